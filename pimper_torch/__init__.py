@@ -1,0 +1,1 @@
+"""Dense surfaces from photographs of many viewpoints and unknown lights."""

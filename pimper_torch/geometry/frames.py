@@ -1,0 +1,38 @@
+"""Rigid transforms, named ``target_from_source``."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def transform(
+    target_from_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch point 3"]
+) -> Float[Tensor, "*batch point 3"]:
+    """Carry points from the source frame to the target frame."""
+    rotation, translation = target_from_source[..., :3, :3], target_from_source[..., :3, 3]
+    return points @ rotation.mT + translation[..., None, :]
+
+
+def rotate(
+    target_from_source: Float[Tensor, "*#batch 4 4"], vectors: Float[Tensor, "*#batch point 3"]
+) -> Float[Tensor, "*batch point 3"]:
+    """Carry directions from the source frame to the target frame."""
+    return vectors @ target_from_source[..., :3, :3].mT
+
+
+def invert_rigid(
+    target_from_source: Float[Tensor, "*batch 4 4"],
+) -> Float[Tensor, "*batch 4 4"]:
+    """Give ``source_from_target`` of a rotation and a translation."""
+    rotation, translation = target_from_source[..., :3, :3], target_from_source[..., :3, 3]
+    return rigid(rotation.mT, -(rotation.mT @ translation[..., None])[..., 0])
+
+
+def rigid(
+    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """Put a rotation and a translation in one matrix."""
+    top = torch.cat([rotation, translation[..., None]], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1
+    return torch.cat([top, bottom], dim=-2)

@@ -1,0 +1,76 @@
+"""Every pixel convention, and the only conversions between them.
+
+Ours is COLMAP's: ``(u, v)`` = (right, down) in pixels, and the centre of the top-left pixel
+is (0.5, 0.5), so that an image covers ``[0, width] x [0, height]``.
+
+=====================================  ===========================================
+convention                             centre of the top-left pixel
+=====================================  ===========================================
+ours, COLMAP                           (0.5, 0.5)
+array index, kornia's warp functions   (0, 0)
+grid_sample, ``align_corners=False``   (1/width - 1, 1/height - 1)
+=====================================  ===========================================
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def grid_from_pixels(
+    pixels: Float[Tensor, "*batch 2"], width: int, height: int
+) -> Float[Tensor, "*batch 2"]:
+    """Turn pixels into the coordinates ``grid_sample(..., align_corners=False)`` expects.
+
+    >>> grid_from_pixels(torch.tensor([0.5, 0.5]), width=4, height=2)
+    tensor([-0.7500, -0.5000])
+    """
+    return 2 * pixels / pixels.new_tensor([width, height]) - 1
+
+
+def pixels_from_grid(
+    grid: Float[Tensor, "*batch 2"], width: int, height: int
+) -> Float[Tensor, "*batch 2"]:
+    """Undo :func:`grid_from_pixels`."""
+    return (grid + 1) / 2 * grid.new_tensor([width, height])
+
+
+def indices_from_pixels(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+    """Count from the centre of the top-left pixel instead of its corner."""
+    return pixels - 0.5
+
+
+def pixels_from_indices(indices: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+    """Count from the corner of the top-left pixel instead of its centre."""
+    return indices + 0.5
+
+
+def homography_in_indices(
+    homography: Float[Tensor, "*batch 3 3"],
+) -> Float[Tensor, "*batch 3 3"]:
+    """Conjugate a homography between pixels for functions that count centres from 0.
+
+    kornia's ``warp_perspective`` is such a function, whichever flag it gets.
+    """
+    index_from_pixel = torch.eye(3, dtype=homography.dtype, device=homography.device)
+    index_from_pixel[:2, 2] = -0.5
+    pixel_from_index = 2 * torch.eye(3, dtype=homography.dtype, device=homography.device)
+    pixel_from_index = pixel_from_index - index_from_pixel
+    return index_from_pixel @ homography @ pixel_from_index
+
+
+def pixel_centers(
+    width: int, height: int, like: Float[Tensor, "..."]
+) -> Float[Tensor, "{height} {width} 2"]:
+    """List the centres of all pixels, with the device and dtype of ``like``."""
+    u = torch.arange(width, device=like.device, dtype=like.dtype) + 0.5
+    v = torch.arange(height, device=like.device, dtype=like.dtype) + 0.5
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
+
+
+def scale_intrinsics(
+    intrinsics: Float[Tensor, "*batch 3 3"], factor_u: float, factor_v: float
+) -> Float[Tensor, "*batch 3 3"]:
+    """Follow a resize of the image; corners stay corners, so no half-pixel shift arises."""
+    scale = intrinsics.new_tensor([factor_u, factor_v, 1.0])
+    return scale[:, None] * intrinsics

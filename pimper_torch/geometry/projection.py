@@ -1,0 +1,45 @@
+"""The pinhole: points to pixels, pixels to rays."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.geometry.frames import transform
+
+
+def project(
+    points_world: Float[Tensor, "*#batch point 3"],
+    cam_from_world: Float[Tensor, "*#batch 4 4"],
+    intrinsics: Float[Tensor, "*#batch 3 3"],
+) -> tuple[Float[Tensor, "*batch point 2"], Float[Tensor, "*batch point"]]:
+    """Find where points appear in an image, and how deep they lie.
+
+    Args:
+        points_world: Scene units.
+        cam_from_world: Rigid.
+        intrinsics: ``K`` in pixels.
+
+    Returns:
+        Pixels, and depth along the camera's z. Behind the camera (depth <= 0) the pixels
+        mean nothing, and the caller masks them. Differentiable where depth is not 0.
+    """
+    points_cam = transform(cam_from_world, points_world)
+    depth = points_cam[..., 2]
+    homogeneous = points_cam @ intrinsics.mT
+    safe = torch.where(depth.abs() > torch.finfo(depth.dtype).tiny, depth, 1)
+    return homogeneous[..., :2] / safe[..., None], depth
+
+
+def rays_through(
+    pixels: Float[Tensor, "*#batch pixel 2"],
+    cam_from_world: Float[Tensor, "*#batch 4 4"],
+    intrinsics: Float[Tensor, "*#batch 3 3"],
+) -> Float[Tensor, "*batch pixel 3"]:
+    """Give the world direction of the ray through each pixel.
+
+    Not unit: its length is chosen so that ``center + depth * ray`` is the point at that
+    depth along the camera's z.
+    """
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
+    rays_cam = torch.linalg.solve(intrinsics, homogeneous.mT).mT
+    return rays_cam @ cam_from_world[..., :3, :3]

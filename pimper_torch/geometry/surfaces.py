@@ -1,0 +1,81 @@
+"""Normals, slopes, areas and neighbourhoods of rasters and meshes."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+
+def slopes_from_normals(
+    normals: Float[Tensor, "*batch 3"], steepest: float = 10.0
+) -> Float[Tensor, "*batch 2"]:
+    """Give ``(dz/dx, dz/dy)`` of the depth whose viewer-facing normals these are.
+
+    Slopes are limited to ``steepest`` (about 84 degrees by default), past which a normal
+    is as good as on the rim. Differentiable below the limit.
+    """
+    nz = normals[..., 2:].clamp_max(-1 / steepest)
+    return (-normals[..., :2] / nz).clamp(-steepest, steepest)
+
+
+def normals_from_slopes(slopes: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    """Undo :func:`slopes_from_normals`: the unit normal with ``n_z < 0``."""
+    return normalize(torch.cat([slopes, -torch.ones_like(slopes[..., :1])], dim=-1), dim=-1)
+
+
+def face_normals(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, "face 3"]:
+    """Give outward normals whose length is twice the area of the face."""
+    a, b, c = vertices[faces].unbind(dim=1)
+    return torch.linalg.cross(b - a, c - a)
+
+
+def vertex_normals(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, "vertex 3"]:
+    """Average the face normals round each vertex by area; unit."""
+    per_face = face_normals(vertices, faces)
+    total = torch.zeros_like(vertices)
+    for corner in range(3):
+        total = total.index_add(0, faces[:, corner], per_face)
+    return normalize(total, dim=-1)
+
+
+def face_pairs(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "pair 2"], Int[Tensor, "pair 2"]]:
+    """Find which faces share an edge.
+
+    Returns:
+        For every edge with exactly two faces: the faces, and the edge's two vertices.
+    """
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    face = torch.arange(len(faces), device=faces.device).repeat_interleave(3)
+    unique, inverse, counts = torch.unique(edges, dim=0, return_inverse=True, return_counts=True)
+    order = torch.argsort(inverse, stable=True)
+    first = torch.cumsum(counts, dim=0) - counts
+    inner = counts == 2
+    pairs = torch.stack([face[order[first[inner]]], face[order[first[inner] + 1]]], dim=1)
+    return pairs, unique[inner]
+
+
+def boundary_vertices(
+    faces: Int[Tensor, "face 3"], num_vertices: int
+) -> Bool[Tensor, " {num_vertices}"]:
+    """Mark vertices on an edge that only one face has."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    unique, counts = torch.unique(edges, dim=0, return_counts=True)
+    marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
+    marked[unique[counts == 1].reshape(-1)] = True
+    return marked
+
+
+def barycentric_2d(
+    points: Float[Tensor, "*#batch 2"], corners: Float[Tensor, "*#batch 3 2"]
+) -> Float[Tensor, "*batch 3"]:
+    """Give barycentric coordinates of points in the plane of triangles."""
+    a, b, c = corners.unbind(dim=-2)
+    ab, ac, ap = b - a, c - a, points - a
+    area = ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0]
+    beta = (ap[..., 0] * ac[..., 1] - ap[..., 1] * ac[..., 0]) / area
+    gamma = (ab[..., 0] * ap[..., 1] - ab[..., 1] * ap[..., 0]) / area
+    return torch.stack([1 - beta - gamma, beta, gamma], dim=-1)

@@ -1,0 +1,116 @@
+"""Which points a camera sees: ray casting on triangle meshes.
+
+The one place that talks to embree. It runs on the CPU in float32 whatever the device of the
+tensors, and its answers are constants to autograd.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.records import Cameras, Mesh, Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Hits(Record):
+    """Where rays first meet a mesh.
+
+    Attributes:
+        face: Index of the face; -1 where the ray meets nothing.
+        distance: Along the ray in units of its direction's length; infinite for a miss.
+        barycentric: Coordinates in the face.
+    """
+
+    face: Int[Tensor, "*batch"]
+    distance: Float[Tensor, "*batch"]
+    barycentric: Float[Tensor, "*batch 3"]
+
+    def interpolate(
+        self, per_vertex: Float[Tensor, "vertex channel"], faces: Int[Tensor, "face 3"]
+    ) -> Float[Tensor, "*batch channel"]:
+        """Blend values of the hit faces' vertices; zero for a miss."""
+        corners = per_vertex[faces[self.face.clamp_min(0)]]
+        blended = (self.barycentric[..., None] * corners).sum(dim=-2)
+        return torch.where((self.face >= 0)[..., None], blended, 0)
+
+
+class RayCaster:
+    """A mesh prepared for ray casting.
+
+    >>> square = torch.tensor([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+    >>> caster = RayCaster(square, torch.tensor([[0, 2, 1], [0, 3, 2]]))
+    >>> caster.cast(torch.zeros(1, 3), torch.tensor([[0.2, 0.1, 1.0]])).distance
+    tensor([1.])
+    """
+
+    def __init__(self, vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> None:
+        triangles = vertices.detach()[faces].to("cpu", torch.float32)
+        self._scene = rtcore_scene.EmbreeScene()
+        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles.numpy()))
+
+    def cast(
+        self, origins: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]
+    ) -> Hits:
+        """Find the first face each ray meets."""
+        shape = directions.shape[:-1]
+        start, along = _as_rows(origins.expand_as(directions)), _as_rows(directions)
+        found = self._scene.run(start, along, output=1)
+        face = torch.from_numpy(found["primID"].astype(np.int64))
+        hit = face >= 0
+        distance = torch.where(hit, torch.from_numpy(found["tfar"]), torch.inf)
+        v, w = torch.from_numpy(found["u"]), torch.from_numpy(found["v"])
+        barycentric = torch.stack([1 - v - w, v, w], dim=-1) * hit[:, None]
+        like = directions
+        return Hits(
+            face=face.reshape(shape).to(like.device),
+            distance=distance.reshape(shape).to(like),
+            barycentric=barycentric.reshape(*shape, 3).to(like),
+        )
+
+    def occluded(
+        self,
+        points: Float[Tensor, "*batch 3"],
+        center: Float[Tensor, " 3"],
+        tolerance: float | Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Tell whether the mesh hides points from a camera.
+
+        Args:
+            points: World.
+            center: Of the camera, world.
+            tolerance: A surface closer than this in front of the point does not count: it
+                is the surface the point itself lies on. Scene units.
+        """
+        directions = points - center
+        length = directions.norm(dim=-1)
+        hits = self.cast(center, directions / length[..., None])
+        return hits.distance < length - tolerance
+
+
+def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
+    """Cast a ray through every pixel of a view.
+
+    Returns:
+        Hits of shape ``height width``; ``distance`` is depth along the camera's z.
+    """
+    width, height = (int(side) for side in cameras.sizes_px[view])
+    pixels = pixel_centers(width, height, like=cameras.intrinsics)
+    rays = rays_through(
+        pixels.reshape(-1, 2), cameras.cam_from_world[view], cameras.intrinsics[view]
+    ).reshape(height, width, 3)
+    caster = RayCaster(mesh.vertices_world, mesh.faces)
+    return caster.cast(cameras.centers_world[view], rays)
+
+
+def _as_rows(
+    vectors: Float[Tensor, "*batch 3"],
+) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    rows = vectors.detach().to("cpu", torch.float32).reshape(-1, 3)
+    return np.ascontiguousarray(rows.numpy())

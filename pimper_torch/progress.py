@@ -1,0 +1,39 @@
+"""How far a stage has come, for whoever wants to show it.
+
+Stages walk their batches through :func:`track`; nothing is printed. A caller that wants a
+bar listens with :func:`listening`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Listener = Callable[[int, int], None]
+
+_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
+def report(done: int, total: int) -> None:
+    """Tell the listener, if any, that ``done`` of ``total`` steps are behind us."""
+    listener = _listener.get()
+    if listener is not None:
+        listener(done, total)
+
+
+def track(items: Sequence[Item]) -> Iterator[Item]:
+    """Walk through ``items``, reporting after each."""
+    for done, item in enumerate(items, start=1):
+        yield item
+        report(done, len(items))
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Send reports to ``listener(done, total)`` inside the ``with`` block."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)

@@ -1,0 +1,40 @@
+"""Frozen data that travels between stages; no algorithms."""
+
+from pimper_torch.records.patches import (
+    Convergence,
+    DepthPatches,
+    Depths,
+    PatchSet,
+    PatchViews,
+    PhotometricPatches,
+    Photometry,
+    Registered,
+    Surface,
+    Templates,
+)
+from pimper_torch.records.reconstruction import Reconstruction, StageReport
+from pimper_torch.records.record import Record
+from pimper_torch.records.scene import CoarseMesh, Lens, Mesh, SparseScene
+from pimper_torch.records.views import Cameras, Views
+
+__all__ = [
+    "Cameras",
+    "CoarseMesh",
+    "Convergence",
+    "DepthPatches",
+    "Depths",
+    "Lens",
+    "Mesh",
+    "PatchSet",
+    "PatchViews",
+    "PhotometricPatches",
+    "Photometry",
+    "Reconstruction",
+    "Record",
+    "Registered",
+    "SparseScene",
+    "StageReport",
+    "Surface",
+    "Templates",
+    "Views",
+]

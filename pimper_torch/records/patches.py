@@ -1,0 +1,198 @@
+"""Everything that is known facet by facet, from templates to the joined surface.
+
+Patches are kept in buckets: templates of like size, padded to one raster and batched.
+Records of later stages have the same buckets in the same order.
+
+The patch frame is x right, y down, z forward into the surface: the facet lies in the
+plane z = 0 and its outward normal is -z. A depth on the template is a coordinate along z.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.records.record import Record
+from pimper_torch.records.scene import CoarseMesh
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Templates(Record):
+    """A bucket of templates: rasters in the planes of their facets.
+
+    Attributes:
+        facet: Which facet of the coarse mesh each template belongs to.
+        patch_from_world: Rigid.
+        origin: x and y of the first sample's centre, patch frame.
+        spacing: Scene units between neighbouring samples; the paper's 1/zeta.
+        depth: z of every sample, 0 while the template is flat.
+        barycentric: Coordinates of every sample with respect to the facet itself; outside
+            the facet one of them is negative.
+        inside: True in the enlarged triangle.
+    """
+
+    facet: Int[Tensor, " patch"]
+    patch_from_world: Float[Tensor, "patch 4 4"]
+    origin: Float[Tensor, "patch 2"]
+    spacing: Float[Tensor, " patch"]
+    depth: Float[Tensor, "patch height width"]
+    barycentric: Float[Tensor, "patch height width 3"]
+    inside: Bool[Tensor, "patch height width"]
+
+    @property
+    def points_patch(self) -> Float[Tensor, "patch height width 3"]:
+        """The samples' places in the patch frame."""
+        height, width = self.depth.shape[-2:]
+        columns = torch.arange(width, device=self.depth.device, dtype=self.depth.dtype)
+        rows = torch.arange(height, device=self.depth.device, dtype=self.depth.dtype)
+        x = self.origin[:, 0, None, None] + self.spacing[:, None, None] * columns
+        y = self.origin[:, 1, None, None] + self.spacing[:, None, None] * rows[:, None]
+        return torch.stack([x.expand_as(self.depth), y.expand_as(self.depth), self.depth], dim=-1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PatchSet(Record):
+    """The decomposition: every facet of the coarse mesh has one template.
+
+    Attributes:
+        coarse: The facets.
+        buckets: Their templates.
+    """
+
+    coarse: CoarseMesh
+    buckets: tuple[Templates, ...]
+
+    @property
+    def num_patches(self) -> int:
+        """How many facets there are."""
+        return sum(len(bucket.facet) for bucket in self.buckets)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Registered(Record):
+    """A bucket of views resampled on templates: the matrices J and D of its patches.
+
+    Attributes:
+        radiance: ``J`` before its samples are put in a row; zero where missing.
+        valid: ``D``: true where a view has the sample.
+    """
+
+    radiance: Float[Tensor, "patch view channel height width"]
+    valid: Bool[Tensor, "patch view height width"]
+
+    @property
+    def gray(self) -> Float[Tensor, "patch view height width"]:
+        """Mean over the channels."""
+        return self.radiance.mean(dim=2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PatchViews(Record):
+    """All views, registered on all templates."""
+
+    patches: PatchSet
+    buckets: tuple[Registered, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Convergence(Record):
+    """How an iteration ended, one entry a problem of the batch.
+
+    Attributes:
+        iterations: Taken until it stopped.
+        residual: Root mean square over what was observed, in the units of the data.
+        converged: False where the limit of iterations stopped it.
+    """
+
+    iterations: Int[Tensor, " patch"]
+    residual: Float[Tensor, " patch"]
+    converged: Bool[Tensor, " patch"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Photometry(Record):
+    """A bucket of factorized patches.
+
+    Attributes:
+        normals_patch: Unit, facing the viewer (``n_z < 0``).
+        albedo: Linear, up to one scale shared by all patches.
+        lights_patch: First-order harmonics ``l`` with radiance = albedo * l . (1, n), n in
+            the patch frame, constants folded in. A view without samples has zeros.
+        valid: True where the sample was determined by the photographs.
+        confidence: In [0, 1]; 0 where not valid.
+        determined: False for a patch whose light varied too little to tell shape from
+            shading; its normals are those of the coarse mesh.
+        convergence: Of the factorization.
+    """
+
+    normals_patch: Float[Tensor, "patch height width 3"]
+    albedo: Float[Tensor, "patch height width channel"]
+    lights_patch: Float[Tensor, "patch view 4"]
+    valid: Bool[Tensor, "patch height width"]
+    confidence: Float[Tensor, "patch height width"]
+    determined: Bool[Tensor, " patch"]
+    convergence: Convergence
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PhotometricPatches(Record):
+    """Normals, albedo and light of all patches."""
+
+    patches: PatchSet
+    buckets: tuple[Photometry, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Depths(Record):
+    """A bucket of patches with relief.
+
+    Attributes:
+        depth: z of every sample in the patch frame, replacing the template's own.
+        valid: True where the relief was integrated or filled from neighbours; false
+            outside the enlarged triangle.
+        transform: The alignment's ``(h_x, h_y, h_z, h_0)``: ``depth`` is
+            ``h . (x, y, z, 1)`` of what integration gave; identity (0, 0, 1, 0) before.
+    """
+
+    depth: Float[Tensor, "patch height width"]
+    valid: Bool[Tensor, "patch height width"]
+    transform: Float[Tensor, "patch 4"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class DepthPatches(Record):
+    """Relief of all patches, with the photometry it was integrated from."""
+
+    photometric: PhotometricPatches
+    buckets: tuple[Depths, ...]
+
+    @property
+    def patches(self) -> PatchSet:
+        """The decomposition underneath."""
+        return self.photometric.patches
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Surface(Record):
+    """The joined surface: every facet subdivided, lattice points on shared edges shared.
+
+    Attributes:
+        vertices_world: Where the lattice points came to lie.
+        faces: Counter-clockwise from outside.
+        facet: A facet each vertex lies in; a shared vertex names one of its facets.
+        barycentric: Where in that facet.
+        normals_world: Unit, outward; photometric where valid, else of the mesh.
+        albedo: Linear, up to one scale.
+        confidence: In [0, 1]; 0 where no view determined the vertex.
+        convergence: Of the refinement, one entry.
+    """
+
+    vertices_world: Float[Tensor, "vertex 3"]
+    faces: Int[Tensor, "face 3"]
+    facet: Int[Tensor, " vertex"]
+    barycentric: Float[Tensor, "vertex 3"]
+    normals_world: Float[Tensor, "vertex 3"]
+    albedo: Float[Tensor, "vertex channel"]
+    confidence: Float[Tensor, " vertex"]
+    convergence: Convergence

@@ -1,0 +1,49 @@
+"""The whole result of a run."""
+
+from dataclasses import dataclass
+
+from pimper_torch.records.patches import DepthPatches
+from pimper_torch.records.record import Record
+from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
+from pimper_torch.records.views import Cameras
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageReport(Record):
+    """What one stage cost and found.
+
+    Attributes:
+        name: Of the stage.
+        seconds: Wall clock.
+        peak_memory_mb: Highest resident memory of the process up to the stage's end.
+        figures: Counts and shares worth telling, such as ``samples`` or ``missing_share``.
+    """
+
+    name: str
+    seconds: float
+    peak_memory_mb: float
+    figures: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Reconstruction(Record):
+    """The surface, and everything that was found on the way.
+
+    Attributes:
+        mesh: One connected surface with vertex normals, albedo and confidence.
+        scene: Cameras, undistorted photographs and the sparse cloud, in the mesh's frame.
+        coarse: The facets.
+        patches: Relief, normals, albedo, confidence and lights of every patch.
+        report: One entry a stage, in the order they ran.
+    """
+
+    mesh: Mesh
+    scene: SparseScene
+    coarse: CoarseMesh
+    patches: DepthPatches
+    report: tuple[StageReport, ...]
+
+    @property
+    def cameras(self) -> Cameras:
+        """The registered views' pinholes."""
+        return self.scene.cameras

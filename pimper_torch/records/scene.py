@@ -1,0 +1,103 @@
+"""What structure from motion finds, and triangle meshes."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.records.record import Record
+from pimper_torch.records.views import Cameras, Views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Lens(Record):
+    """Intrinsics of one photograph before undistortion, in COLMAP's words.
+
+    Attributes:
+        camera: Number of the camera; views taken by one camera share it.
+        model: COLMAP's name of the camera model, such as ``SIMPLE_RADIAL``.
+        params: The model's parameters in COLMAP's order.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    camera: int
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SparseScene(Record):
+    """Cameras, undistorted photographs and a sparse cloud with its tracks.
+
+    Attributes:
+        views: The registered photographs, undistorted to the pinholes in ``cameras``.
+        cameras: Pinholes, one a registered view.
+        points_world: The cloud.
+        reprojection_errors_px: Mean over each point's track.
+        observation_point: Which point each observation sees.
+        observation_view: Which view it is made in.
+        observation_pixels: Where, in the photograph before undistortion.
+        lenses: The photographs' own intrinsics.
+        unregistered: Names of the photographs that found no place in the model.
+    """
+
+    views: Views
+    cameras: Cameras
+    points_world: Float[Tensor, "point 3"]
+    reprojection_errors_px: Float[Tensor, " point"]
+    observation_point: Int[Tensor, " observation"]
+    observation_view: Int[Tensor, " observation"]
+    observation_pixels: Float[Tensor, "observation 2"]
+    lenses: tuple[Lens, ...]
+    unregistered: tuple[str, ...] = ()
+
+    @property
+    def observed(self) -> Bool[Tensor, "point view"]:
+        """True where a view sees a point."""
+        table = torch.zeros(
+            len(self.points_world),
+            self.cameras.num_views,
+            dtype=torch.bool,
+            device=self.points_world.device,
+        )
+        table[self.observation_point, self.observation_view] = True
+        return table
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Mesh(Record):
+    """Triangles; counter-clockwise seen from outside.
+
+    Attributes:
+        vertices_world: In scene units.
+        faces: Indices of vertices.
+        normals_world: Unit, outward, one a vertex.
+        albedo: Linear, one a vertex, up to one scale for the whole mesh.
+        confidence: In [0, 1], one a vertex: how well the photographs determine it.
+    """
+
+    vertices_world: Float[Tensor, "vertex 3"]
+    faces: Int[Tensor, "face 3"]
+    normals_world: Float[Tensor, "vertex 3"] | None = None
+    albedo: Float[Tensor, "vertex channel"] | None = None
+    confidence: Float[Tensor, " vertex"] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class CoarseMesh(Record):
+    """The few hundred facets that the pieces of the method stand on.
+
+    Attributes:
+        mesh: The facets, with vertex normals smoothed over the mesh.
+        reference: The view that the facets were triangulated in; the frontal one.
+        is_point: True for vertices that are points of the sparse cloud; the others were
+            filled in between them.
+    """
+
+    mesh: Mesh
+    reference: int
+    is_point: Bool[Tensor, " vertex"]
