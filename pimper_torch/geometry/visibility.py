@@ -56,7 +56,7 @@ class RayCaster:
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles.numpy()))
 
     def cast(
-        self, origins: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]
+        self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*batch 3"]
     ) -> Hits:
         """Find the first face each ray meets."""
         shape = directions.shape[:-1]
