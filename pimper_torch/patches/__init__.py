@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""Facets to templates, and views resampled on them."""

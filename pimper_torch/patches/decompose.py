@@ -1,0 +1,211 @@
+"""Decomposition: every facet of the coarse mesh becomes a patch with a template."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.frames import rigid, transform
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
+from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Templates
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DecomposeConfig:
+    """How finely facets are sampled and how far they reach over their edges.
+
+    Attributes:
+        samples_per_pixel: Template samples per pixel of the reference view; the paper's
+            zeta, made independent of the scene's unit.
+        overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
+        bucket_samples: Samples of all templates that are batched together; bounds memory.
+    """
+
+    samples_per_pixel: float = 1.0
+    overlap_samples: float = 6.0
+    bucket_samples: int = 100_000
+
+    def __post_init__(self) -> None:
+        require(self.samples_per_pixel > 0, "samples_per_pixel", self.samples_per_pixel, "above 0")
+        require(self.overlap_samples >= 1, "overlap_samples", self.overlap_samples, "1 or more")
+        require(self.bucket_samples >= 1, "bucket_samples", self.bucket_samples, "1 or more")
+
+
+class Decompose(nn.Module):
+    """Give every facet a frame, an enlarged triangle and a raster."""
+
+    def __init__(self, config: DecomposeConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or DecomposeConfig()
+
+    def forward(self, coarse: CoarseMesh, cameras: Cameras) -> PatchSet:
+        """Decompose a coarse mesh.
+
+        The samples of all templates are equally far apart: one over ``samples_per_pixel``
+        pixels of the reference view at the median depth of the mesh.
+
+        Raises:
+            ReconstructionError: A mesh without facets.
+        """
+        vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
+        if len(faces) == 0:
+            raise ReconstructionError(
+                "the coarse mesh has 0 facets, and at least one is needed. Relax the filters "
+                "of `triangulate`, or bring a mesh of your own."
+            )
+        patch_from_world = facet_frames(vertices, faces, cameras.cam_from_world[coarse.reference])
+        corners = transform(patch_from_world, vertices[faces])[..., :2]
+        spacing = sample_spacing(vertices, cameras, coarse.reference, self.config.samples_per_pixel)
+        enlarged = enlarge(corners, self.config.overlap_samples * spacing)
+        # A sliver's enlarged corner runs far away; no patch needs more than twice the overlap.
+        reach = 2 * self.config.overlap_samples * spacing
+        low = torch.maximum(enlarged.amin(dim=1), corners.amin(dim=1) - reach)
+        high = torch.minimum(enlarged.amax(dim=1), corners.amax(dim=1) + reach)
+        sides = ((high - low) / spacing).ceil().long() + 1
+        buckets = tuple(
+            _templates(facets, raster, patch_from_world, corners, enlarged, low, spacing)
+            for facets, raster in group_by_size(sides, self.config.bucket_samples)
+        )
+        return PatchSet(coarse=coarse, buckets=buckets)
+
+
+def facet_frames(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    cam_from_world: Float[Tensor, "4 4"],
+) -> Float[Tensor, "face 4 4"]:
+    """Give ``patch_from_world`` of every facet: the paper's R_mu, and the facet's centroid.
+
+    z is the inward normal; x is the reference camera's x made orthogonal to it, so that a
+    facet that faces the camera appears in its template as in the image.
+    """
+    z = -normalize(face_normals(vertices, faces), dim=-1)
+    x_cam, y_cam = cam_from_world[0, :3].expand_as(z), cam_from_world[1, :3].expand_as(z)
+    # Near the camera's own x axis the projection degenerates, and y serves instead.
+    side = torch.where(((x_cam * z).sum(-1).abs() < 0.99)[:, None], x_cam, y_cam)
+    x = normalize(side - (side * z).sum(-1, keepdim=True) * z, dim=-1)
+    rotation = torch.stack([x, torch.linalg.cross(z, x), z], dim=-2)
+    centroid = vertices[faces].mean(dim=1)
+    return rigid(rotation, -(rotation @ centroid[..., None])[..., 0])
+
+
+def sample_spacing(
+    vertices: Float[Tensor, "vertex 3"], cameras: Cameras, reference: int, samples_per_pixel: float
+) -> Float[Tensor, ""]:
+    """Give the scene units that one sample spans: 1/zeta."""
+    intrinsics = cameras.intrinsics[reference]
+    _, depth = project(vertices, cameras.cam_from_world[reference], intrinsics)
+    focal = (intrinsics[0, 0] * intrinsics[1, 1]).sqrt()
+    return depth.median() / focal / samples_per_pixel
+
+
+def enlarge(
+    corners: Float[Tensor, "patch 3 2"], distance: Float[Tensor, ""]
+) -> Float[Tensor, "patch 3 2"]:
+    """Move every edge outward by ``distance``, parallel to itself.
+
+    The new triangle is the old one scaled about its incentre by ``1 + distance / inradius``.
+
+    >>> enlarge(torch.tensor([[[0.0, 0], [1, 0], [0, 1]]]), torch.tensor(0.1))[0, 0]
+    tensor([-0.1000, -0.1000])
+    """
+    opposite = (corners.roll(-1, dims=1) - corners.roll(-2, dims=1)).norm(dim=-1)
+    perimeter = opposite.sum(dim=1)
+    incenter = (opposite[..., None] * corners).sum(dim=1) / perimeter[:, None]
+    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    inradius = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs() / perimeter
+    scale = 1 + distance / inradius
+    return incenter[:, None] + scale[:, None, None] * (corners - incenter[:, None])
+
+
+def group_by_size(
+    sides: Int[Tensor, "patch 2"], bucket_samples: int
+) -> list[tuple[Int[Tensor, " bucket"], tuple[int, int]]]:
+    """Batch templates of like size.
+
+    Args:
+        sides: Width and height each template needs.
+        bucket_samples: Limit for a bucket; a template larger than that is a bucket alone.
+
+    Returns:
+        Facets and (height, width) of each bucket.
+    """
+    step = math.sqrt(2.0)  # at most twice the samples are padding, in a handful of sizes
+    rounded = step ** (sides.double().log2() * 2).ceil()
+    keys = rounded.ceil().long()
+    groups: dict[tuple[int, int], list[int]] = {}
+    for facet, (width, height) in enumerate(keys.tolist()):
+        groups.setdefault((height, width), []).append(facet)
+    buckets: list[tuple[Int[Tensor, " bucket"], tuple[int, int]]] = []
+    for members in (groups[key] for key in sorted(groups)):
+        facets = torch.tensor(members, device=sides.device)
+        width, height = (int(side) for side in sides[facets].amax(dim=0))
+        count = max(1, bucket_samples // (width * height))
+        starts = range(0, len(facets), count)
+        buckets += [(facets[start : start + count], (height, width)) for start in starts]
+    return buckets
+
+
+def facet_masks(
+    coarse: CoarseMesh, cameras: Cameras, view: int, overlap: float
+) -> Bool[Tensor, "face height width"]:
+    """Give the paper's binary masks: which pixels of a view see which enlarged facet.
+
+    A pixel belongs when the point where its ray meets the facet's plane has barycentric
+    coordinates inside the enlarged triangle. Occlusion is not considered.
+
+    Args:
+        coarse: The facets.
+        cameras: Of all views.
+        view: The one asked about.
+        overlap: How far edges are moved outward, scene units.
+    """
+    vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
+    frames = facet_frames(vertices, faces, cameras.cam_from_world[coarse.reference])
+    enlarged = enlarge(
+        transform(frames, vertices[faces])[..., :2], torch.as_tensor(overlap).to(vertices)
+    )
+    width, height = (int(side) for side in cameras.sizes_px[view])
+    pixels = pixel_centers(width, height, like=vertices).reshape(-1, 2)
+    rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
+    center = transform(frames, cameras.centers_world[view][None])
+    masks = []
+    for frame, corners, start in zip(frames, enlarged, center[:, 0], strict=True):
+        along = rays @ frame[:3, :3].mT
+        reach = -start[2] / along[:, 2]
+        where = start[:2] + reach[:, None] * along[:, :2]
+        inside = (barycentric_2d(where, corners[None]) >= 0).all(dim=-1) & (reach > 0)
+        masks.append(inside.reshape(height, width))
+    return torch.stack(masks)
+
+
+def _templates(
+    facets: Int[Tensor, " bucket"],
+    raster: tuple[int, int],
+    patch_from_world: Float[Tensor, "face 4 4"],
+    corners: Float[Tensor, "face 3 2"],
+    enlarged: Float[Tensor, "face 3 2"],
+    low: Float[Tensor, "face 2"],
+    spacing: Float[Tensor, ""],
+) -> Templates:
+    height, width = raster
+    grid = spacing * (pixel_centers(width, height, like=low) - 0.5)
+    places = low[facets, None, None] + grid
+    barycentric = barycentric_2d(places, corners[facets, None, None])
+    within = barycentric_2d(places, enlarged[facets, None, None])
+    return Templates(
+        facet=facets,
+        patch_from_world=patch_from_world[facets],
+        origin=low[facets],
+        spacing=spacing.expand(len(facets)),
+        depth=torch.zeros_like(barycentric[..., 0]),
+        barycentric=barycentric,
+        inside=(within >= 0).all(dim=-1),
+    )
