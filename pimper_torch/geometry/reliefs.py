@@ -1,0 +1,199 @@
+"""Height fields on templates: looking values up, and where rays meet the relief.
+
+A relief is a depth z for every sample of a raster in the patch frame. Sample (row i,
+column j) lies at ``x = origin_x + j spacing``, ``y = origin_y + i spacing``, so counting
+from the first sample's centre is :func:`~pimper_torch.geometry.pixels.indices_from_pixels`
+already undone. Rasters have at least two samples a side.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+# A neighbour that carries less of the blend than this may be invalid: a point that lies on
+# a row of samples must not miss because rounding put it a hair beside the row.
+_NEGLIGIBLE_WEIGHT = 1e-4
+
+# A ray has met the relief when it passes this close, in sample spacings.
+_TOUCHING = 0.02
+
+
+def sample_raster(
+    values: Float[Tensor, "patch channel height width"],
+    xy: Float[Tensor, "patch ray 2"],
+    origin: Float[Tensor, "patch 2"],
+    spacing: Float[Tensor, " patch"],
+    valid: Bool[Tensor, "patch height width"] | None = None,
+) -> Float[Tensor, "patch channel ray"]:
+    """Look values up between the samples of a template, bilinearly.
+
+    Args:
+        values: Anything kept on the raster: depth, normals, albedo, confidence.
+        xy: Where, patch frame. Outside the raster the nearest border answers.
+        origin: x and y of the first sample.
+        spacing: Between samples.
+        valid: Samples that are false stay out of the blend and the others share their
+            weight; where no neighbour is valid the answer is zero. ``None`` trusts all.
+
+    Differentiable in ``values``, and in ``xy`` inside each cell. Blended unit normals are
+    not unit. To learn whether the answer rests on valid samples only, look up
+    ``valid[:, None].to(values)`` as well.
+
+    >>> ramp = torch.arange(3.0).expand(1, 1, 2, 3)
+    >>> zero = torch.zeros(1, 2)
+    >>> sample_raster(ramp, torch.tensor([[[0.75, 0.2]]]), zero, torch.tensor([0.5]))
+    tensor([[[1.5000]]])
+    """
+    neighbours, across, down = _cell(xy, origin, spacing, values.shape[-2:])
+    weights = _bilinear_weights(across, down)
+    corners = _gather(values, neighbours)
+    if valid is None:
+        return (corners * weights[:, None]).sum(dim=-1)
+    known = _gather(valid[:, None], neighbours)
+    weights = weights[:, None] * known
+    total = weights.sum(dim=-1)
+    blend = (torch.where(known, corners, 0) * weights).sum(dim=-1)
+    return torch.where(total > 0, blend / torch.where(total > 0, total, 1), 0)
+
+
+def intersect_relief(
+    depth: Float[Tensor, "patch height width"],
+    valid: Bool[Tensor, "patch height width"],
+    origin: Float[Tensor, "patch 2"],
+    spacing: Float[Tensor, " patch"],
+    ray_origins: Float[Tensor, "patch ray 3"],
+    ray_directions: Float[Tensor, "patch ray 3"],
+    steps: int = 3,
+) -> tuple[Float[Tensor, "patch ray 3"], Bool[Tensor, "patch ray"]]:
+    r"""Find where rays meet the relief ``z = depth(x, y)``, bilinear between samples.
+
+    From the point on the plane z = 0, Newton's steps on
+    :math:`f(t) = o_z + t d_z - \mathrm{depth}(o_{xy} + t d_{xy})`, with the slope of the
+    bilinear cell. One step is exact on a plane; three bring a smooth relief to rounding
+    for rays within some 60 degrees of the z axis. Rays that would cross the relief several
+    times find the crossing Newton leads to, usually the one nearest to the plane.
+
+    Args:
+        depth: z, patch frame; what invalid samples hold does not matter.
+        valid: True where there is a relief.
+        origin: x and y of the first sample.
+        spacing: Between samples.
+        ray_origins: Patch frame; any point of the ray.
+        ray_directions: Any length and sign; the ray is the whole line.
+        steps: Newton's steps.
+
+    Returns:
+        The points, and whether each lies on the relief: all neighbours it is blended from
+        are valid, and the line passes it within a fiftieth of the spacing. A miss gives a
+        point on the ray that means nothing, though it is finite.
+
+    Differentiable in ``depth``, ``ray_origins`` and ``ray_directions`` by the implicit
+    function: only the last step carries gradients, with its slope held, which is exact once
+    the steps before it have converged.
+    """
+    known = torch.where(valid, depth, 0)
+    normal_enough = 1e-3 * ray_directions.norm(dim=-1)
+    toward_plane = _away_from_zero(ray_directions[..., 2], normal_enough)
+    distance = -ray_origins[..., 2] / toward_plane
+    with torch.no_grad():
+        for _ in range(steps - 1):
+            gap, rate = _gap(known, valid, origin, spacing, ray_origins, ray_directions, distance)
+            distance = distance - gap / _away_from_zero(rate, normal_enough)
+    distance = distance.detach()
+    gap, rate = _gap(known, valid, origin, spacing, ray_origins, ray_directions, distance)
+    distance = distance - gap / _away_from_zero(rate.detach(), normal_enough)
+    points = ray_origins + distance[..., None] * ray_directions
+
+    with torch.no_grad():
+        gap, rate = _gap(known, valid, origin, spacing, ray_origins, ray_directions, distance)
+        supported = sample_raster(valid[:, None].to(depth), points[..., :2], origin, spacing)[:, 0]
+        hit = (
+            (supported >= 1 - _NEGLIGIBLE_WEIGHT)
+            & _within(points[..., :2], origin, spacing, depth.shape[-2:])
+            & (gap.abs() <= _TOUCHING * spacing[:, None])
+            & (rate.abs() > normal_enough)
+        )
+    return points, hit
+
+
+def _gap(
+    depth: Float[Tensor, "patch height width"],
+    valid: Bool[Tensor, "patch height width"],
+    origin: Float[Tensor, "patch 2"],
+    spacing: Float[Tensor, " patch"],
+    ray_origins: Float[Tensor, "patch ray 3"],
+    ray_directions: Float[Tensor, "patch ray 3"],
+    distance: Float[Tensor, "patch ray"],
+) -> tuple[Float[Tensor, "patch ray"], Float[Tensor, "patch ray"]]:
+    """Give the ray's height over the relief along z, and its derivative along the ray."""
+    points = ray_origins + distance[..., None] * ray_directions
+    neighbours, across, down = _cell(points[..., :2], origin, spacing, depth.shape[-2:])
+    corners = _gather(depth[:, None], neighbours)[:, 0]
+    known = _gather(valid[:, None], neighbours)[:, 0]
+    # A half-known cell continues its known corners level: rays that pass over the rim of
+    # the relief on their way are not thrown off by what lies beyond it.
+    level = (corners * known).sum(dim=-1) / known.sum(dim=-1).clamp_min(1)
+    corners = torch.where(known, corners, level[..., None])
+    height = (corners * _bilinear_weights(across, down)).sum(dim=-1)
+    top_left, top_right, low_left, low_right = corners.unbind(dim=-1)
+    slope_x = (top_right - top_left) * (1 - down) + (low_right - low_left) * down
+    slope_y = (low_left - top_left) * (1 - across) + (low_right - top_right) * across
+    climb = slope_x * ray_directions[..., 0] + slope_y * ray_directions[..., 1]
+    return points[..., 2] - height, ray_directions[..., 2] - climb / spacing[:, None]
+
+
+def _cell(
+    xy: Float[Tensor, "patch ray 2"],
+    origin: Float[Tensor, "patch 2"],
+    spacing: Float[Tensor, " patch"],
+    size: torch.Size,
+) -> tuple[Int[Tensor, "patch ray 4"], Float[Tensor, "patch ray"], Float[Tensor, "patch ray"]]:
+    """Give the four samples round each point, and its place between them in [0, 1]."""
+    height, width = size
+    index = (xy - origin[:, None]) / spacing[:, None, None]
+    column = index[..., 0].clamp(0, width - 1)
+    row = index[..., 1].clamp(0, height - 1)
+    left = column.detach().floor().clamp_max(width - 2)
+    top = row.detach().floor().clamp_max(height - 2)
+    first = (top * width + left).long()
+    neighbours = torch.stack([first, first + 1, first + width, first + width + 1], dim=-1)
+    return neighbours, column - left, row - top
+
+
+def _bilinear_weights(
+    across: Float[Tensor, "*batch"], down: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 4"]:
+    left, top = 1 - across, 1 - down
+    return torch.stack([left * top, across * top, left * down, across * down], dim=-1)
+
+
+def _gather(
+    raster: Float[Tensor, "patch channel height width"]
+    | Bool[Tensor, "patch channel height width"],
+    neighbours: Int[Tensor, "patch ray 4"],
+) -> Float[Tensor, "patch channel ray 4"] | Bool[Tensor, "patch channel ray 4"]:
+    channels = raster.shape[1]
+    where = neighbours.flatten(1)[:, None].expand(-1, channels, -1)
+    return raster.flatten(2).gather(2, where).reshape(*raster.shape[:2], *neighbours.shape[1:])
+
+
+def _within(
+    xy: Float[Tensor, "patch ray 2"],
+    origin: Float[Tensor, "patch 2"],
+    spacing: Float[Tensor, " patch"],
+    size: torch.Size,
+) -> Bool[Tensor, "patch ray"]:
+    height, width = size
+    index = (xy - origin[:, None]) / spacing[:, None, None]
+    last = index.new_tensor([width - 1, height - 1])
+    slack = _NEGLIGIBLE_WEIGHT
+    return ((index >= -slack) & (index <= last + slack)).all(dim=-1)
+
+
+def _away_from_zero(
+    value: Float[Tensor, "patch ray"], least: Float[Tensor, "patch ray"]
+) -> Float[Tensor, "patch ray"]:
+    """Keep a divisor's sign but not a size below ``least``; 1 for a ray without direction."""
+    sign = torch.where(value < 0, -1.0, 1.0).to(value)
+    pushed = torch.where(value.abs() < least, sign * least, value)
+    return torch.where(least > 0, pushed, 1)
