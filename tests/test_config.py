@@ -1,0 +1,201 @@
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import yaml
+
+from pimper_torch import config as config_module
+from pimper_torch.config import (
+    build,
+    find_config,
+    overlay,
+    presets,
+    read_mapping,
+    require,
+    to_mapping,
+    to_yaml,
+)
+from pimper_torch.errors import ConfigError
+
+
+class Shade(Enum):
+    MATTE = 1
+    GLOSSY = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inner:
+    steps: int = 9
+    tolerance: float = 1e-6
+    robust: bool = True
+    solver: Literal["balm", "descent"] = "balm"
+
+    def __post_init__(self):
+        require(self.steps > 0, "steps", self.steps, "at least one")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outer:
+    name: str = "x"
+    shade: Shade = Shade.MATTE
+    window: tuple[int, int] = (5, 5)
+    scales: tuple[float, ...] = (0.25, 0.5, 1.0)
+    cache: Path | None = None
+    limit: int | None = None
+    inner: Inner = field(default_factory=Inner)
+
+
+CHANGED = Outer(
+    name="y",
+    shade=Shade.GLOSSY,
+    window=(3, 7),
+    scales=(1.0,),
+    cache=Path("a/b"),
+    limit=4,
+    inner=Inner(steps=2, tolerance=float("inf"), robust=False, solver="descent"),
+)
+
+
+@pytest.mark.parametrize("config", [Outer(), CHANGED])
+def test_a_config_survives_the_way_through_yaml(config):
+    assert build(Outer, yaml.safe_load(to_yaml(config)), "round trip") == config
+    assert build(Outer, to_mapping(config), "round trip") == config
+
+
+def test_only_what_is_named_changes():
+    built = build(Outer, {"inner": {"steps": 3}, "limit": None}, "w")
+    assert built == Outer(inner=Inner(steps=3))
+    assert build(Outer, {"inner": None}, "an empty section in YAML") == Outer()
+
+
+def test_a_whole_number_serves_as_a_number_and_becomes_one():
+    built = build(Inner, {"tolerance": 2}, "w")
+    assert isinstance(built.tolerance, float)
+    assert build(Inner, yaml.safe_load("tolerance: 1e-3"), "w").tolerance == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("mapping", "field", "needed"),
+    [
+        ({"inner": {"steps": 2.0}}, "inner.steps", "a whole number"),
+        ({"inner": {"steps": True}}, "inner.steps", "a whole number"),
+        ({"inner": {"tolerance": False}}, "inner.tolerance", "a number"),
+        ({"inner": {"tolerance": "small"}}, "inner.tolerance", "a number"),
+        ({"inner": {"robust": 1}}, "inner.robust", "true or false"),
+        ({"inner": {"robust": "yes"}}, "inner.robust", "true or false"),
+        ({"inner": {"solver": "newton"}}, "inner.solver", "'balm', 'descent'"),
+        ({"inner": 3}, "inner", "steps, tolerance, robust, solver"),
+        ({"name": 3}, "name", "a text"),
+        ({"shade": "SHINY"}, "shade", "MATTE, GLOSSY"),
+        ({"window": [1, 2, 3]}, "window", "a list of a whole number, a whole number"),
+        ({"window": 5}, "window", "a list"),
+        ({"scales": [1.0, "a"]}, "scales[1]", "a number"),
+        ({"scales": None}, "scales", "a list"),
+        ({"limit": "many"}, "limit", "a whole number"),
+        ({"cache": 3}, "cache", "a path"),
+    ],
+)
+def test_a_wrong_type_is_refused_with_place_and_need(mapping, field, needed):
+    with pytest.raises(ConfigError) as refusal:
+        build(Outer, mapping, "mine.yaml")
+    message = str(refusal.value)
+    assert message.startswith(f"mine.yaml: {field} is ")
+    assert needed in message.partition("needed:")[2]
+
+
+def test_an_unknown_key_names_the_nearest_and_all_others():
+    with pytest.raises(ConfigError, match=r"section `inner`.*`step`.*mean `steps`") as refusal:
+        build(Outer, {"inner": {"step": 3}}, "mine.yaml")
+    for name in ("mine.yaml", "steps", "tolerance", "robust", "solver"):
+        assert name in str(refusal.value)
+
+
+def test_a_key_from_another_section_is_sent_home():
+    with pytest.raises(ConfigError, match=r"top level has no setting `solver`.*`inner\.solver`"):
+        build(Outer, {"solver": "balm"}, "mine.yaml")
+
+
+def test_an_impossible_value_names_file_and_section():
+    with pytest.raises(ConfigError, match=r"mine\.yaml: inner: steps is 0; needed: at least one"):
+        build(Outer, {"inner": {"steps": 0}}, "mine.yaml")
+
+
+def test_a_value_without_default_is_asked_for():
+    @dataclass(frozen=True)
+    class Needy:
+        size: int
+
+    with pytest.raises(ConfigError, match="lacks size"):
+        build(Needy, {}, "mine.yaml")
+
+
+def test_overlay_merges_sections_and_replaces_values_without_touching_its_inputs():
+    base = {"a": {"x": 1, "y": [1, 2]}, "b": 1}
+    other = {"a": {"y": [3]}, "c": None}
+    assert overlay(base, other) == {"a": {"x": 1, "y": [3]}, "b": 1, "c": None}
+    assert base == {"a": {"x": 1, "y": [1, 2]}, "b": 1}
+    assert overlay(base, {"a": None, "b": None}) == {"a": {"x": 1, "y": [1, 2]}, "b": None}
+
+
+def test_every_preset_of_the_package_is_found_and_read():
+    assert {"paper", "default", "fast"} <= set(presets())
+    for name in presets():
+        assert isinstance(read_mapping(find_config(name)), dict)
+
+
+def test_a_misspelt_preset_names_the_nearest():
+    with pytest.raises(ConfigError, match=r"'papre'.*`paper`.*default, fast, paper"):
+        find_config("papre")
+
+
+def test_a_file_is_taken_as_it_is_and_a_missing_one_refused(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("limit: 3\n")
+    assert find_config(str(path)) == find_config(path) == path
+    with pytest.raises(ConfigError, match=r"other\.yaml: there is no such file"):
+        find_config(tmp_path / "other.yaml")
+
+
+def test_presets_of_an_installed_package_come_before_a_checkout(tmp_path, monkeypatch):
+    package = tmp_path / "package"
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "a.yaml").write_text("")
+    package.mkdir()
+    monkeypatch.setattr(config_module.resources, "files", lambda name: package)
+    assert presets() == ("a",)
+    (package / "configs").mkdir()
+    (package / "configs" / "b.yaml").write_text("")
+    assert presets() == ("b",)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a: 1\nb: 2\na: 3\n", "`a` is given twice"),
+        ("a: {b: 1, b: 2}\n", "`b` is given twice"),
+        ("a: [1\n", "no valid YAML"),
+        ("- a\n- b\n", "holds a list"),
+        ("!!python/object/apply:os.getcwd []\n", "no valid YAML"),
+    ],
+)
+def test_a_file_that_holds_no_settings_is_refused_by_name(tmp_path, text, told):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=told) as refusal:
+        read_mapping(path)
+    assert str(path) in str(refusal.value)
+
+
+def test_an_empty_file_changes_nothing(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("# only a remark\n")
+    assert read_mapping(path) == {}
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(b"\xff\xfe\x00a")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_mapping(path)
