@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""The sparse cloud to a few hundred facets."""

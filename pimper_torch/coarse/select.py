@@ -1,0 +1,153 @@
+"""Which view is frontal, and which points of the cloud can be trusted."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.errors import InputError
+from pimper_torch.records import Cameras, SparseScene, Views
+
+
+def frontal_view(scene: SparseScene) -> int:
+    """Choose the view that shares the most points with the others.
+
+    Each other view counts with the square root of the points shared, so that many views at
+    the side weigh more than one close twin.
+    """
+    observed = scene.observed.to(scene.points_world.dtype)
+    shared = (observed.mT @ observed).fill_diagonal_(0)
+    return int(shared.sqrt().sum(dim=1).argmax())
+
+
+def named_view(views: Views, name: str) -> int:
+    """Find a view by its file name or stem.
+
+    Raises:
+        InputError: No view, or more than one, has that name.
+    """
+    found = [
+        index
+        for index, known in enumerate(views.names)
+        if name == known or name == known.rsplit(".", 1)[0]
+    ]
+    if len(found) != 1:
+        raise InputError(
+            f"reference view: {len(found)} registered photographs are named {name!r}, and one "
+            f"is needed. Registered are: {', '.join(views.names)}."
+        )
+    return found[0]
+
+
+def triangulation_angles(
+    points_world: Float[Tensor, "point 3"],
+    observed: Bool[Tensor, "point view"],
+    cameras: Cameras,
+) -> Float[Tensor, " point"]:
+    """Give each point's widest angle between two rays that saw it, in radians."""
+    rays = normalize(points_world[:, None] - cameras.centers_world, dim=-1)
+    cosines = rays @ rays.mT
+    both = observed[:, :, None] & observed[:, None, :]
+    return torch.where(both, cosines, 1).flatten(1).amin(dim=1).clamp(-1, 1).acos()
+
+
+def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[Tensor, " view"]:
+    """Mark the views whose optical axes are within an angle of the reference's."""
+    axes = cameras.cam_from_world[:, 2, :3]
+    cosine = (axes @ axes[reference]).clamp(-1, 1)
+    return cosine >= torch.deg2rad(cosine.new_tensor(max_angle_deg)).cos()
+
+
+def neighbours_agree(
+    pixels: Float[Tensor, "point 2"],
+    points_cam: Float[Tensor, "point 3"],
+    *,
+    neighbours: int,
+    max_slope: float,
+    max_deviation: float,
+) -> Bool[Tensor, " point"]:
+    """Mark points that lie on the same surface as those around them in the image.
+
+    Two tests against the nearest points in the image. A point of another layer (the far
+    side, the background) is steep against most of them: ``|dz|`` over the lateral distance
+    exceeds ``max_slope``. A badly triangulated one is off the plane that its neighbours
+    span by more than ``max_deviation`` of the neighbourhood's radius.
+
+    Points are dropped worst first in a few rounds, so that one outlier does not take its
+    neighbours along.
+    """
+    keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
+    for share in (0.9, 0.75, 0.6, 0.5):
+        index = keep.nonzero()[:, 0]
+        if len(index) <= neighbours:
+            break
+        nearest = nearest_in_image(pixels[index], neighbours)
+        steep = _steepness(points_cam[index], nearest) > max_slope
+        off = _deviation(points_cam[index], nearest) > max_deviation
+        keep[index[(steep.float().mean(dim=1) > share) | off]] = False
+    return keep
+
+
+def nearest_in_image(pixels: Float[Tensor, "point 2"], count: int) -> Int[Tensor, "point {count}"]:
+    """List every point's nearest others."""
+    coordinates = pixels.detach().cpu().numpy()
+    _, index = cKDTree(coordinates).query(coordinates, k=list(range(2, count + 2)))
+    return torch.as_tensor(index, device=pixels.device)
+
+
+def spread(
+    pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], distance_px: float
+) -> Int[Tensor, " chosen"]:
+    """Choose points at least ``distance_px`` apart, the best first."""
+    coordinates = pixels.detach().cpu().numpy()
+    close = cKDTree(coordinates).query_ball_point(coordinates, distance_px)
+    blocked = torch.zeros(len(pixels), dtype=torch.bool)
+    chosen: list[int] = []
+    for point in quality.argsort(descending=True, stable=True).tolist():
+        if not blocked[point]:
+            chosen.append(point)
+            blocked[torch.tensor(close[point])] = True
+    return torch.tensor(chosen, dtype=torch.long, device=pixels.device)
+
+
+def spread_to_number(
+    pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], number: int
+) -> Int[Tensor, " chosen"]:
+    """Choose about ``number`` well-spread points by bisecting their distance."""
+    if number >= len(pixels):
+        return torch.arange(len(pixels), device=pixels.device)
+    low, high = 0.0, float((pixels.amax(dim=0) - pixels.amin(dim=0)).norm())
+    chosen = spread(pixels, quality, high)
+    for _ in range(20):
+        middle = (low + high) / 2
+        chosen = spread(pixels, quality, middle)
+        low, high = (middle, high) if len(chosen) > number else (low, middle)
+    return chosen
+
+
+def _steepness(
+    points_cam: Float[Tensor, "point 3"], nearest: Int[Tensor, "point neighbour"]
+) -> Float[Tensor, "point neighbour"]:
+    steps = points_cam[nearest] - points_cam[:, None]
+    return steps[..., 2].abs() / steps[..., :2].norm(dim=-1).clamp_min(1e-12)
+
+
+def _deviation(
+    points_cam: Float[Tensor, "point 3"], nearest: Int[Tensor, "point neighbour"]
+) -> Float[Tensor, " point"]:
+    """Measure the distance from the neighbours' robust plane, in radii of the neighbourhood."""
+    steps = (points_cam[nearest] - points_cam[:, None]).double()
+    radius = steps[..., :2].norm(dim=-1).median(dim=1).values.clamp_min(1e-12)
+    scaled = steps / radius[:, None, None]
+    design = torch.cat([scaled[..., :2], torch.ones_like(scaled[..., :1])], dim=-1)
+    ridge = 1e-3 * torch.eye(3, dtype=design.dtype, device=design.device)
+    weight = torch.ones_like(scaled[..., 0])
+    plane = torch.zeros_like(design[:, 0])
+    for _ in range(5):  # re-weighted: a neighbour across a depth edge must not tilt the plane
+        normal = (weight[..., None] * design).mT @ design + ridge
+        right = ((weight * scaled[..., 2])[..., None] * design).sum(dim=1)
+        plane = torch.linalg.solve(normal, right)
+        residual = (scaled[..., 2] - (design @ plane[..., None])[..., 0]).abs()
+        weight = 1 / (1 + (residual / (residual.median(dim=1).values[:, None] + 0.02)) ** 2)
+    return plane[:, 2].abs().to(points_cam.dtype)

@@ -1,0 +1,310 @@
+"""Coarse mesh: a few hundred facets through the cloud, seen from the frontal view."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample, normalize
+
+from pimper_torch.coarse.fill import delaunay, fill_pixels, interpolate_inverse_depth
+from pimper_torch.coarse.select import (
+    frontal_view,
+    named_view,
+    neighbours_agree,
+    spread,
+    spread_to_number,
+    triangulation_angles,
+    views_near,
+)
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.surfaces import (
+    face_normals,
+    face_pairs,
+    vertex_normals,
+)
+from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TriangulateConfig:
+    """Which points become vertices, and which triangles facets.
+
+    Attributes:
+        reference: Name or stem of the frontal photograph; empty chooses it.
+        num_points: About how many vertices to spread over the visible side.
+        facet_edge_px: Distance of vertices in the reference view; 0 derives it from
+            ``num_points``.
+        fill: Put vertices on a smooth surface where the cloud has none.
+        fill_smoothing: Of that surface; 0 passes through every point.
+        max_view_angle_deg: Points count that were seen by a view turned less than this
+            from the reference.
+        min_track_length: Views that must have seen a point.
+        max_reprojection_px: Mean reprojection error a point may have.
+        min_angle_deg: Widest angle between rays a point must have.
+        neighbours: Points around a point that must agree with it.
+        max_slope: Depth over lateral distance between agreeing points.
+        max_deviation: From the plane of the neighbours, in radii of the neighbourhood.
+        max_tilt_deg: A facet turned further from the reference bridges a depth
+            discontinuity and is dropped.
+        min_altitude: Height over longest edge below which a facet at the rim is dropped.
+        min_coverage: Share of a facet at the rim that must show the object.
+        dark_level: Radiance in the reference view at or below which nothing is shown.
+        smoothing_rounds: Of the vertex normals, over the mesh.
+    """
+
+    reference: str = ""
+    num_points: int = 250
+    facet_edge_px: float = 0.0
+    fill: bool = True
+    fill_smoothing: float = 1e-6
+    max_view_angle_deg: float = 40.0
+    min_track_length: int = 3
+    max_reprojection_px: float = 1.5
+    min_angle_deg: float = 4.0
+    neighbours: int = 12
+    max_slope: float = 3.0
+    max_deviation: float = 0.5
+    max_tilt_deg: float = 80.0
+    min_altitude: float = 0.15
+    min_coverage: float = 0.6
+    dark_level: float = 0.01
+    smoothing_rounds: int = 1
+
+    def __post_init__(self) -> None:
+        require(self.num_points >= 4, "num_points", self.num_points, "4 or more")
+        require(self.facet_edge_px >= 0, "facet_edge_px", self.facet_edge_px, "0 or more")
+        require(self.min_track_length >= 2, "min_track_length", self.min_track_length, "2 or more")
+        require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
+        require(self.neighbours >= 3, "neighbours", self.neighbours, "3 or more")
+        require(0 <= self.min_coverage <= 1, "min_coverage", self.min_coverage, "in [0, 1]")
+        require(self.fill_smoothing >= 0, "fill_smoothing", self.fill_smoothing, "0 or more")
+
+
+class Triangulate(nn.Module):
+    """Span facets between trustworthy points; the result is a constant to autograd."""
+
+    def __init__(self, config: TriangulateConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or TriangulateConfig()
+
+    @torch.no_grad()
+    def forward(self, scene: SparseScene) -> CoarseMesh:
+        """Triangulate the cloud in the reference view.
+
+        Raises:
+            InputError: No registered photograph has the reference's name.
+            ReconstructionError: Fewer than four points pass the filters, or no facet does.
+        """
+        config, cameras = self.config, scene.cameras
+        if config.reference:
+            reference = named_view(scene.views, config.reference)
+        else:
+            reference = frontal_view(scene)
+        points, quality = self._trusted(scene, reference)
+        pixels, _ = _project(points, cameras, reference)
+        edge_px = config.facet_edge_px
+        if edge_px > 0:
+            chosen = spread(pixels, quality, 0.8 * edge_px)
+        else:
+            edge_px = _edge_for(config.num_points, pixels)
+            chosen = spread_to_number(pixels, quality, config.num_points)
+            if config.fill:  # filled vertices count too: do not crowd where points are dense
+                chosen = spread(pixels, quality, 0.7 * edge_px)
+        vertices = points[chosen]
+        is_point = torch.ones(len(vertices), dtype=torch.bool, device=vertices.device)
+        faces = self._facets(vertices, scene.views, cameras, reference)
+        if config.fill:
+            filled = self._filled(vertices, faces, points, cameras, reference, edge_px)
+            vertices = torch.cat([vertices, filled])
+            is_point = torch.cat([is_point, is_point.new_zeros(len(filled))])
+            faces = self._facets(vertices, scene.views, cameras, reference)
+        faces = largest_component(faces)
+        if len(faces) == 0:
+            raise ReconstructionError(
+                f"coarse mesh: all facets between {len(vertices)} points were dropped, and at "
+                "least one is needed. Raise `triangulate.max_tilt_deg`, lower "
+                "`triangulate.min_coverage`, or choose another `triangulate.reference`."
+            )
+        used, faces = torch.unique(faces, return_inverse=True)
+        vertices = vertices[used]
+        normals = smooth_over_mesh(
+            vertex_normals(vertices, faces), faces, self.config.smoothing_rounds
+        )
+        mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=normals)
+        return CoarseMesh(mesh=mesh, reference=reference, is_point=is_point[used])
+
+    def _trusted(
+        self, scene: SparseScene, reference: int
+    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
+        """Give the points that pass every filter, and how good each is."""
+        config, cameras, observed = self.config, scene.cameras, scene.observed
+        length = observed.sum(dim=1)
+        angle = triangulation_angles(scene.points_world, observed, cameras)
+        near = views_near(cameras, reference, config.max_view_angle_deg)
+        pixels, depth = _project(scene.points_world, cameras, reference)
+        within = ((pixels > 0) & (pixels < cameras.sizes_px[reference])).all(dim=1) & (depth > 0)
+        tests = {
+            f"in front of {scene.views.names[reference]} and inside its frame": within,
+            "seen by a view near it": observed[:, near].any(dim=1),
+            f"seen by {config.min_track_length} views or more": length >= config.min_track_length,
+            f"reprojected within {config.max_reprojection_px} px": (
+                scene.reprojection_errors_px <= config.max_reprojection_px
+            ),
+            f"seen under {config.min_angle_deg} degrees or more": (
+                angle >= torch.deg2rad(angle.new_tensor(config.min_angle_deg))
+            ),
+        }
+        keep = torch.stack(list(tests.values())).all(dim=0)
+        index = keep.nonzero()[:, 0]
+        if len(index) >= 4:
+            points_cam = transform(cameras.cam_from_world[reference], scene.points_world[index])
+            agree = neighbours_agree(
+                pixels[index],
+                points_cam,
+                neighbours=min(config.neighbours, len(index) - 1),
+                max_slope=config.max_slope,
+                max_deviation=config.max_deviation,
+            )
+            index = index[agree]
+        if len(index) < 4:
+            counts = "; ".join(f"{int(passed.sum())} {test}" for test, passed in tests.items())
+            raise ReconstructionError(
+                f"coarse mesh: {len(index)} of {len(keep)} sparse points can be trusted, and at "
+                f"least 4 are needed ({counts}). Take more photographs near the frontal one, "
+                "choose another `triangulate.reference`, or relax the filters of `triangulate`."
+            )
+        quality = length[index].to(angle) - scene.reprojection_errors_px[index]
+        seen = observed[index, reference].to(quality)
+        return scene.points_world[index], quality + 3 * seen
+
+    def _filled(
+        self,
+        vertices: Float[Tensor, "vertex 3"],
+        faces: Int[Tensor, "face 3"],
+        points: Float[Tensor, "point 3"],
+        cameras: Cameras,
+        reference: int,
+        edge_px: float,
+    ) -> Float[Tensor, "filled 3"]:
+        """Give new vertices between far-apart ones, on a spline through all trusted points."""
+        pixels, _ = _project(vertices, cameras, reference)
+        wanted = fill_pixels(pixels, faces, edge_px)
+        known, depth = _project(points, cameras, reference)
+        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, self.config.fill_smoothing)
+        possible = inverse > 0.5 / depth.amax()
+        rays = rays_through(
+            wanted[possible], cameras.cam_from_world[reference], cameras.intrinsics[reference]
+        )
+        return cameras.centers_world[reference] + rays / inverse[possible, None]
+
+    def _facets(
+        self,
+        vertices: Float[Tensor, "vertex 3"],
+        views: Views,
+        cameras: Cameras,
+        reference: int,
+    ) -> Int[Tensor, "face 3"]:
+        """Triangulate, drop bridges, and peel what shows no object off the rim."""
+        pixels, _ = _project(vertices, cameras, reference)
+        faces = delaunay(pixels)
+        normals = normalize(face_normals(vertices, faces), dim=-1)
+        to_camera = normalize(
+            cameras.centers_world[reference] - vertices[faces].mean(dim=1), dim=-1
+        )
+        steepest = torch.deg2rad(normals.new_tensor(self.config.max_tilt_deg)).cos()
+        faces = faces[(normals * to_camera).sum(dim=-1) > steepest]
+        shown = _shown(pixels[faces], views, reference, self.config.dark_level)
+        thin = _altitude(vertices[faces]) < self.config.min_altitude
+        return peel(faces, (shown < self.config.min_coverage) | thin)
+
+
+def peel(faces: Int[Tensor, "face 3"], unwanted: Bool[Tensor, " face"]) -> Int[Tensor, "kept 3"]:
+    """Drop unwanted faces that touch the rim, again and again; inner ones stay, no holes."""
+    while True:
+        rim_edges = _rim_faces(faces)
+        drop = rim_edges & unwanted
+        if not drop.any():
+            return faces
+        faces, unwanted = faces[~drop], unwanted[~drop]
+
+
+def largest_component(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
+    """Keep the largest set of faces that hang together by edges."""
+    pairs, _ = face_pairs(faces)
+    label = torch.arange(len(faces), device=faces.device)
+    while len(pairs):
+        lowest = torch.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
+        spread_label = label.scatter_reduce(0, pairs[:, 0], lowest, "amin")
+        spread_label = spread_label.scatter_reduce(0, pairs[:, 1], lowest, "amin")
+        if torch.equal(spread_label, label):
+            break
+        label = spread_label
+    if len(faces) == 0:
+        return faces
+    return faces[label == label.mode().values]
+
+
+def smooth_over_mesh(
+    normals: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], rounds: int
+) -> Float[Tensor, "vertex 3"]:
+    """Average unit normals with those of neighbouring vertices, ``rounds`` times."""
+    source = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1)
+    target = faces[:, [1, 0, 2, 1, 0, 2]].reshape(-1)
+    for _ in range(rounds):
+        total = torch.zeros_like(normals).index_add(0, target, normals[source])
+        normals = normalize(normals + normalize(total, dim=-1), dim=-1)
+    return normals
+
+
+def _project(
+    points: Float[Tensor, "point 3"], cameras: Cameras, view: int
+) -> tuple[Float[Tensor, "point 2"], Float[Tensor, " point"]]:
+    return project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
+
+
+def _edge_for(num_points: int, pixels: Float[Tensor, "point 2"]) -> float:
+    """Give the edge of the triangular lattice that puts ``num_points`` on the hull's area."""
+    faces = delaunay(pixels)
+    a, b, c = pixels[faces].unbind(dim=1)
+    ab, ac = b - a, c - a
+    area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs().sum() / 2
+    return float((area / num_points * 2 / 3**0.5).sqrt())
+
+
+def _shown(
+    corners_px: Float[Tensor, "face 3 2"], views: Views, view: int, dark_level: float
+) -> Float[Tensor, " face"]:
+    """Give the share of each triangle that is object: not masked out, not dark."""
+    steps = [(a, b, 9 - a - b) for a in range(10) for b in range(10 - a)]
+    weights = corners_px.new_tensor(steps) * (1 - 3 / 27) / 9 + 1 / 27  # a little inside
+    pixels = weights @ corners_px
+    height, width = views.images.shape[-2:]
+    object_shown = views.images[view].mean(dim=0) > dark_level
+    if views.masks is not None:
+        object_shown = object_shown & views.masks[view]
+    sampled = grid_sample(
+        object_shown[None, None].to(corners_px),
+        grid_from_pixels(pixels, width, height)[None],
+        mode="nearest",
+        align_corners=False,
+    )
+    return sampled[0, 0].mean(dim=-1)
+
+
+def _altitude(corners: Float[Tensor, "face 3 3"]) -> Float[Tensor, " face"]:
+    """Give the smallest height over the longest edge; 0.87 for equal sides."""
+    longest = (corners - corners.roll(1, dims=1)).norm(dim=-1).amax(dim=1)
+    a, b, c = corners.unbind(dim=1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=-1)
+    return area / longest.square().clamp_min(1e-30)
+
+
+def _rim_faces(faces: Int[Tensor, "face 3"]) -> Bool[Tensor, " face"]:
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    _, inverse, counts = torch.unique(edges, dim=0, return_inverse=True, return_counts=True)
+    return (counts[inverse] == 1).reshape(-1, 3).any(dim=1)
