@@ -1,0 +1,140 @@
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from pimper_torch.geometry.lattice import Lattice, subdivide
+from pimper_torch.geometry.surfaces import face_normals
+
+
+def icosphere(subdivisions=1):
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return torch.tensor(sphere.vertices, dtype=torch.float64), torch.tensor(sphere.faces)
+
+
+def ragged_fan(seed=41):
+    """An open disc of triangles whose edges differ twentyfold in length."""
+    generator = torch.Generator().manual_seed(seed)
+    count = 9
+    angle = torch.arange(count, dtype=torch.float64) * (2 * torch.pi / count)
+    radius = 0.1 + 1.9 * torch.rand(count, generator=generator, dtype=torch.float64)
+    height = 0.3 * torch.randn(count, generator=generator, dtype=torch.float64)
+    rim = torch.stack([radius * angle.cos(), radius * angle.sin(), height], dim=1)
+    vertices = torch.cat([torch.zeros(1, 3, dtype=torch.float64), rim])
+    one = torch.arange(count)
+    return vertices, torch.stack([torch.zeros_like(one), 1 + one, 1 + (one + 1) % count], dim=1)
+
+
+def edge_counts(faces):
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    return torch.unique(edges, dim=0, return_counts=True)
+
+
+def euler(num_vertices, faces):
+    return num_vertices - len(edge_counts(faces)[0]) + len(faces)
+
+
+def all_spacings(facets, length):
+    return torch.full((len(facets),), length, dtype=torch.float64)
+
+
+SCENES = {
+    "closed": (*icosphere(), 0.08),
+    "ragged": (*ragged_fan(), 0.05),
+    "ragged, coarse": (*ragged_fan(seed=42), 0.7),
+    "one piece an edge": (*icosphere(0), 5.0),
+    "sliver with 1, 1 and 2 pieces": (
+        torch.tensor([[0.0, 0.1, 0], [-0.76, 0, 0], [0.76, 0, 0]], dtype=torch.float64),
+        torch.tensor([[1, 2, 0]]),
+        1.0,
+    ),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+def test_the_lattice_has_the_topology_of_the_coarse_mesh(scene):
+    vertices, facets, length = scene
+    lattice = subdivide(vertices, facets, all_spacings(facets, length))
+    assert lattice.faces.unique().tolist() == list(range(len(lattice.points)))
+    assert euler(len(lattice.points), lattice.faces) == euler(len(vertices), facets)
+    _, counts = edge_counts(lattice.faces)
+    assert counts.max() <= 2
+    if edge_counts(facets)[1].min() == 2:
+        assert counts.min() == 2
+    else:  # the rim is cut, not moved: its length is that of the coarse rim
+
+        def rim(points, faces):
+            ends, number = edge_counts(faces)
+            return (points[ends[number == 1]].diff(dim=1)).norm(dim=-1).sum()
+
+        assert_close(rim(lattice.points, lattice.faces), rim(vertices, facets))
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+def test_no_face_is_turned_and_areas_add_up(scene):
+    vertices, facets, length = scene
+    lattice = subdivide(vertices, facets, all_spacings(facets, length))
+    normals, whole = face_normals(lattice.points, lattice.faces), face_normals(vertices, facets)
+    along = torch.nn.functional.normalize(whole, dim=-1)[lattice.face_facet]
+    assert ((normals * along).sum(-1) > 1e-6 * length**2).all()
+    areas = whole.new_zeros(len(facets)).index_add(0, lattice.face_facet, normals.norm(dim=-1))
+    assert_close(areas, whole.norm(dim=-1))
+
+
+def test_edges_are_about_one_spacing_long_where_facets_are_well_shaped():
+    vertices, facets = icosphere()
+    lattice = subdivide(vertices, facets, all_spacings(facets, 0.05))
+    edges, _ = edge_counts(lattice.faces)
+    lengths = lattice.points[edges].diff(dim=1).norm(dim=-1)
+    assert 0.9 < float(lengths.median()) / 0.05 < 1.1
+    assert float(lengths.max()) < 2 * 0.05
+
+
+def test_an_edge_follows_the_finer_of_its_facets():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    lattice = subdivide(vertices, facets, torch.tensor([0.05, 0.5], dtype=torch.float64))
+    coordinate = lattice.points[:, 0]
+    on_diagonal = (lattice.points[:, 0] - lattice.points[:, 1]).abs() < 1e-9
+    on_top = lattice.points[:, 1] > 1 - 1e-9
+    assert on_diagonal.sum() == 29  # sqrt(2) / 0.05 pieces
+    assert on_top.sum() == 3
+    assert coordinate.isfinite().all()
+    edges, counts = edge_counts(lattice.faces)
+    inside = ~(counts == 1)
+    middle = lattice.points[edges].mean(dim=1)
+    rim = (middle[:, :2].min(dim=1).values < 1e-9) | (middle[:, :2].max(dim=1).values > 1 - 1e-9)
+    assert (inside == ~rim).all()
+
+
+def test_every_vertex_lies_where_its_facet_and_coordinates_say():
+    vertices, facets = ragged_fan()
+    lattice = subdivide(vertices, facets, all_spacings(facets, 0.05))
+    assert_close(lattice.interpolate(vertices, facets), lattice.points)
+    assert_close(lattice.barycentric.sum(dim=1), torch.ones(len(lattice.points)).double())
+    assert (lattice.barycentric >= 0).all()
+    for corner in range(3):  # a face's corners lie in the closed triangle of its facet
+        points = lattice.points[lattice.faces[:, corner]]
+        a, b, c = vertices[facets[lattice.face_facet]].unbind(dim=1)
+        normal = torch.linalg.cross(b - a, c - a)
+        assert ((points - a) * normal).sum(-1).abs().max() < 1e-12
+        for start, end in ((a, b), (b, c), (c, a)):
+            side = (torch.linalg.cross(end - start, points - start) * normal).sum(-1)
+            assert side.min() > -1e-12
+
+
+def test_vertices_the_coarse_mesh_does_not_use_are_left_out():
+    vertices, facets = icosphere(0)
+    more = torch.cat([torch.full((2, 3), 9.0, dtype=torch.float64), vertices])
+    lattice = subdivide(more, facets + 2, all_spacings(facets, 0.3))
+    assert lattice.points.abs().max() <= 1
+    assert isinstance(lattice, Lattice)
+
+
+def test_points_carry_gradients_to_the_coarse_mesh():
+    vertices, facets = icosphere(0)
+    vertices = vertices.clone().requires_grad_()
+    lattice = subdivide(vertices, facets, all_spacings(facets, 0.5))
+    lattice.points.sum().backward()
+    assert vertices.grad is not None
+    assert_close(vertices.grad.sum(), torch.tensor(3.0 * len(lattice.points)).double())
