@@ -1,6 +1,5 @@
 """Decomposition: every facet of the coarse mesh becomes a patch with a template."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -137,9 +136,8 @@ def group_by_size(
     Returns:
         Facets and (height, width) of each bucket.
     """
-    step = math.sqrt(2.0)  # at most twice the samples are padding, in a handful of sizes
-    rounded = step ** (sides.double().log2() * 2).ceil()
-    keys = rounded.ceil().long()
+    # Sizes in steps of a third of an octave: padding adds little, and buckets stay few.
+    keys = (2 ** ((sides.double().log2() * 3).ceil() / 3)).ceil().long()
     groups: dict[tuple[int, int], list[int]] = {}
     for facet, (width, height) in enumerate(keys.tolist()):
         groups.setdefault((height, width), []).append(facet)

@@ -83,7 +83,7 @@ class Warp(nn.Module):
             ),
         )
 
-    def _pyramid(self, views: Views) -> list[Float[Tensor, "view channels height width"]]:
+    def _pyramid(self, views: Views) -> list[Float[Tensor, "view channels _ _"]]:
         """Halve the images again and again; the last channel is 1 where a pixel is unusable."""
         usable = views.inside
         if views.masks is not None:
@@ -98,7 +98,7 @@ class Warp(nn.Module):
         self,
         templates: Templates,
         cameras: Cameras,
-        pyramid: list[Float[Tensor, "view channels height width"]],
+        pyramid: list[Float[Tensor, "view channels _ _"]],
         caster: RayCaster,
     ) -> Registered:
         world_from_patch = invert_rigid(templates.patch_from_world)
@@ -122,7 +122,7 @@ class Warp(nn.Module):
         points_world: Float[Tensor, "patch height width 3"],
         outward: Float[Tensor, "patch 3"],
         cameras: Cameras,
-        pyramid: list[Float[Tensor, "view channels height width"]],
+        pyramid: list[Float[Tensor, "view channels _ _"]],
         caster: RayCaster,
     ) -> tuple[Float[Tensor, "patch channel height width"], Bool[Tensor, "patch height width"]]:
         center = cameras.centers_world[view]
@@ -134,10 +134,8 @@ class Warp(nn.Module):
         pixels = pixels.reshape(*points_world.shape[:-1], 2)
         wanted = templates.inside & (facing > steepest) & (depth.reshape(facing.shape) > 0)
         if not wanted.any():
-            radiance = points_world.new_zeros(
-                len(facing), pyramid[0].shape[1] - 1, *facing.shape[1:]
-            )
-            return radiance, wanted
+            channels = pyramid[0].shape[1] - 1
+            return pyramid[0].new_zeros(len(facing), channels, *facing.shape[1:]), wanted
         level = pyramid_level(pixels)
         sampled = sample_pyramid([images[view] for images in pyramid], pixels, level)
         radiance, unusable = sampled[:, :-1], sampled[:, -1]
@@ -195,9 +193,9 @@ def sample_pyramid(
     """
     num, rows, columns = level.shape
     grid = grid_from_pixels(pixels, width=pyramid[0].shape[-1], height=pyramid[0].shape[-2])
-    grid = grid.reshape(1, num * rows, columns, 2).clamp(-3, 3)
-    level = level.clamp(0, len(pyramid) - 1)
-    total = pixels.new_zeros(num, pyramid[0].shape[0], rows, columns)
+    grid = grid.reshape(1, num * rows, columns, 2).clamp(-3, 3).to(pyramid[0])
+    level = level.clamp(0, len(pyramid) - 1).to(pyramid[0])
+    total = pyramid[0].new_zeros(num, pyramid[0].shape[0], rows, columns)
     for index, image in enumerate(pyramid):
         weight = (1 - (level - index).abs()).clamp_min(0)
         if not (weight > 0).any():

@@ -1,0 +1,17 @@
+import pytest
+import torch
+
+from pimper_torch.records import SparseScene
+from pimper_torch.scenes.cameras import arc_cameras
+from pimper_torch.scenes.render import render_shape
+from pimper_torch.scenes.shapes import Sphere
+from pimper_torch.scenes.sparse import sparse_scene
+
+
+@pytest.fixture(scope="session")
+def dome_cloud() -> SparseScene:
+    """A ball seen by five views on an arc of 50 degrees, with a thousand exact points."""
+    cameras = arc_cameras(5, width=160, height=120, focal_px=200.0, distance=4.0, sway_deg=0.0)
+    lights = torch.tensor([[0.4, 0.0, 0.0, 0.4]], dtype=torch.float64).expand(5, 4)
+    scene = render_shape(Sphere(), cameras, lights, lambda points: torch.ones_like(points))
+    return sparse_scene(scene, 1000, torch.Generator().manual_seed(0))

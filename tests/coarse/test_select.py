@@ -1,0 +1,94 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.coarse.select import (
+    frontal_view,
+    named_view,
+    neighbours_agree,
+    spread,
+    spread_to_number,
+    triangulation_angles,
+    views_near,
+)
+from pimper_torch.errors import InputError
+
+
+def test_frontal_view_is_the_middle_of_the_arc(dome_cloud):
+    assert frontal_view(dome_cloud) == 2
+
+
+def test_a_view_is_found_by_file_name_and_by_stem(dome_cloud):
+    name = dome_cloud.views.names[3]
+    assert named_view(dome_cloud.views, name) == 3
+    assert named_view(dome_cloud.views, name.rsplit(".", 1)[0]) == 3
+
+
+def test_an_unknown_reference_is_refused_with_the_known_names(dome_cloud):
+    with pytest.raises(InputError, match=dome_cloud.views.names[0]):
+        named_view(dome_cloud.views, "nobody")
+
+
+def test_triangulation_angle_is_the_widest_between_rays_that_saw_the_point(dome_cloud):
+    found = triangulation_angles(dome_cloud.points_world, dome_cloud.observed, dome_cloud.cameras)
+    point = int(dome_cloud.observed.sum(dim=1).argmin())
+    seeing = dome_cloud.observed[point].nonzero()[:, 0].tolist()
+    centers = dome_cloud.cameras.centers_world
+    widest = 0.0
+    for a in seeing:
+        for b in seeing:
+            ray_a = dome_cloud.points_world[point] - centers[a]
+            ray_b = dome_cloud.points_world[point] - centers[b]
+            cosine = torch.cosine_similarity(ray_a, ray_b, dim=0).clamp(-1, 1)
+            widest = max(widest, float(cosine.acos()))
+    assert_close(float(found[point]), widest, atol=1e-6, rtol=0)
+
+
+def test_views_near_counts_from_the_optical_axis(dome_cloud):
+    # Five views on an arc of 50 degrees: neighbours are about 12.5 degrees apart.
+    near = views_near(dome_cloud.cameras, 2, 16.0)
+    assert near.tolist() == [False, True, True, True, False]
+
+
+def test_points_of_another_layer_and_stray_points_disagree_with_their_neighbours():
+    generator = torch.Generator().manual_seed(1)
+    lateral = torch.rand(300, 2, generator=generator, dtype=torch.float64)
+    depth = 5 + 0.3 * lateral[:, 0]
+    depth[:10] += 2.0  # another layer
+    depth[10:20] += 0.12  # badly triangulated: several radii of a neighbourhood
+    points_cam = torch.cat([lateral, depth[:, None]], dim=1)
+    agree = neighbours_agree(
+        lateral * 500, points_cam, neighbours=12, max_slope=3.0, max_deviation=0.5
+    )
+    assert not agree[:20].any()
+    assert agree[20:].float().mean() > 0.98
+
+
+def test_neighbours_across_a_depth_edge_agree_each_with_its_own_side():
+    u, v = torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="xy")
+    lateral = torch.stack([u, v], dim=-1).reshape(-1, 2).double()
+    depth = torch.where(lateral[:, 0] < 9.5, 100.0, 160.0).double()
+    points_cam = torch.cat([lateral, depth[:, None]], dim=1)
+    agree = neighbours_agree(lateral, points_cam, neighbours=8, max_slope=3.0, max_deviation=0.5)
+    assert agree.float().mean() > 0.95
+
+
+def test_spread_keeps_its_distance_and_prefers_quality():
+    generator = torch.Generator().manual_seed(2)
+    pixels = 100 * torch.rand(400, 2, generator=generator, dtype=torch.float64)
+    quality = torch.rand(400, generator=generator, dtype=torch.float64)
+    chosen = spread(pixels, quality, 9.0)
+    distance = torch.cdist(pixels[chosen], pixels[chosen]).fill_diagonal_(torch.inf)
+    assert distance.min() > 9.0
+    assert quality.argmax() in chosen
+    # Nothing else would fit: every point is close to a chosen one that is at least as good.
+    near = torch.cdist(pixels, pixels[chosen]) <= 9.0
+    better = quality[chosen] >= quality[:, None]
+    assert (near & better).any(dim=1).all()
+
+
+def test_spread_to_number_comes_close_to_the_number():
+    generator = torch.Generator().manual_seed(3)
+    pixels = 100 * torch.rand(1000, 2, generator=generator, dtype=torch.float64)
+    chosen = spread_to_number(pixels, torch.ones(1000, dtype=torch.float64), 60)
+    assert abs(len(chosen) - 60) <= 6

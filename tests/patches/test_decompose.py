@@ -1,0 +1,147 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import barycentric_2d
+from pimper_torch.patches.decompose import (
+    Decompose,
+    DecomposeConfig,
+    enlarge,
+    facet_masks,
+    group_by_size,
+)
+
+
+def test_the_facet_lies_in_the_plane_z_0_and_the_camera_sees_its_front(plane_scene, plane_mesh):
+    patches = Decompose()(plane_mesh, plane_scene.cameras)
+    vertices, faces = plane_mesh.mesh.vertices_world, plane_mesh.mesh.faces
+    for bucket in patches.buckets:
+        corners = transform(bucket.patch_from_world, vertices[faces[bucket.facet]])
+        assert corners[..., 2].abs().max() < 1e-12
+        rotation = bucket.patch_from_world[:, :3, :3]
+        assert_close(rotation @ rotation.mT, torch.eye(3).expand_as(rotation).double())
+        assert_close(torch.linalg.det(rotation), torch.ones(len(rotation)).double())
+        center = plane_scene.cameras.centers_world[plane_mesh.reference]
+        in_patch = transform(bucket.patch_from_world, center.expand(len(rotation), 1, 3))
+        assert (in_patch[..., 2] < 0).all()  # z points into the surface
+
+
+def test_barycentric_coordinates_give_back_every_sample(plane_scene, plane_mesh):
+    patches = Decompose()(plane_mesh, plane_scene.cameras)
+    vertices, faces = plane_mesh.mesh.vertices_world, plane_mesh.mesh.faces
+    for bucket in patches.buckets:
+        corners = vertices[faces[bucket.facet]]
+        blended = torch.einsum("phwc,pcx->phwx", bucket.barycentric, corners)
+        points = bucket.points_patch
+        in_patch = transform(bucket.patch_from_world, blended.flatten(1, 2))
+        assert_close(in_patch, points.flatten(1, 2), atol=1e-9, rtol=0)
+
+
+def test_every_point_near_a_facet_has_a_sample_and_samples_are_a_pixel_apart(
+    plane_scene, plane_mesh
+):
+    config = DecomposeConfig(overlap_samples=5.0)
+    patches = Decompose(config)(plane_mesh, plane_scene.cameras)
+    for bucket in patches.buckets:
+        spacing = bucket.spacing[:, None, None]
+        area = bucket.inside.sum(dim=(1, 2)) * bucket.spacing**2
+        corners = transform(
+            bucket.patch_from_world,
+            plane_mesh.mesh.vertices_world[plane_mesh.mesh.faces[bucket.facet]],
+        )[..., :2]
+        enlarged = enlarge(corners, 5.0 * bucket.spacing[0])
+        ab, ac = enlarged[:, 1] - enlarged[:, 0], enlarged[:, 2] - enlarged[:, 0]
+        wanted = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs() / 2
+        # Whole samples along the rim, and corners clipped at twice the overlap: 3 %.
+        assert ((area - wanted).abs() / wanted < 0.03).all()
+        reference = plane_mesh.reference
+        pixels, _ = project(
+            torch.linalg.solve(
+                bucket.patch_from_world[:, None, None, :3, :3],
+                (bucket.points_patch - bucket.patch_from_world[:, None, None, :3, 3])[..., None],
+            )[..., 0].reshape(-1, 3),
+            plane_scene.cameras.cam_from_world[reference],
+            plane_scene.cameras.intrinsics[reference],
+        )
+        steps = pixels.reshape(*spacing.shape[:1], *bucket.depth.shape[1:], 2).diff(dim=2)
+        assert 0.8 < steps.norm(dim=-1).median() < 1.2
+
+
+def test_enlarged_edges_are_parallel_and_moved_by_the_distance():
+    generator = torch.Generator().manual_seed(0)
+    corners = torch.randn(20, 3, 2, generator=generator, dtype=torch.float64)
+    moved = enlarge(corners, torch.tensor(0.3, dtype=torch.float64))
+    old = corners.roll(-1, dims=1) - corners
+    new = moved.roll(-1, dims=1) - moved
+    cross = old[..., 0] * new[..., 1] - old[..., 1] * new[..., 0]
+    assert cross.abs().max() < 1e-9
+    normal = torch.stack([old[..., 1], -old[..., 0]], dim=-1) / old.norm(dim=-1, keepdim=True)
+    shift = ((moved - corners) * normal).sum(dim=-1)
+    inward = ((corners.mean(dim=1, keepdim=True) - corners) * normal).sum(dim=-1).sign()
+    assert_close(-inward * shift, torch.full((20, 3), 0.3, dtype=torch.float64))
+
+
+def test_buckets_hold_every_facet_once_and_fit_their_rasters():
+    generator = torch.Generator().manual_seed(1)
+    sides = torch.randint(5, 90, (300, 2), generator=generator)
+    buckets = group_by_size(sides, bucket_samples=20_000)
+    listed = torch.cat([facets for facets, _ in buckets])
+    assert sorted(listed.tolist()) == list(range(300))
+    for facets, (height, width) in buckets:
+        assert (sides[facets, 0] <= width).all()
+        assert (sides[facets, 1] <= height).all()
+        assert len(facets) * height * width <= 20_000
+    padded = sum(len(facets) * height * width for facets, (height, width) in buckets)
+    assert padded < 1.6 * sides.prod(dim=1).sum()
+
+
+def test_masks_belong_by_barycentric_coordinates(plane_scene, plane_mesh):
+    view, overlap = 0, 0.1
+    masks = facet_masks(plane_mesh, plane_scene.cameras, view, overlap)
+    vertices, faces = plane_mesh.mesh.vertices_world, plane_mesh.mesh.faces
+    corners = vertices[faces]
+    # Oracle: project the enlarged triangle's corners and test pixels in the image; a plane's
+    # image keeps straight lines straight.
+    edge = corners.roll(-1, dims=1) - corners
+    normal = torch.linalg.cross(edge[:, 0], edge[:, 1])
+    in_plane = torch.linalg.cross(edge, normal[:, None].expand_as(edge))
+    in_plane = in_plane / in_plane.norm(dim=-1, keepdim=True)
+    pixels = torch.stack(
+        torch.meshgrid(
+            torch.arange(200, dtype=torch.float64) + 0.5,
+            torch.arange(160, dtype=torch.float64) + 0.5,
+            indexing="xy",
+        ),
+        dim=-1,
+    )
+    for face in range(len(faces)):
+        moved = corners[face] + overlap * in_plane[face]  # a point on each moved edge
+        lines = [(moved[i], edge[face, i]) for i in range(3)]
+        enlarged = torch.stack([_meet(lines[i - 1], lines[i]) for i in range(3)])
+        image, _ = project(
+            enlarged, plane_scene.cameras.cam_from_world[view], plane_scene.cameras.intrinsics[view]
+        )
+        inside = (barycentric_2d(pixels, image[None, None]) >= 0).all(dim=-1)
+        assert (inside != masks[face]).sum() <= 2  # rounding on the rim
+
+
+def _meet(first, second):
+    (p, d), (q, e) = first, second
+    s = torch.linalg.lstsq(torch.stack([d, -e], dim=1), (q - p)[:, None]).solution[0, 0]
+    return p + s * d
+
+
+def test_a_mesh_without_facets_is_refused(plane_scene, plane_mesh):
+    empty = plane_mesh.replace(
+        mesh=plane_mesh.mesh.replace(faces=torch.zeros(0, 3, dtype=torch.long))
+    )
+    with pytest.raises(ReconstructionError, match="0 facets"):
+        Decompose()(empty, plane_scene.cameras)
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ConfigError, match="overlap_samples"):
+        DecomposeConfig(overlap_samples=0.0)

@@ -1,0 +1,140 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.patches.decompose import Decompose
+from pimper_torch.patches.warp import (
+    Warp,
+    WarpConfig,
+    missing_share,
+    pyramid_level,
+    sample_pyramid,
+)
+from pimper_torch.records import CoarseMesh, Mesh
+
+
+@pytest.fixture
+def registered(plane_scene, plane_mesh):
+    patches = Decompose()(plane_mesh, plane_scene.cameras)
+    return Warp()(plane_scene.views, plane_scene.cameras, patches)
+
+
+def _points_world(templates):
+    flat = templates.points_patch.flatten(1, 2)
+    return transform(invert_rigid(templates.patch_from_world), flat).view_as(templates.points_patch)
+
+
+def test_every_view_gives_the_albedo_at_each_samples_own_place(registered):
+    for templates, seen in zip(registered.patches.buckets, registered.buckets, strict=True):
+        points = _points_world(templates)
+        x, y = points[..., 0], points[..., 1]
+        truth = torch.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 - 0.1 * x + 0.1 * y], dim=1)
+        error = (seen.radiance - truth[:, None]).abs() * seen.valid[:, :, None]
+        # A ramp on a plane is not quite a ramp in a perspective image: its curvature over a
+        # pixel is far below 1e-3, half a pixel of misplacement is 1.5e-3.
+        assert error.max() < 4e-4
+        assert (seen.valid & templates.inside[:, None]).float().mean() > 0.2
+
+
+def test_nothing_is_said_about_missing_samples(registered):
+    for seen in registered.buckets:
+        assert (seen.radiance * ~seen.valid[:, :, None]).abs().max() == 0
+    assert 0 <= missing_share(registered) < 0.2
+
+
+def test_saturated_dark_masked_and_outside_samples_are_missing(plane_scene, plane_mesh):
+    patches = Decompose()(plane_mesh, plane_scene.cameras)
+    images = plane_scene.views.images.clone()
+    images[0] = 1.0
+    images[1] = 0.005
+    masks = plane_scene.views.inside.clone()
+    masks[2] = False
+    views = plane_scene.views.replace(images=images, masks=masks)
+    shifted = plane_scene.cameras.intrinsics.clone()
+    shifted[3, 0, 2] += 1000  # everything of view 3 falls outside its frame
+    cameras = plane_scene.cameras.replace(intrinsics=shifted)
+    for seen in Warp()(views, cameras, patches).buckets:
+        valid = seen.valid.sum(dim=(0, 2, 3))
+        assert valid[:4].tolist() == [0, 0, 0, 0]
+        assert valid[4] > 0
+
+
+def test_a_facet_turned_away_is_not_seen(plane_scene, plane_mesh):
+    flipped = plane_mesh.replace(mesh=plane_mesh.mesh.replace(faces=plane_mesh.mesh.faces.flip(1)))
+    patches = Decompose()(flipped, plane_scene.cameras)
+    for seen in Warp()(plane_scene.views, plane_scene.cameras, patches).buckets:
+        assert not seen.valid.any()
+
+
+def test_a_facet_in_front_hides_the_one_behind(plane_scene, plane_mesh):
+    vertices, faces = plane_mesh.mesh.vertices_world, plane_mesh.mesh.faces
+    lid = 0.5 * vertices + torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64)
+    both = CoarseMesh(
+        mesh=Mesh(vertices_world=torch.cat([vertices, lid]), faces=torch.cat([faces, faces + 4])),
+        reference=2,
+        is_point=torch.ones(8, dtype=torch.bool),
+    )
+    patches = Decompose()(both, plane_scene.cameras)
+    seen = Warp()(plane_scene.views, plane_scene.cameras, patches)
+    center = plane_scene.cameras.centers_world[2]
+    for templates, bucket in zip(patches.buckets, seen.buckets, strict=True):
+        points = _points_world(templates)
+        # Where the ray to the centre of view 2 passes the lid's plane, in the lid's corners.
+        normal = torch.linalg.cross(lid[1] - lid[0], lid[2] - lid[0])
+        ray = center - points
+        reach = ((lid[0] - points) @ normal) / (ray @ normal)
+        at = points + reach[..., None] * ray
+        covered = torch.zeros_like(templates.inside)
+        deep = torch.zeros_like(templates.inside)
+        for face in faces:
+            a, b, c = lid[face]
+            inverse = torch.linalg.inv(torch.stack([a, b, c], dim=1))
+            weights = at @ inverse.mT
+            covered |= (weights > -0.08).all(dim=-1)
+            deep |= (weights > 0.08).all(dim=-1)
+        behind = (reach > 1e-3) & (reach < 1) & (templates.facet < 2)[:, None, None]
+        assert not (bucket.valid[:, 2] & deep & behind).any()
+        free = templates.inside & ~covered & (templates.facet < 2)[:, None, None]
+        assert (bucket.valid[:, 2] | ~free).float().mean() > 0.98
+
+
+def test_pyramid_level_is_the_logarithm_of_the_footprint():
+    rows, columns = torch.meshgrid(torch.arange(6.0), torch.arange(8.0), indexing="ij")
+    for footprint, level in ((0.5, 0.0), (1.0, 0.0), (2.0, 1.0), (8.0, 3.0)):
+        pixels = footprint * torch.stack([columns, rows], dim=-1)[None]
+        assert_close(pyramid_level(pixels), torch.full((1, 6, 8), level))
+
+
+def test_a_fine_stripe_pattern_seen_from_afar_averages_out():
+    stripes = (torch.arange(64) % 2).float().expand(1, 64, 64)
+    coarse = torch.nn.functional.avg_pool2d(stripes[None], 4)[0]
+    level_2 = coarse.expand(1, 16, 16)
+    level_1 = torch.nn.functional.avg_pool2d(stripes[None], 2)[0]
+    rows, columns = torch.meshgrid(torch.arange(12.0), torch.arange(12.0), indexing="ij")
+    pixels = (4 * torch.stack([columns, rows], dim=-1) + 8.5)[None]
+    sampled = sample_pyramid([stripes, level_1, level_2], pixels, pyramid_level(pixels))
+    assert_close(sampled, torch.full_like(sampled, 0.5))
+
+
+def test_radiance_is_differentiable_in_the_images_and_the_relief(plane_scene, plane_mesh):
+    patches = Decompose()(plane_mesh, plane_scene.cameras)
+    bucket = patches.buckets[0]
+    depth = bucket.depth.clone().requires_grad_()
+    images = plane_scene.views.images.clone().requires_grad_()
+    lifted = patches.replace(buckets=(bucket.replace(depth=depth),))
+    seen = Warp()(plane_scene.views.replace(images=images), plane_scene.cameras, lifted)
+    seen.buckets[0].radiance.sum().backward()
+    assert images.grad is not None
+    assert images.grad.abs().sum() > 0
+    assert depth.grad is not None
+    # Lifting a sample moves it along the ramp in every oblique view.
+    assert (depth.grad[seen.buckets[0].valid.any(dim=1)].abs() > 0).float().mean() > 0.9
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ConfigError, match="saturation_level"):
+        WarpConfig(dark_level=0.5, saturation_level=0.4)
+    with pytest.raises(ConfigError, match="max_tilt_deg"):
+        WarpConfig(max_tilt_deg=90.0)
