@@ -22,7 +22,7 @@ class StageReport(Record):
     name: str
     seconds: float
     peak_memory_mb: float
-    figures: dict[str, float]
+    figures: dict[str, int | float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -1,0 +1,174 @@
+"""What a run tells about its stages: time, memory, and the figures of each record."""
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import singledispatch
+from typing import Protocol, runtime_checkable
+
+from torch import Tensor, nn
+
+from pimper_torch.patches.warp import missing_share
+from pimper_torch.progress import listening
+from pimper_torch.records import (
+    CoarseMesh,
+    DepthPatches,
+    Mesh,
+    PatchSet,
+    PatchViews,
+    PhotometricPatches,
+    SparseScene,
+    StageReport,
+    Surface,
+)
+
+
+@runtime_checkable
+class Observer(Protocol):
+    """Whoever wants to show how a run is going."""
+
+    def started(self, stage: str) -> None:
+        """Hear that a stage begins."""
+
+    def progressed(self, done: int, total: int) -> None:
+        """Hear that the stage has done some of its batches."""
+
+    def finished(self, report: StageReport) -> None:
+        """Hear that a stage ended, what it cost and what it found."""
+
+
+class Silent:
+    """An observer that shows nothing."""
+
+    def started(self, stage: str) -> None:
+        """Do nothing."""
+
+    def progressed(self, done: int, total: int) -> None:
+        """Do nothing."""
+
+    def finished(self, report: StageReport) -> None:
+        """Do nothing."""
+
+
+@contextmanager
+def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]]:
+    """Time the direct submodules of ``chain`` while the ``with`` block calls them.
+
+    Yields:
+        The list that a report is appended to whenever a submodule has run.
+    """
+    reports: list[StageReport] = []
+    began: dict[str, int | float] = {}
+    hooks = []
+    for name, stage in chain.named_children():
+
+        def before(_: nn.Module, __: tuple[object, ...], name: str = name) -> None:
+            began[name] = time.perf_counter()
+            observer.started(name)
+
+        def after(_: nn.Module, __: tuple[object, ...], output: object, name: str = name) -> None:
+            reports.append(
+                StageReport(
+                    name=name,
+                    seconds=time.perf_counter() - began[name],
+                    peak_memory_mb=peak_memory_mb(),
+                    figures=figures(output),
+                )
+            )
+            observer.finished(reports[-1])
+
+        hooks += [stage.register_forward_pre_hook(before), stage.register_forward_hook(after)]
+    try:
+        with listening(observer.progressed):
+            yield reports
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def peak_memory_mb() -> float:
+    """Give the highest resident memory of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes there, kilobytes here
+
+
+@singledispatch
+def figures(record: object) -> dict[str, int | float]:
+    """Give the counts and shares of a record that are worth telling."""
+    return {}
+
+
+@figures.register
+def _(scene: SparseScene) -> dict[str, int | float]:
+    length = len(scene.observation_point) / max(1, len(scene.points_world))
+    return {
+        "views": scene.views.num_views + len(scene.unregistered),
+        "registered": scene.views.num_views,
+        "sparse_points": len(scene.points_world),
+        "mean_track_length": length,
+        "mean_reprojection_px": _mean(scene.reprojection_errors_px),
+    }
+
+
+@figures.register
+def _(coarse: CoarseMesh) -> dict[str, int | float]:
+    return {
+        "mesh_points": len(coarse.mesh.vertices_world),
+        "filled_points": int((~coarse.is_point).sum()),
+        "triangles": len(coarse.mesh.faces),
+    }
+
+
+@figures.register
+def _(patches: PatchSet) -> dict[str, int | float]:
+    return {
+        "patches": patches.num_patches,
+        "template_samples": sum(int(bucket.inside.sum()) for bucket in patches.buckets),
+    }
+
+
+@figures.register
+def _(seen: PatchViews) -> dict[str, int | float]:
+    num_views = seen.buckets[0].valid.shape[1]
+    samples = sum(int(bucket.inside.sum()) for bucket in seen.patches.buckets) * num_views
+    return {"samples": samples, "missing_share": missing_share(seen)}
+
+
+@figures.register
+def _(photometric: PhotometricPatches) -> dict[str, int | float]:
+    pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
+    inside = sum(int(templates.inside.sum()) for templates, _ in pairs)
+    count = photometric.patches.num_patches
+    ended = [bucket.convergence for _, bucket in pairs]
+    return {
+        "valid_share": sum(int(bucket.valid.sum()) for _, bucket in pairs) / inside,
+        "determined_patches": sum(int(bucket.determined.sum()) for _, bucket in pairs),
+        "converged_patches": sum(int(end.converged.sum()) for end in ended),
+        "mean_iterations": sum(float(end.iterations.sum()) for end in ended) / count,
+        "mean_residual": sum(float(end.residual.sum()) for end in ended) / count,
+    }
+
+
+@figures.register
+def _(depths: DepthPatches) -> dict[str, int | float]:
+    return {"valid_depths": sum(int(bucket.valid.sum()) for bucket in depths.buckets)}
+
+
+@figures.register
+def _(surface: Surface) -> dict[str, int | float]:
+    return {
+        "lattice_points": len(surface.vertices_world),
+        "supported_share": _mean((surface.confidence > 0).float()),
+        "relative_residual": _mean(surface.convergence.residual),
+    }
+
+
+@figures.register
+def _(mesh: Mesh) -> dict[str, int | float]:
+    return {"vertices": len(mesh.vertices_world), "faces": len(mesh.faces)}
+
+
+def _mean(values: Tensor) -> float:
+    return float(values.mean()) if len(values) else 0.0

@@ -1,0 +1,72 @@
+import pytest
+import torch
+from torch import nn
+
+from pimper_torch.progress import report
+from pimper_torch.records import Mesh
+from pimper_torch.reporting import Silent, figures, peak_memory_mb, recorded
+
+
+class Tetrahedron(nn.Module):
+    def forward(self) -> Mesh:
+        report(1, 1)
+        faces = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+        return Mesh(vertices_world=torch.eye(4)[:, :3].contiguous(), faces=faces)
+
+
+class Broken(nn.Module):
+    def forward(self) -> Mesh:
+        raise ValueError("broken on purpose")
+
+
+class Chain(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = Tetrahedron()
+        self.second = Tetrahedron()
+        self.broken = Broken()
+
+
+class Listener(Silent):
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    def started(self, stage):
+        self.heard.append(f"started {stage}")
+
+    def progressed(self, done, total):
+        self.heard.append(f"{done}/{total}")
+
+    def finished(self, report):
+        self.heard.append(f"finished {report.name}")
+
+
+def test_stages_are_reported_in_the_order_they_run_with_their_figures():
+    chain, listener = Chain(), Listener()
+    with recorded(chain, listener) as reports:
+        chain.second()
+        chain.first()
+    assert [entry.name for entry in reports] == ["second", "first"]
+    assert reports[0].figures == {"vertices": 4, "faces": 4}
+    assert all(entry.seconds >= 0 and entry.peak_memory_mb > 10 for entry in reports)
+    assert listener.heard[:3] == ["started second", "1/1", "finished second"]
+
+
+def test_no_hook_stays_behind_even_after_a_failure():
+    chain, listener = Chain(), Listener()
+    with pytest.raises(ValueError, match="on purpose"), recorded(chain, listener):
+        chain.broken()
+    chain.first()
+    assert listener.heard == ["started broken"]
+
+
+def test_peak_memory_never_falls_and_sees_an_allocation():
+    before = peak_memory_mb()
+    held = torch.ones(64 * 2**20 // 4)
+    assert peak_memory_mb() >= before
+    assert before < 100_000
+    assert held.sum() > 0
+
+
+def test_what_has_no_figures_reports_none():
+    assert figures("nothing of ours") == {}
