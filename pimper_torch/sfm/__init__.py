@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""Photographs to cameras and a sparse cloud."""

@@ -1,0 +1,107 @@
+"""A sparse model before it has photographs: what SfM finds and COLMAP's folders hold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.records import Lens, Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SparseModel(Record):
+    """Registered views and the cloud that ties them together, in float64 on the CPU.
+
+    Attributes:
+        names: Of the registered photographs.
+        lenses: One a view, before undistortion.
+        cam_from_world: Rigid.
+        points_world: The cloud.
+        observation_point: Which point each observation sees.
+        observation_view: Which view it is made in.
+        observation_pixels: Where, in the photograph before undistortion.
+    """
+
+    names: tuple[str, ...]
+    lenses: tuple[Lens, ...]
+    cam_from_world: Float[Tensor, "view 4 4"]
+    points_world: Float[Tensor, "point 3"]
+    observation_point: Int[Tensor, " observation"]
+    observation_view: Int[Tensor, " observation"]
+    observation_pixels: Float[Tensor, "observation 2"]
+
+    @property
+    def num_views(self) -> int:
+        """How many views are registered."""
+        return len(self.names)
+
+
+def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
+    """Keep some views of a model, in the order given, and the points that two of them see.
+
+    Args:
+        model: Any.
+        chosen: Indices into the model's views, without repetition.
+
+    Returns:
+        Points in their old order. Observations are sorted by point, then view.
+    """
+    new_view = torch.full((model.num_views,), -1)
+    new_view[torch.tensor(chosen, dtype=torch.long)] = torch.arange(len(chosen))
+    view = new_view[model.observation_view]
+    seen = torch.zeros(len(model.points_world), len(chosen), dtype=torch.bool)
+    seen[model.observation_point[view >= 0], view[view >= 0]] = True
+    tied = seen.sum(dim=1) >= 2
+    new_point = torch.cumsum(tied, dim=0) - 1
+    kept = torch.nonzero((view >= 0) & tied[model.observation_point])[:, 0]
+    point, view = new_point[model.observation_point[kept]], view[kept]
+    order = torch.argsort(point * max(len(chosen), 1) + view, stable=True)
+    return SparseModel(
+        names=tuple(model.names[index] for index in chosen),
+        lenses=tuple(model.lenses[index] for index in chosen),
+        cam_from_world=model.cam_from_world[torch.tensor(chosen, dtype=torch.long)],
+        points_world=model.points_world[tied],
+        observation_point=point[order],
+        observation_view=view[order],
+        observation_pixels=model.observation_pixels[kept][order],
+    )
+
+
+def match_names(model: SparseModel, names: Sequence[str], folder: Path) -> SparseModel:
+    """Find the photographs in a model by file name and put it in their order.
+
+    A model's image may lie in a subfolder: where no image has the photograph's name as it
+    is, the last part of the image's path counts.
+
+    Args:
+        model: Any.
+        names: Of the photographs.
+        folder: Where the model came from, for the message.
+
+    Raises:
+        InputError: No photograph is in the model.
+    """
+    exact = {name: index for index, name in enumerate(model.names)}
+    by_file = {PurePosixPath(name).name: index for index, name in enumerate(model.names)}
+    found = [exact.get(name, by_file.get(PurePosixPath(name).name)) for name in names]
+    chosen = [index for index in found if index is not None]
+    if not chosen:
+        raise InputError(
+            f"The COLMAP model in {folder} has none of the photographs. Its images are "
+            f"{list_some(model.names)}; the photographs are {list_some(names)}. Rename the "
+            "photographs to match, or leave the model out to run structure from motion."
+        )
+    renamed = select_views(model, chosen)
+    return renamed.replace(
+        names=tuple(name for name, index in zip(names, found, strict=True) if index is not None)
+    )
+
+
+def list_some(names: Sequence[str], most: int = 8) -> str:
+    """Name a few of many."""
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

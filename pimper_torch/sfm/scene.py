@@ -1,0 +1,129 @@
+"""From a sparse model and the photographs to the scene, and back to COLMAP's files."""
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Cameras, SparseScene, Views
+from pimper_torch.sfm import colmap
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.photographs import to_bytes
+from pimper_torch.sfm.undistort import undistort
+
+
+def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
+    """Undistort the registered photographs and put them beside their cameras and cloud.
+
+    Args:
+        views: All photographs, in any order.
+        model: Its names are among theirs, and its lenses have their sizes.
+
+    Returns:
+        Views in the model's order. Device and dtype are those of the photographs.
+    """
+    number = {name: index for index, name in enumerate(views.names)}
+    undistorted, intrinsics = undistort(
+        take_views(views, [number[name] for name in model.names]), model.lenses
+    )
+    like = views.images
+    return SparseScene(
+        views=undistorted,
+        cameras=Cameras(
+            intrinsics=intrinsics,
+            cam_from_world=model.cam_from_world.to(like),
+            sizes_px=undistorted.sizes_px,
+        ),
+        points_world=model.points_world.to(like),
+        reprojection_errors_px=reprojection_errors(model).to(like),
+        observation_point=model.observation_point.to(like.device),
+        observation_view=model.observation_view.to(like.device),
+        observation_pixels=model.observation_pixels.to(like),
+        lenses=model.lenses,
+        unregistered=tuple(name for name in views.names if name not in model.names),
+    )
+
+
+def write_model(scene: SparseScene, folder: Path) -> None:
+    """Write the scene as a COLMAP model in the same frame.
+
+    The cameras are the photographs' own lenses, not the pinholes, and the observations are
+    where they were made: the model belongs to the photographs as they were loaded, and
+    reading it back with them gives the same scene.
+
+    Args:
+        scene: Any.
+        folder: Gets ``cameras.bin``, ``images.bin``, ``points3D.bin`` and what else the
+            installed COLMAP writes; made if it does not exist.
+
+    Raises:
+        OutputError: The files cannot be written.
+    """
+    model = SparseModel(
+        names=scene.views.names,
+        lenses=scene.lenses,
+        cam_from_world=scene.cameras.cam_from_world.detach().cpu().double(),
+        points_world=scene.points_world.detach().cpu().double(),
+        observation_point=scene.observation_point.cpu(),
+        observation_view=scene.observation_view.cpu(),
+        observation_pixels=scene.observation_pixels.detach().cpu().double(),
+    )
+    colmap.write_binary(model, point_colors(scene).cpu().numpy(), folder)
+
+
+def take_views(views: Views, chosen: list[int]) -> Views:
+    """Keep some views, in the order given."""
+    index = torch.tensor(chosen, dtype=torch.long, device=views.images.device)
+    return views.replace(
+        images=views.images[index],
+        sizes_px=views.sizes_px[index],
+        names=tuple(views.names[item] for item in chosen),
+        masks=None if views.masks is None else views.masks[index],
+        focals_px=views.focals_px[index],
+    )
+
+
+def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
+    """Average the distance between where a point is seen and where it should be, in pixels.
+
+    Infinite for a point that a camera sees from behind.
+    """
+    residual = torch.full_like(model.observation_pixels[:, 0], torch.inf)
+    for index, lens in enumerate(model.lenses):
+        here = torch.nonzero(model.observation_view == index)[:, 0]
+        points = model.points_world[model.observation_point[here]]
+        expected = colmap.distort(lens, transform(model.cam_from_world[index], points))
+        distance = (expected - model.observation_pixels[here]).norm(dim=-1)
+        residual[here] = distance.nan_to_num(nan=torch.inf)
+    total = torch.zeros_like(model.points_world[:, 0])
+    total = total.index_add(0, model.observation_point, residual)
+    count = torch.bincount(model.observation_point, minlength=len(total))
+    return total / count.clamp_min(1)
+
+
+def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
+    """Average what the views that see a point show there, as 8-bit sRGB."""
+    images = scene.views.images
+    height, width = images.shape[-2:]
+    total = images.new_zeros(len(scene.points_world), images.shape[1])
+    for index in range(scene.views.num_views):
+        seen = _points_in(scene, index)
+        pixels, _ = project(
+            scene.points_world[seen],
+            scene.cameras.cam_from_world[index],
+            scene.cameras.intrinsics[index],
+        )
+        grid = grid_from_pixels(pixels, width, height)[None, None]
+        colors = grid_sample(images[index][None], grid, mode="bilinear", align_corners=False)
+        total = total.index_add(0, seen, colors[0, :, 0].T)
+    count = torch.bincount(scene.observation_point, minlength=len(total)).clamp_min(1)
+    return to_bytes((total / count[:, None]).expand(-1, 3))
+
+
+def _points_in(scene: SparseScene, view: int) -> Int[Tensor, " seen"]:
+    return scene.observation_point[scene.observation_view == view]
