@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""Linear algebra the stages share: sparse systems, and Poisson's equation on rasters."""

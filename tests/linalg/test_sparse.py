@@ -1,0 +1,140 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.linalg.sparse import (
+    SingularSystemError,
+    SparseCholesky,
+    scatter_blocks,
+    solve_spd,
+)
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(4127)
+
+
+def edges_of_a_path_with_shortcuts(size):
+    first = torch.arange(size - 1)
+    start = torch.cat([first, torch.arange(0, size - 5, 3)])
+    end = torch.cat([first + 1, torch.arange(0, size - 5, 3) + 5])
+    return start, end
+
+
+def laplacian(weights, start, end, anchor):
+    """Every edge adds four entries, so that diagonal entries repeat."""
+    loop = torch.arange(len(anchor))
+    rows = torch.cat([start, end, start, end, loop])
+    cols = torch.cat([start, end, end, start, loop])
+    values = torch.cat([weights, weights, -weights, -weights, anchor])
+    return rows, cols, values
+
+
+def small_system(generator, size=12):
+    start, end = edges_of_a_path_with_shortcuts(size)
+    weights = 0.5 + torch.rand(len(start), generator=generator, dtype=torch.float64)
+    anchor = 0.1 * torch.rand(size, generator=generator, dtype=torch.float64)
+    return start, end, weights, anchor
+
+
+def dense(rows, cols, values, size):
+    matrix = torch.zeros(size, size, dtype=values.dtype)
+    return matrix.index_put((rows, cols), values, accumulate=True)
+
+
+@pytest.mark.parametrize("columns", [(), (1,), (3,), (0,)])
+def test_solutions_equal_those_of_a_dense_solve(generator, columns):
+    start, end, weights, anchor = small_system(generator)
+    rows, cols, values = laplacian(weights, start, end, anchor)
+    order = torch.randperm(len(rows), generator=generator)
+    rhs = torch.randn(12, *columns, generator=generator, dtype=torch.float64)
+    found = solve_spd(rows[order], cols[order], values[order], rhs)
+    expected = torch.linalg.solve(dense(rows, cols, values, 12), rhs.reshape(12, -1))
+    assert_close(found, expected.reshape(rhs.shape))
+
+
+def test_gradients_reach_matrix_and_right_hand_side(generator):
+    start, end, weights, anchor = small_system(generator, size=8)
+    rhs = torch.randn(8, 2, generator=generator, dtype=torch.float64)
+    inputs = [tensor.requires_grad_() for tensor in (weights, anchor, rhs)]
+
+    def solve(weights, anchor, rhs):
+        return solve_spd(*laplacian(weights, start, end, anchor), rhs)
+
+    assert torch.autograd.gradcheck(solve, inputs)
+    assert torch.autograd.gradgradcheck(solve, inputs)
+
+
+def test_one_factor_serves_many_right_hand_sides(generator):
+    start, end, weights, anchor = small_system(generator)
+    rows, cols, values = laplacian(weights, start, end, anchor)
+    factor = SparseCholesky(rows, cols, values, size=12)
+    rhs = torch.randn(2, 12, generator=generator, dtype=torch.float64)
+    matrix = dense(rows, cols, values, 12)
+    for one in rhs:
+        assert_close(matrix @ factor.solve(one), one)
+
+
+def test_float32_input_gets_a_float32_answer_computed_in_float64():
+    # 1 + 1e-6 and 1 differ by only 8 float32 steps: eliminated in float32, the digits go.
+    delta = 2.0**-20
+    values = torch.tensor([1.0, 1.0, 1.0, 1.0 + delta])
+    rows, cols = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 0, 1])
+    found = solve_spd(rows, cols, values, torch.tensor([0.0, delta]))
+    assert found.dtype == torch.float32
+    assert_close(found, torch.tensor([-1.0, 1.0]), rtol=1e-6, atol=0)
+
+
+def test_scaling_an_unknowns_unit_does_not_make_the_system_singular(generator):
+    start, end, weights, anchor = small_system(generator)
+    rows, cols, values = laplacian(weights, start, end, anchor)
+    unit = 10 ** torch.linspace(-9, 9, 12, dtype=torch.float64)
+    rhs = torch.randn(12, generator=generator, dtype=torch.float64)
+    found = solve_spd(rows, cols, values * unit[rows] * unit[cols], rhs * unit)
+    assert_close(found * unit, solve_spd(rows, cols, values, rhs))
+
+
+def test_blocks_land_where_kronecker_puts_them(generator):
+    blocks = torch.randn(3, 2, 2, generator=generator, dtype=torch.float64)
+    rows, cols, values = scatter_blocks(torch.tensor([0, 2, 2]), torch.tensor([1, 0, 0]), blocks)
+    expected = torch.zeros(6, 6, dtype=torch.float64)
+    expected[0:2, 2:4] = blocks[0]
+    expected[4:6, 0:2] = blocks[1] + blocks[2]
+    assert_close(dense(rows, cols, values, 6), expected)
+
+
+def test_a_free_constant_is_refused_even_when_the_right_hand_side_hides_it(generator):
+    start, end, weights, anchor = small_system(generator)
+    rows, cols, values = laplacian(weights, start, end, 0 * anchor)
+    rhs = torch.zeros(12, dtype=torch.float64)
+    rhs[0], rhs[1] = 1, -1
+    with pytest.raises(SingularSystemError, match=r"the seams.*12 unknowns"):
+        solve_spd(rows, cols, values, rhs, what="the seams")
+
+
+def test_an_indefinite_matrix_is_refused():
+    rows, cols = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 0, 1])
+    with pytest.raises(SingularSystemError, match="not positive definite"):
+        solve_spd(rows, cols, torch.tensor([1.0, 2.0, 2.0, 1.0]), torch.ones(2))
+
+
+def test_an_unknown_without_equations_is_refused_by_number():
+    index = torch.tensor([0, 2])
+    with pytest.raises(SingularSystemError, match="unknown 1"):
+        solve_spd(index, index, torch.ones(2), torch.ones(3))
+
+
+def test_one_triangle_alone_is_refused():
+    rows, cols = torch.tensor([0, 1, 1]), torch.tensor([0, 0, 1])
+    with pytest.raises(SingularSystemError, match="not symmetric"):
+        solve_spd(rows, cols, torch.tensor([2.0, 1.0, 3.0]), torch.ones(2))
+
+
+@pytest.mark.parametrize("place", ["matrix", "rhs"])
+def test_numbers_that_are_not_finite_are_refused(place):
+    index = torch.tensor([0, 1])
+    values, rhs = torch.ones(2), torch.ones(2)
+    (values if place == "matrix" else rhs)[1] = torch.nan
+    with pytest.raises(SingularSystemError, match="finite"):
+        solve_spd(index, index, values, rhs)
