@@ -67,7 +67,7 @@ class TriangulateConfig:
     max_reprojection_px: float = 1.5
     min_angle_deg: float = 4.0
     neighbours: int = 12
-    max_slope: float = 3.0
+    max_slope: float = 6.0
     max_deviation: float = 0.5
     max_tilt_deg: float = 80.0
     min_altitude: float = 0.15
