@@ -1,0 +1,140 @@
+"""Smooth random functions of space, for texture and relief."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import grid_sample, pad
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waves:
+    """A sum of sines: smooth to every order, with its gradient in closed form.
+
+    Attributes:
+        wave_vectors: Radians a scene unit.
+        phases: Radians.
+        amplitudes: In the units of the function.
+    """
+
+    wave_vectors: Float[Tensor, "wave axis"]
+    phases: Float[Tensor, " wave"]
+    amplitudes: Float[Tensor, " wave"]
+
+    def __call__(self, points: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch"]:
+        """Evaluate at points."""
+        return torch.sin(self._angle(points)) @ self.amplitudes.to(points)
+
+    def gradient(self, points: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch axis"]:
+        """Evaluate the gradient at points."""
+        slope = torch.cos(self._angle(points)) * self.amplitudes.to(points)
+        return slope @ self.wave_vectors.to(points)
+
+    def _angle(self, points: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch wave"]:
+        return points @ self.wave_vectors.to(points).mT + self.phases.to(points)
+
+
+def random_waves(
+    generator: torch.Generator,
+    *,
+    wavelength: float,
+    root_mean_square: float,
+    axes: int = 3,
+    num_waves: int = 24,
+) -> Waves:
+    """Draw waves of about one length in random directions.
+
+    Args:
+        generator: Decides everything.
+        wavelength: Scene units; drawn between 0.7 and 1.4 of this.
+        root_mean_square: Of the function's values.
+        axes: 3 in space, 2 over a plane.
+        num_waves: More look more random and take longer.
+    """
+    direction = torch.randn(num_waves, axes, generator=generator, dtype=torch.float64)
+    direction = direction / direction.norm(dim=1, keepdim=True)
+    octave = torch.rand(num_waves, 1, generator=generator, dtype=torch.float64) - 0.5
+    phases = 2 * torch.pi * torch.rand(num_waves, generator=generator, dtype=torch.float64)
+    amplitude = root_mean_square * (2 / num_waves) ** 0.5
+    return Waves(
+        wave_vectors=direction * (2 * torch.pi / wavelength) * 2**octave,
+        phases=phases,
+        amplitudes=torch.full((num_waves,), amplitude, dtype=torch.float64),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Speckle:
+    """A solid texture: an albedo for every point of space.
+
+    Several lattices of random values, each finer than the one before, are blended
+    linearly, added and pushed towards light and dark, so that features of many sizes have
+    edges. The same point has the same colour in every view.
+
+    Attributes:
+        lattices: One an octave, periodic.
+        cells: Scene units between lattice points, one an octave.
+        weights: One an octave.
+        darkest: Lowest albedo.
+        brightest: Highest albedo.
+        contrast: Steepness of the push; the smaller, the less texture.
+    """
+
+    lattices: Float[Tensor, "octave channel side side side"]
+    cells: tuple[float, ...]
+    weights: tuple[float, ...]
+    darkest: float
+    brightest: float
+    contrast: float
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
+        """Give the albedo at points."""
+        rows = points.reshape(-1, 3)
+        side = self.lattices.shape[-1]
+        channels = self.lattices.shape[1]
+        total = rows.new_zeros(channels, len(rows))
+        for lattice, cell, weight in zip(self.lattices, self.cells, self.weights, strict=True):
+            # The wrapped lattice has side + 1 points and spans [-1, 1] between its outermost.
+            grid = torch.remainder(rows / cell, side) * (2 / side) - 1
+            wrapped = pad(lattice[None].to(rows), (0, 1, 0, 1, 0, 1), mode="circular")
+            values = grid_sample(wrapped, grid[None, None, None], align_corners=True)
+            total = total + weight * values[0, :, 0, 0]
+        share = torch.sigmoid(self.contrast * total)
+        albedo = self.darkest + (self.brightest - self.darkest) * share
+        return albedo.mT.reshape(*points.shape[:-1], channels)
+
+
+def random_speckle(
+    generator: torch.Generator,
+    *,
+    cells: tuple[float, ...] = (0.25, 0.09, 0.035),
+    darkest: float = 0.15,
+    brightest: float = 0.85,
+    contrast: float = 2.5,
+    colour: float = 0.35,
+    channels: int = 3,
+) -> Speckle:
+    """Draw a texture.
+
+    Args:
+        generator: Decides everything.
+        cells: Sizes of its features in scene units.
+        darkest: Lowest albedo.
+        brightest: Highest albedo.
+        contrast: 0 is uniform; 2.5 gives plenty of features to structure from motion.
+        colour: 0 is gray; 1 gives the channels nothing in common.
+        channels: Of the albedo.
+    """
+    side = 32  # repeats after 32 cells: farther than the finest octave is seen at once
+    shape = (len(cells), 1, side, side, side)
+    shared = torch.randn(shape, generator=generator)
+    own = torch.randn((len(cells), channels, side, side, side), generator=generator)
+    return Speckle(
+        lattices=(1 - colour) * shared + colour * own,
+        cells=cells,
+        weights=tuple(1.0 for _ in cells),
+        darkest=darkest,
+        brightest=brightest,
+        contrast=contrast,
+    )

@@ -1,0 +1,26 @@
+"""Rendered photographs as files."""
+
+from pathlib import Path
+
+import numpy as np
+from kornia.color import linear_rgb_to_rgb
+from PIL import Image
+
+from pimper_torch.records import Views
+
+
+def save_photographs(views: Views, folder: Path) -> tuple[Path, ...]:
+    """Write views as 8-bit sRGB PNG files, named as the views are.
+
+    Radiance over 1 saturates. The folder is made if it is not there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for image, name, (width, height) in zip(
+        views.images, views.names, views.sizes_px.tolist(), strict=True
+    ):
+        cropped = image[:, :height, :width].clamp(0, 1).expand(3, -1, -1)
+        bytes_ = (255 * linear_rgb_to_rgb(cropped)).round().movedim(0, -1).cpu().numpy()
+        paths.append(folder / name)
+        Image.fromarray(bytes_.astype(np.uint8)).save(paths[-1])
+    return tuple(paths)
