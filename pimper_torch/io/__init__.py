@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""Files: photographs in, results out."""

@@ -1,0 +1,247 @@
+"""Photographs from a folder, as linear radiance."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from pimper_torch.errors import InputError
+from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header, turned
+from pimper_torch.io.srgb import linear_from_srgb
+from pimper_torch.progress import track
+from pimper_torch.records import Views
+
+MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
+# A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
+_BLACK = 1e-3
+_LIT_SHARE = 1e-3  # more than hot pixels
+_OPAQUE = 0.5
+
+
+def load_views(
+    folder: Path | str,
+    *,
+    masks: Path | str | None = None,
+    linear: bool = False,
+    max_size_px: int = 0,
+) -> Views:
+    """Read the photographs of a folder, in the natural order of their names.
+
+    JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette; other files, hidden ones and
+    folders inside are passed over. EXIF's orientation is applied, its focal length kept in
+    pixels. sRGB is undone exactly, so that radiance is linear and 1 is saturation; colour
+    profiles are not looked at. Photographs of unlike sizes are padded.
+
+    Masks are images of the photographs' sizes, zero off the object (JPEG: below half).
+    Without a folder of masks, alpha channels that are somewhere transparent are the masks,
+    and a photograph without one shows the object everywhere.
+
+    Args:
+        folder: With the photographs.
+        masks: Folder with one mask for each photograph, of the same name whatever the
+            suffix (``17.jpg``: ``17.png``, or COLMAP's ``17.jpg.png``).
+        linear: The files hold linear radiance: leave the values as they are.
+        max_size_px: Shrink photographs whose longer side is longer, in linear light and
+            without aliasing; 0 leaves them as they are.
+
+    Returns:
+        On the CPU, float32.
+
+    Raises:
+        InputError: Names the photographs or masks that are missing, damaged, black, or do
+            not belong together, and says what to do.
+    """
+    if max_size_px < 0:
+        raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
+    paths = list_images(Path(folder))
+    _check_count(Path(folder), paths)
+    headers = [read_header(path) for path in paths]
+    mask_paths = _match_masks(paths, Path(masks)) if masks is not None else None
+    sizes = [_shrunk(header, max_size_px) for header in headers]
+    width, height = (max(sides) for sides in zip(*sizes, strict=True))
+    channels = max(header.channels for header in headers)
+    images = torch.zeros(len(paths), channels, height, width)
+    drawn = torch.zeros(len(paths), height, width, dtype=torch.bool)
+    has_masks = mask_paths is not None
+    for index in track(range(len(paths))):
+        decoded, (wide, high) = decode(paths[index]), sizes[index]
+        radiance = decoded.samples if linear else linear_from_srgb(decoded.samples)
+        images[index, :, :high, :wide] = _resized(radiance, wide, high)
+        opacity = decoded.alpha
+        if mask_paths is not None:
+            opacity = _read_mask(mask_paths[index], paths[index], headers[index])
+        elif opacity is not None and bool((opacity < _OPAQUE).any()):
+            has_masks = True
+        drawn[index, :high, :wide] = _resized_mask(opacity, wide, high)
+    names = tuple(path.name for path in paths)
+    _refuse_black(images, names, Path(folder))
+    if has_masks:
+        _refuse_empty(drawn, names, Path(masks) if masks is not None else None)
+    return Views(
+        images=images,
+        sizes_px=torch.tensor(sizes),
+        names=names,
+        masks=drawn if has_masks else None,
+        focals_px=torch.tensor(
+            [
+                header.focal_px * max(size) / max(header.width, header.height)
+                for header, size in zip(headers, sizes, strict=True)
+            ],
+            dtype=torch.float32,
+        ),
+    )
+
+
+def list_images(folder: Path) -> list[Path]:
+    """List the image files of a folder in natural order: ``img2`` before ``img10``.
+
+    Raises:
+        InputError: No such folder, no images in it, two of one stem, or a link that leads
+            out of the folder.
+    """
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing"
+        raise InputError(f"{folder}: found {found}; needed: a folder of images.")
+    try:
+        entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
+    paths = [path for path in entries if path.suffix.lower() in SUFFIXES and path.is_file()]
+    if not paths:
+        held = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
+        raise InputError(
+            f"{folder}: no images; {held}. Read are files ending in {', '.join(SUFFIXES)}, not "
+            "those in folders inside."
+        )
+    paths.sort(key=lambda path: _natural(path.name))
+    for path in paths:
+        if path.resolve().parent != folder.resolve():
+            raise InputError(f"{path}: is a link out of the folder; put a copy of the file there.")
+    stems: dict[str, Path] = {}
+    for path in paths:
+        other = stems.setdefault(path.stem, path)
+        if other is not path:
+            raise InputError(
+                f"{folder}: {other.name} and {path.name} differ only in their suffix; masks and "
+                "results go by the name without it. Rename or remove one."
+            )
+    return paths
+
+
+def some(names: Sequence[str], at_most: int = 5) -> str:
+    """List names for a message, the first few and how many more.
+
+    >>> some(["a", "b", "c"], at_most=2)
+    'a, b and 1 more'
+    """
+    rest = len(names) - at_most
+    return ", ".join(names[:at_most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _check_count(folder: Path, paths: list[Path]) -> None:
+    if len(paths) < MIN_PHOTOGRAPHS:
+        raise InputError(
+            f"{folder}: found {len(paths)} ({some([path.name for path in paths])}); needed: at "
+            f"least {MIN_PHOTOGRAPHS} photographs, better 10 or more, each from another place "
+            "under another light."
+        )
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sort digits as numbers; the name itself settles ``1`` against ``01``."""
+    pieces = re.split(r"([0-9]+)", name)
+    key = [(int(piece), "") if piece.isdigit() else (0, piece.lower()) for piece in pieces]
+    return [*key, (0, name)]
+
+
+def _shrunk(header: Header, max_size_px: int) -> tuple[int, int]:
+    longer = max(header.width, header.height)
+    if not 0 < max_size_px < longer:
+        return header.width, header.height
+    factor = max_size_px / longer
+    return max(1, round(header.width * factor)), max(1, round(header.height * factor))
+
+
+def _resized(
+    planes: Float[Tensor, "channel height width"], width: int, height: int
+) -> Float[Tensor, "channel {height} {width}"]:
+    """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
+    if tuple(planes.shape[-2:]) == (height, width):
+        return planes
+    return interpolate(
+        planes[None], size=(height, width), mode="bilinear", antialias=True, align_corners=False
+    )[0]
+
+
+def _resized_mask(
+    opacity: Float[Tensor, "height_in width_in"] | None, width: int, height: int
+) -> Bool[Tensor, "{height} {width}"]:
+    if opacity is None:
+        return torch.ones(height, width, dtype=torch.bool)
+    return _resized(opacity[None], width, height)[0] >= _OPAQUE
+
+
+def _match_masks(paths: list[Path], folder: Path) -> list[Path]:
+    """Find the mask of each photograph by its stem, or by its whole name as COLMAP has it."""
+    by_stem = {path.stem: path for path in list_images(folder)}
+    found = [by_stem.get(path.stem) or by_stem.get(path.name) for path in paths]
+    missing = [path.name for path, mask in zip(paths, found, strict=True) if mask is None]
+    if missing:
+        raise InputError(
+            f"{folder}: no mask for {some(missing)}; needed: one for each photograph, of the same "
+            f"name (such as {Path(missing[0]).stem}.png). There are "
+            f"{some([path.name for path in by_stem.values()])}."
+        )
+    return [mask for mask in found if mask is not None]
+
+
+def _read_mask(path: Path, photograph: Path, header: Header) -> Float[Tensor, "height width"]:
+    """Give 1 on the object, 0 off it, the way the photograph is turned."""
+    drawn = _on_object(decode(path))
+    lying = drawn.shape == (header.width, header.height)
+    if header.orientation >= 5 and lying and header.width != header.height:
+        # Drawn on the file's pixels by a program that does not know EXIF.
+        drawn = torch.from_numpy(turned(drawn.numpy(), header.orientation))
+    size = (drawn.shape[1], drawn.shape[0])
+    if size != (header.width, header.height):
+        raise InputError(
+            f"{path}: is {size[0]} x {size[1]}, but the photograph {photograph.name} is "
+            f"{header.width} x {header.height}; needed: a mask of the same size."
+        )
+    return drawn
+
+
+def _on_object(decoded: Decoded) -> Float[Tensor, "height width"]:
+    brightest = decoded.samples.amax(dim=0)
+    drawn = brightest >= _OPAQUE if decoded.lossy else brightest > 0
+    if decoded.alpha is not None:
+        drawn = drawn & (decoded.alpha > 0)
+    return drawn.float()
+
+
+def _refuse_black(
+    images: Float[Tensor, "view channel height width"], names: tuple[str, ...], folder: Path
+) -> None:
+    lit = [float((image > _BLACK).float().mean()) > _LIT_SHARE for image in images]
+    black = [name for name, one in zip(names, lit, strict=True) if not one]
+    if black:
+        raise InputError(
+            f"{folder}: {some(black)} {'is' if len(black) == 1 else 'are'} black all over. Take "
+            "them out of the folder; at least some of the object has to be lit."
+        )
+
+
+def _refuse_empty(
+    drawn: Bool[Tensor, "view height width"], names: tuple[str, ...], folder: Path | None
+) -> None:
+    empty = [name for name, mask in zip(names, drawn, strict=True) if not bool(mask.any())]
+    if empty:
+        where = f"{folder}: the masks" if folder else "the alpha channels"
+        raise InputError(
+            f"{where} of {some(empty)} mark no pixel as object; needed: nonzero (opaque) on the "
+            "object, zero off it. Draw them again, or leave these photographs out."
+        )

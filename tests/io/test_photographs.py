@@ -1,0 +1,232 @@
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.nn.functional import avg_pool2d
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.io.photographs import load_views
+from pimper_torch.io.srgb import linear_from_srgb
+from pimper_torch.progress import listening
+from pimper_torch.sfm.photographs import srgb_from_linear
+
+
+def save(path, array, **options):
+    path.parent.mkdir(exist_ok=True, parents=True)
+    Image.fromarray(array).save(path, **options)
+
+
+def test_linearization_undoes_the_encoding_and_has_its_known_values():
+    radiance = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    # The standard's two pieces miss each other by about 3e-8 at the joint.
+    assert_close(linear_from_srgb(srgb_from_linear(radiance)), radiance, rtol=0, atol=1e-7)
+    known = torch.tensor([0.04, 0.5], dtype=torch.float64)
+    wanted = torch.tensor([0.04 / 12.92, 0.21404114048], dtype=torch.float64)
+    assert_close(linear_from_srgb(known), wanted, rtol=0, atol=1e-10)
+
+
+def test_photographs_come_in_natural_order_as_linear_radiance(photos, pixels):
+    views = load_views(photos)
+    assert views.names == ("1.png", "2.png", "10.png")
+    assert views.images.shape == (3, 3, 8, 12)
+    assert views.sizes_px.tolist() == [[12, 8]] * 3
+    assert views.masks is None
+    assert views.focals_px.isnan().all()
+    stored = torch.from_numpy(pixels / 255).permute(2, 0, 1)
+    assert_close(views.images[0].double(), linear_from_srgb(stored), rtol=0, atol=1e-6)
+    assert_close(load_views(photos, linear=True).images[1].double(), stored, rtol=0, atol=1e-6)
+
+
+def test_other_files_hidden_ones_and_folders_are_passed_over(photos, pixels):
+    (photos / "notes.txt").write_text("notes")
+    (photos / "._1.png").write_bytes(b"what a Mac leaves behind")
+    save(photos / "more" / "4.png", pixels)
+    assert load_views(str(photos)).num_views == 3
+
+
+def test_grey_photographs_keep_one_channel_until_a_coloured_one_joins(photos, pixels):
+    for name in ("1.png", "2.png", "10.png"):
+        save(photos / name, pixels[..., 0])
+    assert load_views(photos).images.shape[1] == 1
+    save(photos / "3.png", pixels)
+    images = load_views(photos).images
+    assert images.shape[1] == 3
+    assert torch.equal(images[0, 0], images[0, 2])
+
+
+def test_unlike_sizes_are_padded_right_and_below(photos, pixels):
+    save(photos / "2.png", pixels.swapaxes(0, 1).copy())
+    views = load_views(photos)
+    assert views.images.shape[-2:] == (12, 12)
+    assert views.sizes_px.tolist() == [[12, 8], [8, 12], [12, 8]]
+    assert (views.images.amax(dim=1)[~views.inside] == 0).all()
+    assert_close(views.images[1, :, :, :8], views.images[0, :, :8].mT)
+
+
+def test_orientation_and_focal_length_come_from_exif(photos, pixels):
+    exif = Image.Exif()
+    exif[274] = 6
+    exif.get_ifd(0x8769)[0xA405] = 50
+    save(photos / "2.png", pixels, exif=exif)
+    views = load_views(photos)
+    assert views.sizes_px.tolist()[1] == [8, 12]
+    upright = np.rot90(pixels, -1).copy()
+    assert_close(views.images[1, :, :12, :8], linear_from_srgb(as_planes(upright)))
+    assert views.focals_px[1].item() == pytest.approx(5000 / 3600 * 12)
+
+
+def as_planes(array):
+    return torch.from_numpy(array.astype(np.float32) / 255).permute(2, 0, 1)
+
+
+def test_shrinking_averages_light_not_codes_and_scales_the_focal_length(tmp_path):
+    stripes = np.zeros((64, 96, 3), dtype=np.uint8)
+    stripes[:, ::2] = 255
+    exif = Image.Exif()
+    exif[274] = 1
+    exif.get_ifd(0x8769)[0xA405] = 50
+    for number in range(3):
+        save(tmp_path / f"{number}.png", stripes, exif=exif)
+    views = load_views(tmp_path, max_size_px=24)
+    assert views.images.shape[-2:] == (16, 24)
+    # Half the light; decimation would give 0 or 1, averaging the codes 0.21.
+    assert_close(views.images[..., 1:-1], torch.full((3, 3, 16, 22), 0.5), rtol=0, atol=1e-4)
+    assert views.focals_px[0].item() == pytest.approx(5000 / 3600 * 24)
+
+
+def test_shrinking_keeps_corners_in_place(photos):
+    ramp = np.tile(np.arange(0, 240, 5, dtype=np.uint8)[None, :, None], (32, 1, 3))
+    for name in ("1.png", "2.png", "10.png"):
+        save(photos / name, ramp)
+    found = load_views(photos, linear=True, max_size_px=12).images
+    wanted = avg_pool2d(load_views(photos, linear=True).images, 4)
+    assert_close(found[..., 1:-1], wanted[..., 1:-1])  # a triangle keeps a ramp; not at borders
+
+
+def test_small_photographs_are_left_alone(photos):
+    assert torch.equal(load_views(photos, max_size_px=12).images, load_views(photos).images)
+    with pytest.raises(InputError, match="max_size_px is -1"):
+        load_views(photos, max_size_px=-1)
+
+
+def test_masks_are_found_by_stem_and_mark_what_is_not_zero(photos, tmp_path):
+    drawn = np.zeros((8, 12), dtype=np.uint8)
+    drawn[2:5, 3:9] = 1
+    save(tmp_path / "masks" / "1.png", drawn)
+    save(tmp_path / "masks" / "2.tif", drawn * 255)
+    save(tmp_path / "masks" / "10.png.png", np.stack([drawn * 0, drawn * 200, drawn], axis=-1))
+    masks = load_views(photos, masks=tmp_path / "masks").masks
+    assert torch.equal(masks, torch.from_numpy(drawn > 0).expand(3, 8, 12))
+
+
+def test_masks_drawn_before_or_after_turning_fit(photos, tmp_path, pixels):
+    exif = Image.Exif()
+    exif[274] = 6
+    for number in (1, 2, 10):
+        save(photos / f"{number}.png", pixels, exif=exif)
+    drawn = np.zeros((8, 12), dtype=np.uint8)
+    drawn[:3, :5] = 255
+    save(tmp_path / "masks" / "1.png", drawn)
+    save(tmp_path / "masks" / "2.png", drawn, exif=exif)
+    save(tmp_path / "masks" / "10.png", np.rot90(drawn, -1).copy())
+    masks = load_views(photos, masks=tmp_path / "masks").masks
+    assert torch.equal(masks, torch.from_numpy(np.rot90(drawn, -1) > 0).expand(3, 12, 8))
+
+
+def test_masks_shrink_with_their_photographs_and_do_not_reach_into_padding(tmp_path):
+    white = np.full((32, 48, 3), 200, dtype=np.uint8)
+    drawn = np.zeros((32, 48), dtype=np.uint8)
+    drawn[:, :24] = 255
+    for number in range(3):
+        high = 32 if number else 24
+        save(tmp_path / "photos" / f"{number}.png", white[:high])
+        save(tmp_path / "masks" / f"{number}.png", drawn[:high])
+    views = load_views(tmp_path / "photos", masks=tmp_path / "masks", max_size_px=24)
+    assert views.masks[1].sum() == 12 * 16
+    assert views.masks[1, :, :12].all()
+    assert not (views.masks & ~views.inside).any()
+
+
+def test_transparency_serves_as_mask_unless_masks_are_given(photos, tmp_path, pixels):
+    alpha = np.full((8, 12, 1), 255, dtype=np.uint8)
+    save(photos / "2.png", np.concatenate([pixels, alpha], axis=-1))
+    assert load_views(photos).masks is None  # opaque all over says nothing
+    alpha[:4] = 0
+    save(photos / "2.png", np.concatenate([pixels, alpha], axis=-1))
+    masks = load_views(photos).masks
+    assert masks[0].all()
+    assert torch.equal(masks[1], torch.from_numpy(alpha[..., 0] > 0))
+    for number in (1, 2, 10):
+        save(tmp_path / "masks" / f"{number}.png", np.full((8, 12), 9, dtype=np.uint8))
+    assert load_views(photos, masks=tmp_path / "masks").masks.all()
+
+
+def test_reading_tells_how_far_it_has_come(photos):
+    heard = []
+    with listening(lambda done, total: heard.append((done, total))):
+        load_views(photos)
+    assert heard == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_missing_folder_a_file_and_an_empty_folder_are_refused(tmp_path):
+    with pytest.raises(InputError, match="nowhere: found nothing; needed: a folder"):
+        load_views(tmp_path / "nowhere")
+    (tmp_path / "a.png").write_text("")
+    with pytest.raises(InputError, match=r"a\.png: found a file; needed: a folder"):
+        load_views(tmp_path / "a.png")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"no images; it is empty.*\.jpg.*\.tiff"):
+        load_views(tmp_path / "empty")
+    (tmp_path / "empty" / "a.cr2").write_text("")
+    with pytest.raises(InputError, match=r"no images; it holds a\.cr2"):
+        load_views(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_photographs_are_refused(photos, count):
+    for path in sorted(photos.iterdir())[count:]:
+        path.unlink()
+    with pytest.raises(InputError, match=f"found {count} .*needed: at least 3"):
+        load_views(photos)
+
+
+def test_black_photographs_are_refused_by_name(photos):
+    save(photos / "2.png", np.full((8, 12, 3), 2, dtype=np.uint8))
+    with pytest.raises(InputError, match=r"2\.png is black"):
+        load_views(photos)
+
+
+def test_two_files_of_one_stem_are_refused(photos, pixels):
+    save(photos / "2.jpg", pixels)
+    with pytest.raises(InputError, match=r"2\.(jpg|png) and 2\.(jpg|png) differ only in"):
+        load_views(photos)
+
+
+def test_a_damaged_file_is_refused_by_name(photos):
+    (photos / "2.png").write_bytes((photos / "2.png").read_bytes()[:-60])
+    with pytest.raises(InputError, match=r"2\.png: cannot be read"):
+        load_views(photos)
+
+
+def test_a_link_out_of_the_folder_is_refused(photos, tmp_path, pixels):
+    save(tmp_path / "elsewhere.png", pixels)
+    (photos / "3.png").symlink_to(tmp_path / "elsewhere.png")
+    with pytest.raises(InputError, match=r"3\.png: is a link out of the folder"):
+        load_views(photos)
+
+
+def test_masks_that_do_not_match_are_refused_by_name(photos, tmp_path):
+    masks = tmp_path / "masks"
+    for number in (1, 10):
+        save(masks / f"{number}.png", np.full((8, 12), 255, dtype=np.uint8))
+    with pytest.raises(InputError, match=r"no mask for 2\.png.*such as 2\.png"):
+        load_views(photos, masks=masks)
+    save(masks / "2.png", np.full((4, 6), 255, dtype=np.uint8))
+    with pytest.raises(InputError, match=r"2\.png: is 6 x 4, but the photograph 2\.png is 12 x 8"):
+        load_views(photos, masks=masks)
+    save(masks / "2.png", np.zeros((8, 12), dtype=np.uint8))
+    with pytest.raises(InputError, match=r"masks of 2\.png mark no pixel"):
+        load_views(photos, masks=masks)
+    with pytest.raises(InputError, match="nowhere: found nothing"):
+        load_views(photos, masks=tmp_path / "nowhere")
