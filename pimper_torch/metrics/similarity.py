@@ -1,0 +1,111 @@
+"""Similarities (scale, rotation, translation) that put a result in the frame of the truth.
+
+They are 4x4 matrices ``truth_from_world`` whose upper left block is scale times rotation;
+:func:`pimper_torch.geometry.frames.transform` applies them.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.frames import rigid
+from pimper_torch.records import Cameras
+
+
+def pair_views(
+    names: Sequence[str], names_true: Sequence[str]
+) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
+    """Find views of the same name, for results that miss some of the photographs.
+
+    Returns:
+        Indices in ``names`` and in ``names_true``, in the order of the former.
+
+    Raises:
+        InputError: No name is in both.
+    """
+    place = {name: index for index, name in enumerate(names_true)}
+    pairs = [(index, place[name]) for index, name in enumerate(names) if name in place]
+    if not pairs:
+        raise InputError(
+            f"no view is in both sets: found {', '.join(names[:3])}, ... and "
+            f"{', '.join(names_true[:3])}, ... Name the photographs alike in both."
+        )
+    ours, truth = torch.tensor(pairs).unbind(dim=1)
+    return ours, truth
+
+
+def similarity_between_points(
+    points: Float[Tensor, "point 3"], points_true: Float[Tensor, "point 3"]
+) -> Float[Tensor, "4 4"]:
+    """Give the similarity that carries points nearest to true ones, in least squares.
+
+    Solved in float64. Three points not on a line determine it; fewer leave a rotation open.
+
+    Raises:
+        InputError: All points coincide, so that nothing tells the scale.
+
+    Source: Umeyama, PAMI 13(4), 1991.
+    """
+    source, target = points.double(), points_true.double()
+    return _similarity(source, target, _outer(target, source)).to(points)
+
+
+def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "4 4"]:
+    """Give the similarity that carries our cameras nearest to the true ones.
+
+    Scale and translation are Umeyama's on the cameras' centres. Centres on a line leave a
+    rotation about it open, and an arc nearly does; so the rotation is fitted to the centres
+    and to the cameras' axes together, each axis drawn as long as the centres' root mean
+    square distance from their mean.
+
+    Args:
+        ours: World frame of the result.
+        truth: The same views in the same order; see :func:`pair_views`.
+
+    Raises:
+        InputError: Unequal numbers of cameras, or centres that coincide.
+    """
+    if ours.num_views != truth.num_views:
+        raise InputError(
+            f"found {ours.num_views} cameras and {truth.num_views} true ones; needed: the same "
+            "views in the same order. Pair them by name first."
+        )
+    source, target = ours.centers_world.double(), truth.centers_world.double()
+    axes = ours.cam_from_world[:, :3, :3].double()  # rows are the axes in the world
+    axes_true = truth.cam_from_world[:, :3, :3].double()
+    length = _spread(source).sqrt() * _spread(target).sqrt()
+    correlation = _outer(target, source) + length * (axes_true.mT @ axes).mean(dim=0)
+    return _similarity(source, target, correlation).to(ours.cam_from_world)
+
+
+def _similarity(
+    source: Float[Tensor, "point 3"],
+    target: Float[Tensor, "point 3"],
+    correlation: Float[Tensor, "3 3"],
+) -> Float[Tensor, "4 4"]:
+    """Rotate by the correlation, then fit scale and translation to the points."""
+    if _spread(source) == 0 or _spread(target) == 0:
+        raise InputError(
+            f"the {len(source)} points or camera centres to align by coincide, so that nothing "
+            "tells the scale; needed: two different places at least."
+        )
+    U, _, Vh = torch.linalg.svd(correlation)
+    mirror = torch.ones(3).to(U)
+    mirror[2] = torch.linalg.det(U @ Vh).sign()
+    rotation = U @ (mirror[:, None] * Vh)
+    scale = (rotation * _outer(target, source)).sum() / _spread(source)
+    translation = target.mean(dim=0) - scale * rotation @ source.mean(dim=0)
+    return rigid(scale * rotation, translation)
+
+
+def _outer(
+    target: Float[Tensor, "point 3"], source: Float[Tensor, "point 3"]
+) -> Float[Tensor, "3 3"]:
+    return (target - target.mean(dim=0)).mT @ (source - source.mean(dim=0)) / len(source)
+
+
+def _spread(points: Float[Tensor, "point 3"]) -> Float[Tensor, ""]:
+    return (points - points.mean(dim=0)).square().sum(dim=1).mean()
