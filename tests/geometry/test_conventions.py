@@ -1,0 +1,169 @@
+"""Every convention of the package, held against somebody else's code or a hand-made case."""
+
+import kornia
+import pycolmap
+import torch
+from torch.nn.functional import grid_sample
+from torch.testing import assert_close
+
+from pimper_torch.geometry.pixels import (
+    grid_from_pixels,
+    homography_in_indices,
+    indices_from_pixels,
+    pixel_centers,
+    pixels_from_grid,
+    pixels_from_indices,
+    scale_intrinsics,
+)
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.surfaces import normals_from_slopes, slopes_from_normals
+
+WIDTH, HEIGHT = 7, 5
+
+
+def noise_image(seed):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(1, 1, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
+
+
+def ramp_image(width, height):
+    # The value of every pixel is where its centre lies: linear, so resampling is exact.
+    return pixel_centers(width, height, like=torch.zeros(1).double()).movedim(-1, 0)[None]
+
+
+def test_the_first_pixel_center_is_half_a_pixel_from_both_borders():
+    centers = pixel_centers(WIDTH, HEIGHT, like=torch.zeros(1).double())
+    assert centers.shape == (HEIGHT, WIDTH, 2)
+    assert centers[0, 0].tolist() == [0.5, 0.5]
+    assert centers[0, 1].tolist() == [1.5, 0.5]  # u goes right
+    assert centers[1, 0].tolist() == [0.5, 1.5]  # v goes down
+    assert centers[-1, -1].tolist() == [WIDTH - 0.5, HEIGHT - 0.5]
+
+
+def test_grid_sample_at_pixel_centers_gives_the_image_back():
+    image = noise_image(101)
+    grid = grid_from_pixels(pixel_centers(WIDTH, HEIGHT, like=image), WIDTH, HEIGHT)
+    found = grid_sample(image, grid[None], mode="bilinear", align_corners=False)
+    assert_close(found, image)
+
+
+def test_grid_sample_half_way_between_centers_gives_the_mean():
+    image = noise_image(102)
+    between = torch.tensor([[[3.0, 2.5]]], dtype=torch.float64)  # between columns 2 and 3, row 2
+    grid = grid_from_pixels(between, WIDTH, HEIGHT)
+    found = grid_sample(image, grid[None], mode="bilinear", align_corners=False)
+    assert_close(found[0, 0, 0, 0], image[0, 0, 2, 2:4].mean())
+
+
+def test_grid_and_pixels_undo_each_other_and_corners_are_the_ends():
+    corners = torch.tensor([[0.0, 0.0], [WIDTH, HEIGHT]], dtype=torch.float64)
+    grid = grid_from_pixels(corners, WIDTH, HEIGHT)
+    assert_close(grid, torch.tensor([[-1.0, -1.0], [1.0, 1.0]], dtype=torch.float64))
+    pixels = torch.tensor([[1.3, 4.2], [-2.0, 9.0]], dtype=torch.float64)
+    back = pixels_from_grid(grid_from_pixels(pixels, WIDTH, HEIGHT), WIDTH, HEIGHT)
+    assert_close(back, pixels)
+
+
+def test_an_index_points_at_the_center_of_its_pixel():
+    image = noise_image(103)
+    index = torch.tensor([4.0, 1.0], dtype=torch.float64)
+    pixel = pixels_from_indices(index)
+    assert_close(pixel, pixel_centers(WIDTH, HEIGHT, like=image)[1, 4])
+    assert_close(indices_from_pixels(pixel), index)
+
+
+def test_kornia_warps_pixels_right_once_the_homography_counts_from_centers():
+    width, height = 24, 18
+    dst_from_src = torch.tensor(
+        [[1.1, 0.08, -1.7], [-0.05, 0.93, 0.9], [1e-3, -2e-3, 1.0]], dtype=torch.float64
+    )
+    warped = kornia.geometry.transform.warp_perspective(
+        ramp_image(width, height),
+        homography_in_indices(dst_from_src)[None],
+        (height, width),
+        align_corners=True,
+    )
+    # By our convention the pixel p of the target shows the place H^-1 p of the source.
+    target = pixel_centers(width, height, like=dst_from_src)
+    homogeneous = torch.cat([target, torch.ones_like(target[..., :1])], dim=-1)
+    source = homogeneous @ torch.linalg.inv(dst_from_src).mT
+    source = source[..., :2] / source[..., 2:]
+    size = source.new_tensor([width, height])
+    inside = ((source > 0.5) & (source < size - 0.5)).all(dim=-1)
+    assert inside.float().mean() > 0.6
+    found = warped[0].movedim(0, -1)
+    assert_close(found[inside], source[inside], atol=1e-9, rtol=0)
+    # Without the shift kornia is off, whichever flag it gets: else we would not need it.
+    for flag in (True, False):
+        plain = kornia.geometry.transform.warp_perspective(
+            ramp_image(width, height), dst_from_src[None], (height, width), align_corners=flag
+        )[0].movedim(0, -1)
+        assert (plain[inside] - source[inside]).abs().max() > 0.01
+
+
+def test_homographies_in_indices_chain_like_those_in_pixels():
+    generator = torch.Generator().manual_seed(104)
+    one, two = torch.randn(2, 3, 3, generator=generator, dtype=torch.float64)
+    chained = homography_in_indices(one) @ homography_in_indices(two)
+    assert_close(homography_in_indices(one @ two), chained)
+    batch = torch.stack([one, two])
+    assert_close(homography_in_indices(batch)[1], homography_in_indices(two))
+
+
+def test_resized_images_keep_corners_and_so_intrinsics_only_scale():
+    generator = torch.Generator().manual_seed(105)
+    K = torch.tensor([[90.0, 0, 11.0], [0, 80, 9.5], [0, 0, 1]], dtype=torch.float64)
+    points = torch.rand(20, 3, generator=generator, dtype=torch.float64) + 1
+    identity = torch.eye(4, dtype=torch.float64)
+    large, _ = project(points, identity, K)
+    small, _ = project(points, identity, scale_intrinsics(K, 0.5, 0.25))
+    assert_close(small, large * large.new_tensor([0.5, 0.25]))
+    # Area averaging puts the mean of two centres, 0.5 and 1.5, at 1 = 2 * 0.5.
+    halved = torch.nn.functional.avg_pool2d(ramp_image(8, 6), 2)
+    assert_close(halved, 2 * ramp_image(4, 3))
+
+
+def test_the_pinhole_is_colmaps():
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=640, height=480, params=[500.0, 510.0, 321.5, 238.25]
+    )
+    world_to_cam = pycolmap.Rigid3d(pycolmap.Rotation3d([0.1, -0.2, 0.3, 0.927]), [0.1, 0.2, 4.0])
+    generator = torch.Generator().manual_seed(106)
+    points = torch.randn(15, 3, generator=generator, dtype=torch.float64)
+    cam_from_world = torch.eye(4, dtype=torch.float64)
+    cam_from_world[:3] = torch.from_numpy(world_to_cam.matrix())
+    K = torch.from_numpy(camera.calibration_matrix())
+    pixels, depth = project(points, cam_from_world, K)
+    for point, pixel, z in zip(points.numpy(), pixels, depth, strict=True):
+        in_cam = world_to_cam * point
+        assert_close(pixel, torch.from_numpy(camera.img_from_cam(in_cam)))
+        assert_close(z, torch.tensor(in_cam[2]))
+
+
+def test_camera_axes_are_right_down_and_forward():
+    K = torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]], dtype=torch.float64)
+    points = torch.tensor([[0.0, 0, 2], [0.5, 0, 2], [0, 0.5, 2], [0, 0, -2]]).double()
+    pixels, depth = project(points, torch.eye(4, dtype=torch.float64), K)
+    assert pixels[:3].tolist() == [[50.0, 40.0], [75.0, 40.0], [50.0, 65.0]]
+    assert depth.tolist() == [2.0, 2.0, 2.0, -2.0]
+
+
+def test_rays_reach_the_depth_along_z_at_their_own_length():
+    K = torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]], dtype=torch.float64)
+    rays = rays_through(
+        torch.tensor([[50.0, 40.0], [150.0, 40.0]]).double(), torch.eye(4, dtype=torch.float64), K
+    )
+    assert rays.tolist() == [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]
+
+
+def test_a_depth_that_grows_to_the_right_has_a_normal_that_leans_to_the_right():
+    # z = 0.5 x + 0.25 y: the surface recedes towards +x, so its outside faces +x and -z.
+    slopes = torch.tensor([0.5, 0.25], dtype=torch.float64)
+    normal = normals_from_slopes(slopes)
+    assert normal[2] < 0
+    assert normal[0] > 0
+    assert normal[1] > 0
+    assert_close(normal.norm(), torch.tensor(1.0, dtype=torch.float64))
+    tangents = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.25]], dtype=torch.float64)
+    assert_close(tangents @ normal, torch.zeros(2, dtype=torch.float64), atol=1e-15, rtol=0)
+    assert_close(slopes_from_normals(normal), -normal[:2] / normal[2])

@@ -1,0 +1,68 @@
+import pytest
+import torch
+from scipy.spatial.transform import RigidTransform, Rotation
+from torch.testing import assert_close
+
+from pimper_torch.geometry.frames import invert_rigid, rigid, rotate, transform
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(111)
+
+
+def random_rigid(generator, *batch):
+    quaternions = torch.randn(*batch, 4, generator=generator, dtype=torch.float64).numpy()
+    rotation = torch.from_numpy(Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix())
+    translation = torch.randn(*batch, 3, generator=generator, dtype=torch.float64)
+    return rigid(rotation.reshape(*batch, 3, 3), translation)
+
+
+def test_points_are_carried_as_scipy_carries_them(generator):
+    target_from_source = random_rigid(generator, 1)[0]
+    points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
+    scipy_transform = RigidTransform.from_matrix(target_from_source.numpy())
+    assert_close(
+        transform(target_from_source, points), torch.from_numpy(scipy_transform.apply(points))
+    )
+    directions = torch.from_numpy(scipy_transform.rotation.apply(points.numpy()))
+    assert_close(rotate(target_from_source, points), directions)
+
+
+def test_the_inverse_undoes_the_transform_in_every_batch(generator):
+    target_from_source = random_rigid(generator, 2, 3)
+    source_from_target = invert_rigid(target_from_source)
+    assert_close(source_from_target, torch.linalg.inv(target_from_source))
+    points = torch.randn(2, 3, 7, 3, generator=generator, dtype=torch.float64)
+    assert_close(transform(source_from_target, transform(target_from_source, points)), points)
+
+
+def test_transforms_chain_by_matrix_product(generator):
+    c_from_b, b_from_a = random_rigid(generator, 2)
+    points = torch.randn(7, 3, generator=generator, dtype=torch.float64)
+    assert_close(
+        transform(c_from_b @ b_from_a, points), transform(c_from_b, transform(b_from_a, points))
+    )
+
+
+def test_one_set_of_points_meets_many_frames(generator):
+    frames = random_rigid(generator, 4)
+    points = torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    together = transform(frames, points)
+    assert together.shape == (4, 6, 3)
+    assert_close(together[2], transform(frames[2], points))
+
+
+def test_directions_do_not_feel_the_translation(generator):
+    frame = random_rigid(generator, 1)[0]
+    moved = frame.clone()
+    moved[:3, 3] += 5
+    vectors = torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    assert_close(rotate(frame, vectors), rotate(moved, vectors))
+    assert_close(rotate(frame, vectors).norm(dim=1), vectors.norm(dim=1))
+
+
+def test_gradients_reach_points_and_frames(generator):
+    frame = random_rigid(generator, 1)[0].requires_grad_()
+    points = torch.randn(3, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda f, p: transform(invert_rigid(f), p), (frame, points))

@@ -1,0 +1,66 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.scenes.cameras import arc_cameras
+
+
+@pytest.fixture
+def cameras():
+    return arc_cameras(3, width=64, height=48, focal_px=70.0, distance=4.0)
+
+
+@pytest.fixture
+def points():
+    generator = torch.Generator().manual_seed(121)
+    return torch.rand(40, 3, generator=generator, dtype=torch.float64) - 0.5
+
+
+def test_a_ray_at_its_depth_comes_back_to_the_point(cameras, points):
+    pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
+    assert pixels.shape == (3, 40, 2)
+    rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)
+    found = cameras.centers_world[:, None] + depth[..., None] * rays
+    assert_close(found, points.expand(3, -1, -1))
+
+
+def test_a_camera_projects_alone_as_it_does_in_company(cameras, points):
+    together, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
+    alone, depth_alone = project(points, cameras.cam_from_world[1], cameras.intrinsics[1])
+    assert_close(together[1], alone)
+    assert_close(depth[1], depth_alone)
+
+
+def test_the_camera_centre_is_where_all_rays_start(cameras):
+    in_cam = torch.einsum("vij,vj->vi", cameras.cam_from_world[:, :3, :3], cameras.centers_world)
+    assert_close(in_cam + cameras.cam_from_world[:, :3, 3], torch.zeros(3, 3).double())
+
+
+def test_skewed_intrinsics_keep_the_round_trip(points):
+    K = torch.tensor([[90.0, 2.0, 30], [0, 85, 20], [0, 0, 1]], dtype=torch.float64)
+    cam_from_world = torch.eye(4, dtype=torch.float64)
+    cam_from_world[2, 3] = 3
+    pixels, depth = project(points, cam_from_world, K)
+    center = torch.tensor([0.0, 0.0, -3.0], dtype=torch.float64)
+    assert_close(center + depth[:, None] * rays_through(pixels, cam_from_world, K), points)
+
+
+def test_points_behind_and_beside_the_camera_give_finite_values_and_gradients():
+    K = torch.tensor([[90.0, 0, 30], [0, 85, 20], [0, 0, 1]], dtype=torch.float64)
+    points = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, -2.0], [0.0, 0.0, 0.0]]).double()
+    points.requires_grad_()
+    pixels, depth = project(points, torch.eye(4, dtype=torch.float64), K)
+    assert depth.tolist() == [0.0, -2.0, 0.0]
+    assert pixels.isfinite().all()
+    pixels.sum().backward()
+    assert points.grad.isfinite().all()
+
+
+def test_gradients_of_projection_and_rays_are_right(cameras, points):
+    some = points[:4].clone().requires_grad_()
+    frames = cameras.cam_from_world[:1].clone().requires_grad_()
+    K = cameras.intrinsics[:1].clone().requires_grad_()
+    assert torch.autograd.gradcheck(project, (some, frames, K))
+    pixels = (points[:4, :2] * 30 + 30).requires_grad_()
+    assert torch.autograd.gradcheck(rays_through, (pixels, frames, K))

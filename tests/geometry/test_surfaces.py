@@ -1,0 +1,134 @@
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from pimper_torch.geometry.surfaces import (
+    barycentric_2d,
+    boundary_vertices,
+    face_normals,
+    face_pairs,
+    normals_from_slopes,
+    slopes_from_normals,
+    vertex_normals,
+)
+
+# Two triangles that share the edge 0-2, and a third on its own.
+FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(131)
+
+
+def as_tensors(mesh):
+    return torch.tensor(mesh.vertices, dtype=torch.float64), torch.tensor(mesh.faces)
+
+
+def test_slopes_and_normals_undo_each_other(generator):
+    slopes = 3 * torch.randn(50, 2, generator=generator, dtype=torch.float64)
+    normals = normals_from_slopes(slopes)
+    assert (normals[:, 2] < 0).all()
+    assert_close(normals.norm(dim=1), torch.ones(50, dtype=torch.float64))
+    assert_close(slopes_from_normals(normals), slopes)
+
+
+def test_slopes_are_the_derivatives_of_the_depth_of_a_sphere(generator):
+    xy = (torch.rand(50, 2, generator=generator, dtype=torch.float64) - 0.5).requires_grad_()
+    depth = -(1 - xy.square().sum(dim=1)).sqrt()  # the near half: z grows away from the viewer
+    (slopes,) = torch.autograd.grad(depth.sum(), xy)
+    normals = torch.cat([xy, depth[:, None]], dim=1).detach()  # outward, so n_z < 0
+    assert_close(slopes_from_normals(normals), slopes)
+
+
+def test_steep_and_averted_normals_get_the_steepest_slope_of_their_direction():
+    normals = torch.tensor([[1.0, 0.0, -1e-3], [-0.9, 0.0, 0.436], [0.0, 0.0, 1.0]]).double()
+    slopes = slopes_from_normals(normals, steepest=5.0)
+    assert_close(slopes[0], torch.tensor([5.0, 0.0]).double())
+    assert_close(slopes[1], torch.tensor([-4.5, 0.0]).double())
+    assert_close(slopes[2], torch.zeros(2).double())
+
+
+def test_face_normals_have_twice_the_area_and_point_out():
+    vertices, faces = as_tensors(trimesh.creation.box(extents=(1.0, 2.0, 3.0)))
+    normals = face_normals(vertices, faces)
+    assert_close(normals.norm(dim=1).sum() / 2, torch.tensor(22.0, dtype=torch.float64))
+    assert ((vertices[faces].mean(dim=1) * normals).sum(dim=1) > 0).all()
+
+
+def test_a_counter_clockwise_triangle_faces_its_viewer():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+    normal = face_normals(vertices, torch.tensor([[0, 1, 2]]))
+    assert normal.tolist() == [[0.0, 0.0, 1.0]]
+
+
+def test_vertex_normals_weigh_faces_by_area(generator):
+    vertices = torch.randn(7, 3, generator=generator, dtype=torch.float64)
+    found = vertex_normals(vertices, FACES)
+    per_face = face_normals(vertices, FACES)
+    expected = torch.stack(
+        [per_face[(v == FACES).any(dim=1)].sum(dim=0) for v in range(len(vertices))]
+    )
+    assert_close(found, expected / expected.norm(dim=1, keepdim=True))
+
+
+def test_vertex_normals_of_a_ball_point_away_from_its_centre():
+    vertices, faces = as_tensors(trimesh.creation.icosphere(subdivisions=4))
+    found = vertex_normals(vertices, faces)
+    assert (found * vertices).sum(dim=1).min() > 0.9999
+
+
+def test_neighbouring_faces_are_found_with_their_edge():
+    pairs, edges = face_pairs(FACES)
+    assert [sorted(pair) for pair in pairs.tolist()] == [[0, 1]]
+    assert edges.tolist() == [[0, 2]]
+
+
+def test_neighbours_agree_with_trimesh_on_a_closed_mesh():
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    pairs, edges = face_pairs(torch.tensor(mesh.faces))
+    found = {
+        (frozenset(pair), frozenset(edge))
+        for pair, edge in zip(pairs.tolist(), edges.tolist(), strict=True)
+    }
+    expected = {
+        (frozenset(pair), frozenset(edge))
+        for pair, edge in zip(
+            mesh.face_adjacency.tolist(), mesh.face_adjacency_edges.tolist(), strict=True
+        )
+    }
+    assert len(pairs) == len(expected)
+    assert found == expected
+
+
+def test_an_edge_of_three_faces_joins_nobody():
+    pairs, _ = face_pairs(torch.tensor([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
+    assert len(pairs) == 0
+
+
+def test_the_boundary_is_where_faces_have_no_neighbour():
+    hexagon = torch.tensor([[0, k, k % 6 + 1] for k in range(1, 7)])  # a fan round vertex 0
+    marked = boundary_vertices(hexagon, 8)
+    assert marked.tolist() == [False, *[True] * 6, False]
+    closed = torch.tensor(trimesh.creation.icosphere(subdivisions=1).faces)
+    assert not boundary_vertices(closed, int(closed.max()) + 1).any()
+
+
+def test_barycentric_coordinates_rebuild_the_point_and_tell_the_side(generator):
+    corners = torch.randn(20, 3, 2, generator=generator, dtype=torch.float64)
+    points = torch.randn(20, 2, generator=generator, dtype=torch.float64)
+    found = barycentric_2d(points, corners)
+    assert_close(found.sum(dim=1), torch.ones(20, dtype=torch.float64))
+    assert_close((found[..., None] * corners).sum(dim=1), points)
+    at_corners = barycentric_2d(corners.movedim(1, 0), corners[None])
+    assert_close(
+        at_corners.movedim(0, 1), torch.eye(3).double().expand(20, 3, 3), atol=1e-9, rtol=0
+    )
+
+
+def test_gradients_of_normals_are_right(generator):
+    vertices = torch.randn(7, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: vertex_normals(v, FACES), (vertices,))
+    normals = normals_from_slopes(torch.randn(5, 2, generator=generator, dtype=torch.float64))
+    assert torch.autograd.gradcheck(slopes_from_normals, (normals.requires_grad_(),))

@@ -1,0 +1,115 @@
+import dataclasses
+from dataclasses import dataclass
+
+import jaxtyping
+import pytest
+import torch
+
+from pimper_torch.records import Cameras, Record, SparseScene, Views
+from pimper_torch.records.patches import Templates
+from pimper_torch.scenes.cameras import arc_cameras
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Box(Record):
+    inside: Cameras
+    many: tuple[torch.Tensor, ...]
+    label: str
+    nothing: torch.Tensor | None = None
+
+
+@pytest.fixture
+def cameras():
+    return arc_cameras(2, width=6, height=4, focal_px=5.0, distance=3.0)
+
+
+def views_of(num_views, height=4, width=6):
+    return Views(
+        images=torch.zeros(num_views, 3, height, width),
+        sizes_px=torch.tensor([[width, height]]).repeat(num_views, 1),
+        names=tuple(f"{view}.png" for view in range(num_views)),
+        focals_px=torch.full((num_views,), torch.nan),
+    )
+
+
+def test_moving_a_record_moves_every_tensor_down_to_the_last(cameras):
+    box = Box(inside=cameras, many=(torch.zeros(2), torch.ones(3)), label="box")
+    moved = box.to("meta")
+    assert moved.inside.intrinsics.device.type == "meta"
+    assert [tensor.device.type for tensor in moved.many] == ["meta", "meta"]
+    assert moved.label == "box"
+    assert moved.nothing is None
+    assert box.inside.intrinsics.device.type == "cpu"
+
+
+def test_replace_changes_a_copy_alone(cameras):
+    farther = cameras.replace(sizes_px=cameras.sizes_px * 2)
+    assert farther.sizes_px[0].tolist() == [12, 8]
+    assert cameras.sizes_px[0].tolist() == [6, 4]
+    assert farther.intrinsics is cameras.intrinsics
+    with pytest.raises(TypeError):
+        cameras.replace(extrinsics=cameras.cam_from_world)
+
+
+def test_a_record_cannot_be_rebound_or_extended(cameras):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        cameras.intrinsics = cameras.intrinsics * 2
+    with pytest.raises((AttributeError, TypeError)):
+        cameras.note = "frontal"
+
+
+def test_a_record_shows_shapes_instead_of_numbers(cameras):
+    shown = repr(Box(inside=cameras, many=tuple(torch.zeros(n) for n in range(5)), label="box"))
+    assert "intrinsics=float64[2, 3, 3]" in shown
+    assert "(float32[0], ... 5 in all)" in shown
+    assert "label='box'" in shown
+    assert len(shown) < 300
+
+
+def test_tensors_of_the_wrong_shape_or_kind_are_refused(cameras):
+    with pytest.raises(jaxtyping.TypeCheckError):
+        cameras.replace(cam_from_world=cameras.cam_from_world[:1])  # one camera, two intrinsics
+    with pytest.raises(jaxtyping.TypeCheckError):
+        cameras.replace(sizes_px=cameras.sizes_px.double())  # sizes are whole
+
+
+def test_camera_centres_are_carried_to_the_origin_of_their_camera(cameras):
+    homogeneous = torch.cat([cameras.centers_world, torch.ones(2, 1).double()], dim=1)
+    in_cam = torch.einsum("vij,vj->vi", cameras.cam_from_world, homogeneous)
+    torch.testing.assert_close(in_cam[:, :3], torch.zeros(2, 3).double())
+
+
+def test_padding_is_outside_the_photographs():
+    views = views_of(2).replace(sizes_px=torch.tensor([[6, 4], [3, 2]]))
+    assert views.inside[0].all()
+    assert views.inside[1].nonzero().tolist() == [[r, c] for r in range(2) for c in range(3)]
+
+
+def test_the_table_of_observations_says_which_view_saw_which_point(cameras):
+    scene = SparseScene(
+        views=views_of(2),
+        cameras=cameras,
+        points_world=torch.zeros(3, 3),
+        reprojection_errors_px=torch.zeros(3),
+        observation_point=torch.tensor([0, 2, 2]),
+        observation_view=torch.tensor([1, 0, 1]),
+        observation_pixels=torch.zeros(3, 2),
+        lenses=(),
+    )
+    assert scene.observed.tolist() == [[False, True], [False, False], [True, True]]
+
+
+def test_template_samples_lie_right_and_down_from_the_first_and_deep_along_z():
+    templates = Templates(
+        facet=torch.tensor([0]),
+        patch_from_world=torch.eye(4)[None],
+        origin=torch.tensor([[1.0, 2.0]]),
+        spacing=torch.tensor([0.5]),
+        depth=torch.arange(6.0).reshape(1, 2, 3),
+        barycentric=torch.zeros(1, 2, 3, 3),
+        inside=torch.ones(1, 2, 3, dtype=torch.bool),
+    )
+    points = templates.points_patch[0]
+    assert points[0, 0].tolist() == [1.0, 2.0, 0.0]
+    assert points[0, 2].tolist() == [2.0, 2.0, 2.0]
+    assert points[1, 0].tolist() == [1.0, 2.5, 3.0]
