@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from pimper_torch.errors import InputError, OutputError
@@ -230,7 +230,7 @@ def read_model(folder: Path) -> SparseModel:
     return _model_of(reconstruction)
 
 
-def write_binary(model: SparseModel, colors: np.ndarray[Any, Any], folder: Path) -> None:
+def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: Path) -> None:
     """Write a model as COLMAP's binary files.
 
     Args:
@@ -347,7 +347,7 @@ def _lens_of(camera: Any) -> Lens:  # noqa: ANN401 - see _camera_of
     )
 
 
-def _reconstruction_of(model: SparseModel, colors: np.ndarray[Any, Any]) -> Any:  # noqa: ANN401
+def _reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> Any:  # noqa: ANN401
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
@@ -367,11 +367,12 @@ def _reconstruction_of(model: SparseModel, colors: np.ndarray[Any, Any]) -> Any:
     starts = np.searchsorted(
         model.observation_point.numpy()[order], np.arange(len(model.points_world) + 1)
     )
+    rgb = colors.cpu().numpy()
     for index, xyz in enumerate(model.points_world.numpy()):
         track = pycolmap.Track()
         for observation in order[starts[index] : starts[index + 1]]:
             track.add_element(int(view[observation]) + 1, int(position[observation]))
-        reconstruction.add_point3D(xyz, track, colors[index])
+        reconstruction.add_point3D(xyz, track, rgb[index])
     reconstruction.update_point_3d_errors()
     return reconstruction
 

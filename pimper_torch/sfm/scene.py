@@ -73,7 +73,7 @@ def write_model(scene: SparseScene, folder: Path) -> None:
         observation_view=scene.observation_view.cpu(),
         observation_pixels=scene.observation_pixels.detach().cpu().double(),
     )
-    colmap.write_binary(model, point_colors(scene).cpu().numpy(), folder)
+    colmap.write_binary(model, point_colors(scene), folder)
 
 
 def take_views(views: Views, chosen: list[int]) -> Views:

@@ -1,0 +1,210 @@
+import subprocess
+import sys
+import warnings
+from importlib.resources import files
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.testing import assert_close
+
+from pimper_torch.errors import (
+    ConfigError,
+    InputError,
+    PimperWarning,
+    ReconstructionError,
+)
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.records import Views
+from pimper_torch.sfm.photographs import srgb_from_linear, write_photographs
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.sfm.scene import take_views, write_model
+
+
+def blank(sizes: list[tuple[int, int]]) -> Views:
+    width, height = (max(side) for side in zip(*sizes, strict=True))
+    return Views(
+        images=torch.zeros(len(sizes), 3, height, width),
+        sizes_px=torch.tensor(sizes),
+        names=tuple(f"{index}.jpg" for index in range(len(sizes))),
+        focals_px=torch.full((len(sizes),), torch.nan),
+    )
+
+
+def test_a_model_of_other_photographs_is_refused_with_both_sides_names(scene, views, tmp_path):
+    write_model(scene, tmp_path)
+    strangers = views.replace(names=tuple(f"x{index}.png" for index in range(5)))
+    with pytest.raises(InputError, match="none of the photographs") as caught:
+        Reconstruct()(strangers, tmp_path)
+    assert "b.jpg" in str(caught.value)
+    assert "x0.png" in str(caught.value)
+
+
+def test_photographs_that_the_model_lacks_are_left_out_with_a_warning(scene, views, tmp_path):
+    write_model(scene, tmp_path)
+    more = take_views(views, [4, 0, 1, 2, 3]).replace(
+        names=("ü.tif", "b.jpg", "new.jpg", "c 1.png", "d.jpg")
+    )
+    with pytest.warns(PimperWarning, match=r"4 of 5 photographs.*left out: new\.jpg"):
+        placed = Reconstruct()(more, tmp_path)
+    assert placed.unregistered == ("new.jpg",)
+    assert placed.views.names == ("ü.tif", "b.jpg", "c 1.png", "d.jpg")
+    assert_close(
+        placed.cameras.cam_from_world,
+        scene.cameras.cam_from_world[[4, 0, 2, 3]],
+        rtol=0,
+        atol=1e-12,  # through quaternions
+    )
+    # Every observation is still where the original scene has it, under the new numbers.
+    for index, old in enumerate([4, 0, 2, 3]):
+        mine = placed.observation_view == index
+        theirs = scene.observation_view == old
+        points = placed.points_world[placed.observation_point[mine]]
+        rivals = scene.points_world[scene.observation_point[theirs]]
+        same = (points[:, None] == rivals).all(dim=-1)
+        assert (same.sum(dim=1) == 1).all()
+        nearest = same.long().argmax(dim=1)
+        assert torch.equal(
+            placed.observation_pixels[mine], scene.observation_pixels[theirs][nearest]
+        )
+
+
+def test_a_models_subfolders_do_not_matter(scene, views, tmp_path):
+    inside = scene.replace(
+        views=scene.views.replace(names=tuple(f"images/{name}" for name in views.names))
+    )
+    write_model(inside, tmp_path)
+    assert Reconstruct()(views, tmp_path).views.names == views.names
+
+
+def test_a_model_of_larger_photographs_is_scaled_to_these(scene, views, tmp_path):
+    write_model(scene, tmp_path)
+    small = views.replace(
+        images=views.images[..., ::2, ::2].contiguous(), sizes_px=views.sizes_px // 2
+    )
+    placed = Reconstruct()(small, tmp_path)
+    assert_close(placed.cameras.intrinsics, scale_intrinsics(scene.cameras.intrinsics, 0.5, 0.5))
+    assert_close(placed.observation_pixels, scene.observation_pixels / 2)
+    assert_close(placed.reprojection_errors_px, scene.reprojection_errors_px / 2)
+
+
+def test_a_model_of_turned_photographs_is_refused(scene, views, tmp_path):
+    write_model(scene, tmp_path)
+    turned = views.replace(images=views.images.mT.contiguous(), sizes_px=views.sizes_px.flip(1))
+    with pytest.raises(InputError, match=r"b\.jpg is 60x80.*80x60.*neither cropped nor turned"):
+        Reconstruct()(turned, tmp_path)
+
+
+def test_a_folder_without_a_model_is_refused(views, tmp_path):
+    with pytest.raises(InputError, match="no COLMAP model"):
+        Reconstruct()(views, tmp_path)
+
+
+def test_a_damaged_model_is_refused(scene, views, tmp_path):
+    write_model(scene, tmp_path)
+    images = tmp_path / "images.bin"
+    images.write_bytes(images.read_bytes()[:100])
+    with pytest.raises(InputError, match="cannot be read"):
+        Reconstruct()(views, tmp_path)
+
+
+def test_a_model_with_two_of_the_photographs_is_refused(scene, views, tmp_path):
+    write_model(scene, tmp_path)
+    few = views.replace(names=("b.jpg", "a.jpg", "x.jpg", "y.jpg", "z.jpg"))
+    with pytest.raises(ReconstructionError, match="2 of 5 photographs"):
+        Reconstruct()(few, tmp_path)
+
+
+def test_unlike_sizes_with_one_shared_camera_are_refused_naming_files_and_the_way_out():
+    views = blank([(40, 30), (40, 30), (30, 40)])
+    with pytest.raises(InputError) as caught:
+        Reconstruct()(views)
+    message = str(caught.value)
+    assert "40x30: 0.jpg, 1.jpg" in message
+    assert "30x40: 2.jpg" in message
+    assert "no-" in message
+    assert "shared-camera" in message
+
+
+def test_black_photographs_are_refused_naming_those_without_features():
+    with pytest.raises(ReconstructionError, match=r"No features.*3 of 3.*0\.jpg, 1\.jpg, 2\.jpg"):
+        Reconstruct()(blank([(40, 30)] * 3))
+
+
+def test_two_photographs_are_refused():
+    with pytest.raises(ReconstructionError, match="at least 3"):
+        Reconstruct()(blank([(40, 30)] * 2))
+
+
+def test_photographs_of_noise_that_do_not_match_are_refused(generator):
+    views = blank([(96, 64)] * 4)
+    noise = torch.rand(views.images.shape, generator=generator)
+    with pytest.raises(ReconstructionError, match=r"registered 0 of 4 photographs.*0\.jpg"):
+        Reconstruct(ReconstructConfig(affine_shape=False))(views.replace(images=noise))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("camera_model", "SIMPLE_RADAL"),
+        ("peak_threshold", 0.0),
+        ("max_ratio", 1.5),
+        ("starts", 0),
+        ("min_share", 0.0),
+        ("threads", -1),
+    ],
+)
+def test_an_impossible_setting_is_refused(field, value):
+    with pytest.raises(ConfigError, match=field):
+        ReconstructConfig(**{field: value})
+
+
+def test_photographs_are_written_as_srgb_without_padding_and_masks_beside(tmp_path):
+    views = blank([(4, 3), (2, 3)])
+    images = views.images.clone()
+    images[0] = 0.21586  # sRGB 128/255
+    images[1, :, :, 2:] = 1.0  # what lies in the padding must not be written
+    masks = torch.zeros(2, 3, 4, dtype=torch.bool)
+    masks[:, :, 0] = True
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    names = write_photographs(
+        views.replace(images=images, masks=masks), tmp_path / "images", tmp_path / "masks"
+    )
+    first = np.asarray(Image.open(tmp_path / "images" / names[0]))
+    second = np.asarray(Image.open(tmp_path / "images" / names[1]))
+    mask = np.asarray(Image.open(tmp_path / "masks" / f"{names[1]}.png"))
+    assert first.shape == (3, 4, 3)
+    assert (first == 128).all()
+    assert second.shape == (3, 2, 3)
+    assert (second == 0).all()
+    assert mask.tolist() == [[255, 0]] * 3
+
+
+def test_the_srgb_curve_meets_its_published_points():
+    linear = torch.tensor([0.0, 0.0031308, 0.214041140482, 1.0, 2.0], dtype=torch.float64)
+    encoded = torch.tensor([0.0, 0.04045, 0.5, 1.0, 1.0], dtype=torch.float64)
+    assert_close(srgb_from_linear(linear), encoded, rtol=0, atol=1e-6)  # the curve's own seam
+
+
+def test_importing_the_package_does_not_load_colmap():
+    code = "import sys, pimper_torch.sfm.reconstruct; sys.exit('pycolmap' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.slow
+def test_eight_photographs_of_the_skull_register_and_their_points_reproject():
+    from pimper_torch.io.photographs import load_views
+
+    with files("pimper_torch").joinpath("data/skull") as folder:
+        views = load_views(folder)
+    chosen = [views.names.index(f"{number}.jpg") for number in (35, 36, 37, 38, 53, 54, 55, 56)]
+    scene = Reconstruct()(take_views(views, chosen))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert scene.unregistered == ()
+    # The whole set of 66 photographs gives 2048 px at this size, and a lens bent by 0.04.
+    assert scene.cameras.intrinsics[0, 0, 0] == pytest.approx(2048, rel=0.05)
+    assert len(scene.points_world) > 500
+    assert scene.reprojection_errors_px.median() < 1

@@ -1,0 +1,67 @@
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.geometry.frames import transform
+from pimper_torch.sfm.colmap import read_model
+from pimper_torch.sfm.reconstruct import Reconstruct
+from pimper_torch.sfm.scene import point_colors, reprojection_errors, write_model
+
+
+def test_writing_a_model_and_reading_it_gives_the_same_scene(scene, views, tmp_path):
+    write_model(scene, tmp_path / "new" / "sparse")
+    again = Reconstruct()(views, tmp_path / "new" / "sparse")
+    assert again.lenses == scene.lenses
+    assert again.views.names == scene.views.names
+    assert again.unregistered == ()
+    # Rotations pass through unit quaternions.
+    assert_close(again.cameras.cam_from_world, scene.cameras.cam_from_world, rtol=0, atol=1e-12)
+    assert_close(again.cameras.intrinsics, scene.cameras.intrinsics)
+    assert torch.equal(again.points_world, scene.points_world)
+    assert torch.equal(again.observation_point, scene.observation_point)
+    assert torch.equal(again.observation_view, scene.observation_view)
+    assert torch.equal(again.observation_pixels, scene.observation_pixels)
+    assert_close(again.reprojection_errors_px, scene.reprojection_errors_px)
+    assert_close(again.views.images, scene.views.images)
+
+
+def test_reprojection_errors_are_the_distances_from_where_the_noise_put_the_observations(model):
+    # The fixture's noise has 0.3 px a coordinate: its length averages 0.3 * sqrt(pi / 2).
+    errors = reprojection_errors(model)
+    assert 0.30 < errors.mean() < 0.45
+    moved = model.observation_pixels.clone()
+    first = model.observation_point == 0
+    exact = []
+    for index in torch.nonzero(first)[:, 0]:
+        view = int(model.observation_view[index])
+        point = transform(model.cam_from_world[view], model.points_world[:1])
+        f, cx, cy, k = (60.0, 0.0, 0.0, 0.0)
+        if model.lenses[view].model == "SIMPLE_RADIAL":
+            f, cx, cy, k = model.lenses[view].params
+        x = point[0, :2] / point[0, 2]
+        expected = f * (1 + k * x.square().sum()) * x + torch.tensor([cx, cy])
+        if model.lenses[view].model == "SIMPLE_RADIAL":
+            exact.append((expected - moved[index]).norm())
+            moved[index] = expected
+    change = reprojection_errors(model.replace(observation_pixels=moved)) - errors
+    assert_close(change[0], -torch.stack(exact).sum() / first.sum())
+    assert (change[1:] == 0).all()
+
+
+def test_a_point_behind_a_camera_has_infinite_error(model):
+    points = model.points_world.clone()
+    points[0, 2] = -100
+    errors = reprojection_errors(model.replace(points_world=points))
+    assert errors[0].isinf()
+    assert errors[1:].isfinite().all()
+
+
+def test_points_take_the_color_that_the_views_show(scene):
+    red = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    images = red[:, None, None].expand(5, 3, 60, 80)
+    colored = scene.replace(views=scene.views.replace(images=images))
+    assert (point_colors(colored) == torch.tensor([255, 0, 0])).all()
+
+
+def test_the_written_model_has_the_photographs_own_lenses(scene, model, tmp_path):
+    write_model(scene, tmp_path)
+    assert read_model(tmp_path).lenses == model.lenses

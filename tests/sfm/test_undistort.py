@@ -1,0 +1,108 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.records import Lens, Views
+from pimper_torch.sfm.colmap import distort, undistort_pixels
+from pimper_torch.sfm.undistort import photograph_pixels, undistort
+
+
+def bent(width: int, height: int, strength: float) -> Lens:
+    params = (60.0, width / 2 + 1.5, height / 2 - 2.0, strength)
+    return Lens(camera=1, model="SIMPLE_RADIAL", params=params, width=width, height=height)
+
+
+def ramp_views(sizes: list[tuple[int, int]]) -> Views:
+    # Radiance is the photograph's own pixel coordinate, scaled: a ramp before undistortion.
+    width, height = (max(side) for side in zip(*sizes, strict=True))
+    images = torch.zeros(len(sizes), 2, height, width, dtype=torch.float64)
+    for index, (w, h) in enumerate(sizes):
+        images[index, :, :h, :w] = pixel_centers(w, h, like=images).permute(2, 0, 1) / 100
+    return Views(
+        images=images,
+        sizes_px=torch.tensor(sizes),
+        names=tuple(f"{index}.png" for index in range(len(sizes))),
+        focals_px=torch.full((len(sizes),), torch.nan, dtype=torch.float64),
+    )
+
+
+@pytest.mark.parametrize("strength", [0.3, -0.2])
+def test_a_ramp_of_the_photograph_shows_where_each_pinhole_pixel_came_from(strength):
+    sizes = [(50, 40), (36, 44)]
+    views = ramp_views(sizes)
+    lenses = tuple(bent(w, h, strength) for w, h in sizes)
+    undistorted, intrinsics = undistort(views, lenses)
+    for index, (w, h) in enumerate(sizes):
+        f, cx, cy, k = lenses[index].params
+        assert_close(
+            intrinsics[index],
+            torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64),
+        )
+        x = (pixel_centers(w, h, like=views.images) - torch.tensor([cx, cy])) / f
+        source = f * (1 + k * x.square().sum(-1, keepdim=True)) * x + torch.tensor([cx, cy])
+        # Half a pixel from the rim the ramp itself ends; interpolation is exact inside.
+        size = torch.tensor([w, h])
+        exact = ((source >= 0.5) & (source <= size - 0.5)).all(-1)
+        outside = ((source < 0) | (source > size)).any(-1)
+        assert exact.sum() > 0.6 * w * h
+        found = 100 * undistorted.images[index, :, :h, :w].permute(1, 2, 0)
+        assert_close(found[exact], source[exact].double())
+        assert (found[outside] == 0).all()
+        if strength > 0:
+            assert outside.any()
+            assert (undistorted.masks[index, :h, :w] == ~outside).all()
+            assert not undistorted.masks[index, h:].any()
+            assert not undistorted.masks[index, :, w:].any()
+    if strength < 0:
+        assert undistorted.masks is None
+
+
+def test_the_padding_of_a_smaller_photograph_never_leaks_in():
+    views = ramp_views([(50, 40), (36, 44)])
+    ones = views.replace(images=views.inside[:, None].double())
+    lenses = (bent(50, 40, -0.2), bent(36, 44, -0.2))
+    undistorted, _ = undistort(ones, lenses)
+    assert_close(undistorted.images, ones.images)
+
+
+def test_a_photograph_without_distortion_stays_bit_for_bit():
+    views = ramp_views([(50, 40)])
+    plain = Lens(camera=1, model="PINHOLE", params=(60.0, 61.0, 20.0, 22.0), width=50, height=40)
+    undistorted, _ = undistort(views, (plain,))
+    assert torch.equal(undistorted.images, views.images)
+    assert undistorted.masks is None
+
+
+def test_a_drawn_mask_moves_with_the_photograph():
+    views = ramp_views([(50, 40)])
+    drawn = views.images[:, 0] * 100 < 11.0  # left of a straight line in the photograph
+    undistorted, _ = undistort(views.replace(masks=drawn), (bent(50, 40, -0.2),))
+    source = photograph_pixels(bent(50, 40, -0.2))
+    clear = (source[..., 0] - 11.0).abs() > 0.5
+    assert (undistorted.masks[0] == (source[..., 0] < 11.0))[clear].all()
+
+
+def test_undistortion_lets_gradients_through():
+    views = ramp_views([(6, 5)])
+    lens = bent(6, 5, 0.3)
+
+    def undistorted(images: torch.Tensor) -> torch.Tensor:
+        return undistort(views.replace(images=images), (lens,))[0].images
+
+    assert torch.autograd.gradcheck(undistorted, views.images.clone().requires_grad_())
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"])
+def test_a_lens_and_its_inverse_undo_each_other(model):
+    params = {
+        "SIMPLE_RADIAL": (60.0, 25.0, 20.0, 0.1),
+        "OPENCV": (60.0, 62.0, 25.0, 20.0, 0.05, -0.01, 1e-3, 2e-3),
+        "OPENCV_FISHEYE": (60.0, 62.0, 25.0, 20.0, 0.05, -0.01, 1e-3, 2e-3),
+    }[model]
+    lens = Lens(camera=1, model=model, params=params, width=50, height=40)
+    pixels = pixel_centers(50, 40, like=torch.zeros(1, dtype=torch.float64)).reshape(-1, 2)
+    plane = undistort_pixels(lens, pixels)
+    rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
+    # COLMAP inverts by Newton's method to about 1e-10 of the image plane.
+    assert_close(distort(lens, 3 * rays), pixels, rtol=0, atol=1e-6)
