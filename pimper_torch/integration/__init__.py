@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""Normals of every patch to its relief."""
