@@ -1,0 +1,154 @@
+r"""What factorization leaves free: scaled Lorentz transformations.
+
+:math:`J = L N = (L A^{-1})(A N)` for every invertible 4 x 4 matrix, but ``A N`` stays on the
+cone only if ``A`` preserves the form :math:`\eta = \mathrm{diag}(1, -1, -1, -1)` up to
+scale: rotations (the frame), boosts (relatives of the bas-relief transformation),
+reflections (convex against concave) and one factor between albedo and light.
+
+Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.records import Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Ambiguity(Record):
+    """A scaled Lorentz transformation, ready to act on a factorization.
+
+    Attributes:
+        matrix: ``A`` with ``A^T eta A = s^2 eta``.
+
+    >>> push = Ambiguity(matrix=lorentz(torch.tensor([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])))
+    >>> push.on_shading(push.inverse().on_shading(torch.ones(4, 1)))[:, 0]
+    tensor([1., 1., 1., 1.])
+    """
+
+    matrix: Float[Tensor, "*batch 4 4"]
+
+    def on_shading(self, shading: Float[Tensor, "*batch 4 sample"]) -> Float[Tensor, "..."]:
+        """Give ``A N``."""
+        return self.matrix @ shading
+
+    def on_lights(self, lights: Float[Tensor, "*batch view 4"]) -> Float[Tensor, "..."]:
+        """Give ``L A^-1``, so that the product with :meth:`on_shading` stays the data."""
+        return lights @ self.inverse().matrix
+
+    def inverse(self) -> "Ambiguity":
+        """Give the transformation that undoes this one: ``eta A^T eta / s^2``."""
+        eta = minkowski(self.matrix)
+        return Ambiguity(matrix=eta @ self.matrix.mT @ eta / self.scale[..., None, None] ** 2)
+
+    @property
+    def scale(self) -> Float[Tensor, "*batch"]:
+        """The factor ``s`` on albedo."""
+        return _scale(self.matrix)
+
+
+def minkowski(like: Float[Tensor, "..."]) -> Float[Tensor, "4 4"]:
+    """Give ``diag(1, -1, -1, -1)``; ``n^T eta n = 0`` is the tie of albedo and normal."""
+    return torch.diag(like.new_tensor([1.0, -1.0, -1.0, -1.0]))
+
+
+def lorentz(generator: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    """Give the proper Lorentz transformation of a generator by the matrix exponential.
+
+    Args:
+        generator: Three rapidities of the boost along x, y, z, then a rotation vector.
+
+    Differentiable.
+    """
+    return torch.linalg.matrix_exp(_algebra(generator))
+
+
+def align_factorizations(
+    shading: Float[Tensor, "*batch 4 sample"],
+    reference: Float[Tensor, "*batch 4 sample"],
+    weight: Float[Tensor, "*batch sample"],
+    iterations: int = 10,
+) -> Ambiguity:
+    r"""Find the ambiguity that brings one factorization closest to another.
+
+    Minimises :math:`\sum_k w_k \lVert s e^{\omega} A_0 n_k - m_k \rVert^2` by Gauss-Newton
+    over scale and generators. It starts from the unconstrained linear solution and its
+    polar factor with respect to the form, reflections included.
+
+    Args:
+        shading: ``N`` to be moved, columns on the cone.
+        reference: Where it should come to lie, columns on the cone.
+        weight: Not negative. Samples without weight do not matter.
+        iterations: Of Gauss-Newton, after the linear start.
+
+    Fails softly where the samples span less than four dimensions: the best transformation
+    found is still a scaled Lorentz transformation. Constant to autograd.
+    """
+    with torch.no_grad():
+        source, target, w = shading.double(), reference.double(), weight.double()[..., None, :]
+        moment = (w * source) @ source.mT
+        ridge = 1e-9 * moment.diagonal(dim1=-2, dim2=-1).mean(dim=-1) + 1e-30
+        eye = torch.eye(4, dtype=source.dtype, device=source.device)
+        cross = (w * target) @ source.mT + ridge[..., None, None] * eye
+        linear = torch.linalg.solve(moment + ridge[..., None, None] * eye, cross, left=False)
+        matrix = _nearest_lorentz(linear)
+        for _ in range(iterations):
+            matrix = _improve(matrix, source, target, w)
+        return Ambiguity(matrix=matrix.to(shading.dtype))
+
+
+def _improve(
+    matrix: Float[Tensor, "*batch 4 4"],
+    source: Float[Tensor, "*batch 4 sample"],
+    target: Float[Tensor, "*batch 4 sample"],
+    w: Float[Tensor, "*batch 1 sample"],
+) -> Float[Tensor, "*batch 4 4"]:
+    moved = matrix @ source
+    basis = _algebra(torch.eye(6, dtype=matrix.dtype, device=matrix.device))
+    eye = torch.eye(4, dtype=matrix.dtype, device=matrix.device)
+    basis = torch.cat([basis, eye[None]])
+    steps = torch.einsum("gij,...jk->...gik", basis, moved)
+    root = w.sqrt()
+    A = (steps * root[..., None, :, :]).flatten(-2)
+    r = ((target - moved) * root).flatten(-2)
+    normal = A @ A.mT
+    damping = 1e-9 * normal.diagonal(dim1=-2, dim2=-1).mean(dim=-1) + 1e-30
+    eye7 = torch.eye(7, dtype=matrix.dtype, device=matrix.device)
+    step = torch.linalg.solve(normal + damping[..., None, None] * eye7, (A @ r[..., None])[..., 0])
+    step = step * (1 / step.norm(dim=-1, keepdim=True).clamp_min(1e-30)).clamp_max(1)
+    better = step[..., 6, None, None].exp() * lorentz(step[..., :6]) @ matrix
+    before = (w * (target - moved) ** 2).sum(dim=(-2, -1))
+    after = (w * (target - better @ source) ** 2).sum(dim=(-2, -1))
+    return torch.where((after < before)[..., None, None], better, matrix)
+
+
+def _nearest_lorentz(linear: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Take the polar factor with respect to the form by Newton's iteration.
+
+    Source: Higham, Mackey, Mackey & Tisseur, SIAM J. Matrix Anal. 25(4), 2004. Where it does
+    not converge (the matrix is far from every Lorentz transformation) the identity is taken.
+    """
+    eta = minkowski(linear)
+    scale = _scale(linear)[..., None, None]
+    found = linear / scale.clamp_min(1e-30)
+    for _ in range(30):
+        inverse = torch.linalg.inv_ex(found).inverse
+        found = (found + eta @ inverse.mT @ eta) / 2
+    wrong = (found.mT @ eta @ found - eta).abs().amax(dim=(-2, -1)) > 1e-6
+    bad = wrong | ~found.isfinite().all(dim=-1).all(dim=-1) | (found[..., 0, 0] < 0)
+    eye = torch.eye(4, dtype=linear.dtype, device=linear.device)
+    return torch.where(bad[..., None, None], eye, found) * scale
+
+
+def _scale(matrix: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
+    return torch.linalg.det(matrix).abs() ** 0.25
+
+
+def _algebra(generator: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    bx, by, bz, rx, ry, rz = generator.unbind(dim=-1)
+    zero = torch.zeros_like(bx)
+    rows = [[zero, bx, by, bz], [bx, zero, -rz, ry], [by, rz, zero, -rx], [bz, -ry, rx, zero]]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

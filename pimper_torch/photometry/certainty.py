@@ -1,0 +1,141 @@
+"""The last word on every sample: the exact minimum on the cone, and how sure it is."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.photometry.bilinear import (
+    Bilinear,
+    Factors,
+    equations_of_samples,
+    geometry_of_samples,
+)
+from pimper_torch.photometry.cone import project_to_cone, split_shading, tangent_columns
+from pimper_torch.photometry.quadratics import (
+    apply_packed,
+    congruence,
+    diagonal,
+    solve_packed,
+)
+from pimper_torch.records import Record
+
+# A normal whose standard error is this counts half.
+HALF_CONFIDENCE_DEG = 8.0
+
+# A step longer than this, in radians, is not Newton's last: the model there is no model.
+LONGEST_STEP = 0.3
+
+# A sample's own residuals are few; the patch's spread joins as if it were so many views.
+BORROWED_VIEWS = 4.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Certain(Record):
+    """Samples at the minimum.
+
+    Attributes:
+        albedo: Gray.
+        normals: Unit.
+        confidence: In (0, 1], where the equations allow any.
+    """
+
+    albedo: Float[Tensor, "patch sample"]
+    normals: Float[Tensor, "patch sample 3"]
+    confidence: Float[Tensor, "patch sample"]
+
+
+def refine_on_cone(problem: Bilinear, factors: Factors) -> Certain:
+    r"""Take each sample's Newton step along the cone, with lights and weights given.
+
+    With ``A`` and ``b`` the sample's normal equations and ``B`` the cone's tangents,
+    :math:`\delta = (B^\top A B)^{-1} B^\top (b - A n)`. At a converged solution the step is
+    next to nothing, but its derivative by the radiances is the implicit function's (Gauss-
+    Newton's approximation, lights held): this step is what gradients go through.
+
+    The same matrix tells the standard error of the normal, :math:`\sigma^2 = s^2
+    (C_{11} + C_{22}) / \rho^2` with ``C`` the inverse of :math:`B^\top A B` for the tangents
+    that turn the normal and ``s`` the spread of the residuals, the sample's and the patch's
+    pooled. Confidence is :math:`1 / (1 + (\sigma / 8°)^2)`: many views, lights that differ,
+    brightness and small residuals all raise it. Confidence is constant to autograd.
+    """
+    A, b = equations_of_samples(problem, factors.lights, factors.weight)
+    A = A + geometry_of_samples(problem)
+    columns = tangent_columns(factors.shading)
+    curvature = congruence(A, columns)
+    slope = b - apply_packed(A, factors.shading)
+    descent = torch.stack([(column * slope).sum(dim=1) for column in columns], dim=1)
+    damped = curvature.clone()
+    damped[:, diagonal(3)] += 1e-9 * curvature[:, diagonal(3)].sum(dim=1, keepdim=True)
+    step = solve_packed(damped, descent)
+    size = step.norm(dim=1, keepdim=True).detach()
+    limit = LONGEST_STEP * factors.shading[:, :1]
+    step = step * torch.where(size > limit, limit / size.clamp_min(1e-30), 1)
+    moved = factors.shading
+    for place, column in enumerate(columns):
+        moved = moved + column * step[:, place : place + 1]
+    albedo, normals = split_shading(project_to_cone(moved.mT))
+    with torch.no_grad():
+        error = _standard_error(problem, factors, damped)
+        half = math.radians(HALF_CONFIDENCE_DEG)
+        confidence = 1 / (1 + (error / half) ** 2)
+    return Certain(albedo=albedo, normals=normals, confidence=confidence.nan_to_num(nan=0.0))
+
+
+def fit_albedo(
+    radiance: Float[Tensor, "patch view channel sample"],
+    weight: Float[Tensor, "patch view sample"],
+    shading: Float[Tensor, "patch view sample"],
+) -> Float[Tensor, "patch channel sample"]:
+    """Give every channel's albedo in closed form, shading ``l . (1, n)`` given.
+
+    Not negative; zero where nothing is lit. Differentiable.
+    """
+    lit = weight * shading
+    square = (lit * shading).sum(dim=1)
+    product = torch.einsum("pfk,pfck->pck", lit, radiance)
+    some = square > torch.finfo(square.dtype).tiny ** 0.5
+    return torch.where(some[:, None], product / torch.where(some, square, 1)[:, None], 0).clamp_min(
+        0
+    )
+
+
+def light_varies(
+    lights: Float[Tensor, "view 4"],
+    share: Float[Tensor, "patch view"],
+    least: float,
+) -> Bool[Tensor, " patch"]:
+    r"""Tell in which patches the light changed enough between the views that see them.
+
+    The lights, each scaled to length 1 so that exposure does not count, are weighed by the
+    share of the patch that their view sees. A shading vector has three degrees of freedom:
+    the third singular value of the weighted lights, over the first, must reach ``least``.
+    """
+    unit = lights / lights.norm(dim=1, keepdim=True).clamp_min(1e-30)
+    moment = torch.einsum("pf,fi,fj->pij", share.double(), unit.double(), unit.double())
+    values = torch.linalg.eigvalsh(moment).clamp_min(0)
+    return (values[:, 1] > 0) & (values[:, 1] >= least**2 * values[:, 3])
+
+
+def _standard_error(
+    problem: Bilinear, factors: Factors, curvature: Float[Tensor, "patch 6 sample"]
+) -> Float[Tensor, "patch sample"]:
+    residual = problem.radiance - factors.lights @ factors.shading
+    square = (factors.weight * residual**2).sum(dim=1)
+    count = factors.weight.sum(dim=1)
+    # A sample with m views has spent 3 of them on its own albedo and normal.
+    pooled = square.sum(dim=1) / (count - 3).clamp_min(0).sum(dim=1).clamp_min(1)
+    spread = (square + BORROWED_VIEWS * pooled[:, None]) / (
+        (count - 3).clamp_min(0) + BORROWED_VIEWS
+    )
+    variance = torch.zeros_like(square)
+    for place in (1, 2):
+        unit = torch.zeros_like(factors.shading[:, :3])
+        unit[:, place] = 1
+        variance = variance + solve_packed(curvature, unit)[:, place]
+    albedo = factors.shading[:, 0]
+    some = albedo > 0
+    error = (spread * variance).clamp_min(0).sqrt() / torch.where(some, albedo, 1)
+    return torch.where(some & (variance > 0), error, torch.inf)

@@ -1,0 +1,101 @@
+"""Many small symmetric systems at once: weighted least squares, sample by sample.
+
+A symmetric n x n matrix travels as its upper triangle, row by row, in the last axis but
+one: 10 numbers for n = 4. Millions of them then cost one matrix product to assemble, and
+elementwise arithmetic, without a call of a library each, to solve.
+"""
+
+from itertools import combinations_with_replacement
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def outer(vectors: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch packed item"]:
+    """Give the upper triangle of ``v v^T`` for each column ``v``.
+
+    >>> outer(torch.tensor([[1.0], [2.0]]))[:, 0]
+    tensor([1., 2., 4.])
+    """
+    rows, columns = _triangle(vectors.shape[-2])
+    return vectors[..., rows, :] * vectors[..., columns, :]
+
+
+def diagonal(size: int) -> list[int]:
+    """Tell where the diagonal of a matrix stands in its packed form."""
+    rows, columns = _triangle(size)
+    return [place for place, pair in enumerate(zip(rows, columns, strict=True)) if len({*pair}) < 2]
+
+
+def apply_packed(
+    packed: Float[Tensor, "*batch packed item"], vectors: Float[Tensor, "*batch size item"]
+) -> Float[Tensor, "*batch size item"]:
+    """Multiply each packed matrix with its vector."""
+    size = vectors.shape[-2]
+    rows, columns = _triangle(size)
+    total = [torch.zeros_like(vectors[..., 0, :]) for _ in range(size)]
+    for place, (row, column) in enumerate(zip(rows, columns, strict=True)):
+        entry = packed[..., place, :]
+        total[row] = total[row] + entry * vectors[..., column, :]
+        if row != column:
+            total[column] = total[column] + entry * vectors[..., row, :]
+    return torch.stack(total, dim=-2)
+
+
+def congruence(
+    packed: Float[Tensor, "*batch packed item"], columns: list[Float[Tensor, "*batch size item"]]
+) -> Float[Tensor, "*batch smaller item"]:
+    """Give ``B^T A B``, packed, for matrices ``B`` given by their columns."""
+    images = [apply_packed(packed, column) for column in columns]
+    rows, places = _triangle(len(columns))
+    return torch.stack(
+        [
+            (columns[row] * images[place]).sum(dim=-2)
+            for row, place in zip(rows, places, strict=True)
+        ],
+        dim=-2,
+    )
+
+
+def solve_packed(
+    packed: Float[Tensor, "*batch packed item"], rhs: Float[Tensor, "*batch size item"]
+) -> Float[Tensor, "*batch size item"]:
+    """Solve symmetric positive systems by Cholesky, in float64.
+
+    A direction whose pivot is below 1e-12 of the matrix's trace carries no information:
+    its pivot is raised to that, so that the answer stays finite; an empty matrix answers
+    zero to a zero right-hand side. Differentiable.
+    """
+    size = rhs.shape[-2]
+    rows, columns = _triangle(size)
+    entries = {
+        (column, row): packed[..., place, :].double()
+        for place, (row, column) in enumerate(zip(rows, columns, strict=True))
+    }
+    trace = torch.stack([entries[i, i] for i in range(size)]).sum(dim=0)
+    floor = (1e-12 * trace.detach()).clamp_min(torch.finfo(torch.float64).tiny ** 0.5)
+    lower: dict[tuple[int, int], Tensor] = {}
+    forward: list[Tensor] = []
+    for i in range(size):
+        for j in range(i + 1):
+            total = entries[i, j]
+            for k in range(j):
+                total = total - lower[i, k] * lower[j, k]
+            lower[i, j] = torch.maximum(total, floor).sqrt() if i == j else total / lower[j, j]
+        value = rhs[..., i, :].double()
+        for k in range(i):
+            value = value - lower[i, k] * forward[k]
+        forward.append(value / lower[i, i])
+    solution = forward
+    for i in reversed(range(size)):
+        value = forward[i]
+        for k in range(i + 1, size):
+            value = value - lower[k, i] * solution[k]
+        solution[i] = value / lower[i, i]
+    return torch.stack(solution, dim=-2).to(rhs.dtype)
+
+
+def _triangle(size: int) -> tuple[list[int], list[int]]:
+    pairs = list(combinations_with_replacement(range(size), 2))
+    return [row for row, _ in pairs], [column for _, column in pairs]

@@ -1,0 +1,107 @@
+"""A start from the data alone: singular vectors, upgraded to the photometric cone."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.photometry.ambiguity import minkowski
+from pimper_torch.photometry.quadratics import diagonal, outer, solve_packed
+
+# Filling converges in a few steps to a good start; the alternation after it is exact.
+FILL_STEPS = 20
+ALTERNATIONS = 30
+
+
+def factorize_rank_four(
+    radiance: Float[Tensor, "patch view sample"], weight: Float[Tensor, "patch view sample"]
+) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
+    """Find the best product of rank four where the data is seen, cone ignored.
+
+    Missing entries are filled with a sample's albedo times a view's brightness, then with
+    the rank-four part of the filled matrix in turn (eigenvectors of the small view-by-view
+    matrix); weighted alternation follows. A view or sample with fewer than four entries
+    gets the smallest solution. The product is unique, its factors up to a 4 x 4 matrix.
+    """
+    count = weight.sum(dim=1, keepdim=True).clamp_min(1)
+    gain = (weight * radiance).sum(dim=2, keepdim=True) / weight.sum(dim=2, keepdim=True).clamp_min(
+        1
+    )
+    albedo = (weight * radiance).sum(dim=1, keepdim=True) / (
+        (weight * gain).sum(dim=1, keepdim=True).clamp_min(1e-12)
+    )
+    filled = torch.where(weight > 0, radiance, gain * albedo * (count > 0))
+    basis = _leading(filled)
+    for _ in range(FILL_STEPS):
+        filled = torch.where(weight > 0, radiance, basis @ (basis.mT @ filled))
+        basis = _leading(filled)
+    lights, shading = basis, basis.mT @ filled
+    for _ in range(ALTERNATIONS):
+        shading = _solve(outer(lights.mT) @ weight, lights.mT @ (weight * radiance))
+        packed = (weight @ outer(shading).mT).mT
+        lights = _solve(packed, ((weight * radiance) @ shading.mT).mT).mT
+    return lights, shading
+
+
+def upgrade_to_cone(
+    lights: Float[Tensor, "patch view 4"],
+    shading: Float[Tensor, "patch 4 sample"],
+    weight: Float[Tensor, "patch sample"],
+) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
+    r"""Bring shading vectors as near to the cone as one matrix for all of them can.
+
+    All lie on a quadric :math:`s^\top Q s = 0`; the least eigenvector of their quadratic
+    monomials is ``Q``, and :math:`Q = H^\top \eta H` gives the matrix ``H``. Noise can spoil
+    Q's signature (1, 3); the eigenvalue most apart in sign is then taken for albedo.
+
+    Returns:
+        Lights and shading vectors, equal in product to those given, near the cone up to a
+        scaled Lorentz transformation and with albedo positive for most samples.
+    """
+    S, L = shading.double(), lights.double()
+    moment = (S * weight[:, None]) @ S.mT
+    values, vectors = torch.linalg.eigh(moment)
+    whiten = vectors * values.clamp_min(1e-12 * values[:, -1:] + 1e-300).rsqrt()[:, None, :]
+    S, L = whiten.mT @ S, L @ torch.linalg.pinv(whiten).mT
+    size = S.norm(dim=1, keepdim=True)
+    unit = S / size.clamp_min(1e-12)
+    monomials = outer(unit) * (weight > 0)[:, None]
+    double = torch.full_like(monomials[0, :, :1], 2.0)
+    double[diagonal(4)] = 1
+    monomials = monomials * double
+    least = torch.linalg.eigh(monomials @ monomials.mT).eigenvectors[..., 0]
+    rows, columns = torch.triu_indices(4, 4)
+    Q = least.new_zeros(len(least), 4, 4)
+    Q[:, rows, columns] = least
+    Q[:, columns, rows] = least
+    values, vectors = torch.linalg.eigh(Q)
+    # Ascending: one positive at the end, or one negative at the front.
+    front = values[:, 1] > 0
+    flipped = front | ((values[:, 2] > 0) & (values[:, 0].abs() > values[:, 3]))
+    values = torch.where(flipped[:, None], -values.flip(1), values)
+    vectors = torch.where(flipped[:, None, None], vectors.flip(2), vectors)
+    order = [3, 0, 1, 2]
+    roots = values[:, order].abs().clamp_min(1e-6).sqrt()
+    H = roots[..., None] * vectors[:, :, order].mT
+    S, L = H @ S, L @ torch.linalg.inv(H)
+    sign = torch.where((weight * S[:, 0].sign()).sum(dim=1) < 0, -1.0, 1.0)[:, None, None]
+    eta = minkowski(S)
+    # A time axis of the wrong sign is mended by -1; space axes are the alignment's affair.
+    mirror = torch.where(sign < 0, -torch.eye(4, dtype=S.dtype, device=S.device), eta @ eta)
+    return (L @ mirror).to(lights), (mirror @ S).to(shading)
+
+
+def _leading(filled: Float[Tensor, "patch view sample"]) -> Float[Tensor, "patch view 4"]:
+    rows = filled.double()
+    vectors = torch.linalg.eigh(rows @ rows.mT).eigenvectors
+    lead = vectors[..., -4:]
+    padding = lead.new_zeros(*lead.shape[:-1], 4 - lead.shape[-1])
+    return torch.cat([lead, padding], dim=-1).to(filled.dtype)
+
+
+def _solve(
+    packed: Float[Tensor, "patch 10 item"], rhs: Float[Tensor, "patch 4 item"]
+) -> Float[Tensor, "patch 4 item"]:
+    ridge = 1e-9 * packed[:, diagonal(4)].sum(dim=1, keepdim=True).amax(dim=2, keepdim=True)
+    damped = packed.clone()
+    damped[:, diagonal(4)] += ridge
+    return solve_packed(damped, rhs)

@@ -1,0 +1,49 @@
+"""Where a factorization starts."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.photometry.ambiguity import Ambiguity, align_factorizations
+from pimper_torch.photometry.cone import project_to_cone
+from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.spectral import factorize_rank_four, upgrade_to_cone
+
+
+def start_from_mesh(
+    radiance: Float[Tensor, "patch view sample"],
+    seen: Bool[Tensor, "patch view sample"],
+    lights: Float[Tensor, "patch view 4"],
+    normals: Float[Tensor, "patch sample 3"],
+) -> Float[Tensor, "patch 4 sample"]:
+    """Give shading vectors with the mesh's normals and the albedo that fits them best."""
+    basis = harmonics(normals).mT
+    shading = lights @ basis
+    weight = seen.to(radiance.dtype)
+    square = (weight * shading**2).sum(dim=1)
+    product = (weight * shading * radiance).sum(dim=1)
+    albedo = torch.where(square > 0, product / torch.where(square > 0, square, 1), 0)
+    return albedo.clamp_min(0)[:, None] * basis
+
+
+def start_from_data(
+    radiance: Float[Tensor, "patch view sample"],
+    seen: Bool[Tensor, "patch view sample"],
+    reference: Float[Tensor, "patch view 4"],
+) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
+    """Factorize without the mesh, then fix the ambiguity by reference lights.
+
+    Singular vectors of the filled data, upgraded to the cone; of all Lorentz transformations
+    the one is applied that brings the lights nearest to ``reference``. Normals would be the
+    worse reference: those of a mesh are smoother than the true ones, and the transformation
+    that fits them best flattens the relief.
+    """
+    weight = seen.to(radiance.dtype)
+    # Samples that fewer than four views see say nothing of the cone.
+    told = (weight.sum(dim=1) >= 4).to(radiance.dtype)
+    lights, shading = factorize_rank_four(radiance, weight)
+    lights, shading = upgrade_to_cone(lights, shading, told)
+    # L A^-1 = reference, transposed: lights are columns that A^-T moves.
+    moves = align_factorizations(lights.mT, reference.mT, weight.sum(dim=2))
+    turn = Ambiguity(matrix=moves.matrix.mT).inverse()
+    return turn.on_lights(lights), project_to_cone(turn.on_shading(shading).mT).mT

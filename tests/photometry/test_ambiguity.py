@@ -1,0 +1,73 @@
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.photometry.ambiguity import (
+    Ambiguity,
+    align_factorizations,
+    lorentz,
+    minkowski,
+)
+from pimper_torch.photometry.harmonics import harmonics
+
+
+def some(generator, batch=3):
+    generators = 0.5 * torch.randn(batch, 6, generator=generator, dtype=torch.float64)
+    return Ambiguity(matrix=1.7 * lorentz(generators))
+
+
+def cone_points(generator, batch=3, samples=40):
+    n = normalize(torch.randn(batch, samples, 3, generator=generator, dtype=torch.float64), dim=-1)
+    rho = 0.2 + torch.rand(batch, samples, 1, generator=generator, dtype=torch.float64)
+    return (rho * harmonics(n)).mT
+
+
+def test_transformations_preserve_the_form_up_to_their_scale(generator):
+    A = some(generator).matrix
+    eta = minkowski(A)
+    assert_close(A.mT @ eta @ A, (1.7**2 * eta).expand_as(A))
+    assert not torch.allclose(A.mT @ A, 1.7**2 * torch.eye(4, dtype=A.dtype))  # not a rotation
+
+
+def test_the_inverse_undoes_and_the_generator_negated_is_the_inverse(generator):
+    A = some(generator)
+    assert_close(A.inverse().matrix @ A.matrix, torch.eye(4, dtype=torch.float64).expand(3, 4, 4))
+    g = torch.randn(2, 6, generator=generator, dtype=torch.float64)
+    assert_close(lorentz(g) @ lorentz(-g), torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
+
+
+def test_the_ambiguity_changes_neither_the_data_nor_the_cone(generator):
+    A, N = some(generator), cone_points(generator)
+    L = torch.randn(3, 7, 4, generator=generator, dtype=torch.float64)
+    moved = A.on_shading(N)
+    assert_close(A.on_lights(L) @ moved, L @ N)
+    assert_close(moved[:, 0], moved[:, 1:].norm(dim=1))
+    assert (moved - N).abs().max() > 0.1
+
+
+def test_alignment_finds_the_transformation_that_was_applied(generator):
+    N = cone_points(generator)
+    weight = torch.ones(3, 40, dtype=torch.float64)
+    A = some(generator)
+    assert_close(align_factorizations(N, A.on_shading(N), weight).matrix, A.matrix)
+    mirror = torch.diag(torch.tensor([1.0, 1, 1, -1], dtype=torch.float64))  # convex to concave
+    flipped = Ambiguity(matrix=A.matrix @ mirror)
+    found = align_factorizations(N, flipped.on_shading(N), weight)
+    assert_close(found.matrix, flipped.matrix)
+
+
+def test_alignment_under_noise_is_a_minimum_within_the_group(generator):
+    N, A = cone_points(generator), some(generator)
+    target = A.on_shading(N)
+    target = target + 0.05 * torch.randn(target.shape, generator=generator, dtype=torch.float64)
+    weight = torch.rand(3, 40, generator=generator, dtype=torch.float64)
+    found = align_factorizations(N, target, weight)
+
+    def cost(matrix):
+        return (weight[:, None] * (target - matrix @ N) ** 2).sum(dim=(1, 2))
+
+    least = cost(found.matrix)
+    for _ in range(50):
+        nudge = lorentz(1e-3 * torch.randn(3, 6, generator=generator, dtype=torch.float64))
+        assert (cost(nudge @ found.matrix) >= least).all()
+        assert (cost(1.0003 * found.matrix) >= least).all()

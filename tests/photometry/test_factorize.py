@@ -1,0 +1,226 @@
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError, PimperWarning
+from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.rows import coarse_normals
+from pimper_torch.records import PatchViews
+
+EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
+
+
+def angles_deg(found, truth, where):
+    cosine = (found * truth).sum(dim=-1).clamp(-1, 1)
+    return torch.rad2deg(torch.acos(cosine))[where]
+
+
+def median_error(found, scene):
+    return torch.cat(
+        [
+            angles_deg(bucket.normals_patch, truth, bucket.valid)
+            for bucket, truth in zip(found.buckets, scene.normals, strict=True)
+        ]
+    ).median()
+
+
+def test_the_mesh_starts_at_the_truth_and_stays_when_it_is_the_truth(scene):
+    true = scene(bumps=0.0)
+    found = Factorize(EXACT)(true.seen)
+    ratios = []
+    for bucket, normals, albedo, registered in zip(
+        found.buckets, true.normals, true.albedo, true.seen.buckets, strict=True
+    ):
+        assert angles_deg(bucket.normals_patch, normals, bucket.valid).max() < 0.05
+        ratios.append((bucket.albedo / albedo)[bucket.valid])
+        again = bucket.albedo.movedim(-1, 1)[:, None] * torch.einsum(
+            "pfi,phwi->pfhw", bucket.lights_patch, harmonics(bucket.normals_patch)
+        ).unsqueeze(2)
+        lit = registered.valid & bucket.valid[:, None]
+        off = (again - registered.radiance).abs().movedim(2, -1)[lit]
+        assert off.max() < 2e-3
+    ratio = torch.cat(ratios)
+    assert ratio.std() / ratio.mean() < 1e-3  # one scale for all patches and channels
+
+
+@pytest.mark.parametrize("solver", ["balm", "descent"])
+def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
+    true = scene(bumps=0.2)
+    start = torch.cat(
+        [
+            angles_deg(coarse_normals(true.seen.patches.coarse, t), n, t.inside)
+            for t, n in zip(true.seen.patches.buckets, true.normals, strict=True)
+        ]
+    ).median()
+    found = Factorize(FactorizeConfig(solver=solver, geometry_weight=0.0))(true.seen)
+    assert start > 10
+    assert median_error(found, true) < 0.25 * start
+    for bucket in found.buckets:
+        assert bucket.determined.all()
+        assert (bucket.normals_patch[..., 2] < 0).all()
+        assert (bucket.confidence[~bucket.valid] == 0).all()
+        assert (bucket.confidence >= 0).all()
+        assert (bucket.confidence <= 1).all()
+
+
+def test_the_published_method_fixes_its_ambiguity_by_the_mesh(scene):
+    true = scene(bumps=0.3)
+    paper = FactorizeConfig(
+        start="svd", light_coupling=0.0, geometry_weight=0.0, robust=False, max_iterations=200
+    )
+    assert median_error(Factorize(paper)(true.seen), true) < 5  # the bumps have 17 degrees
+
+
+def test_samples_lit_by_few_have_no_say(scene):
+    true = scene()
+    first = true.seen.buckets[0]
+    valid = first.valid.clone()
+    valid[1, 3:, 4:7] = False  # three views left in these rows
+    seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
+    found = Factorize()(seen).buckets[0]
+    assert not found.valid[1, 4:7].any()
+    assert (found.confidence[1, 4:7] == 0).all()
+    coarse = coarse_normals(seen.patches.coarse, seen.patches.buckets[0])
+    assert_close(found.normals_patch[1, 4:7], coarse[1, 4:7])
+    assert found.valid[1, 8:].any()
+
+
+def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
+    light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
+    true = scene(lights=light * torch.linspace(0.5, 1.5, 12, dtype=torch.float64)[:, None])
+    with pytest.warns(PimperWarning, match="8 of 8 patches keep the normals of the coarse mesh"):
+        found = Factorize()(true.seen)
+    for bucket, templates in zip(found.buckets, true.seen.patches.buckets, strict=True):
+        assert not bucket.determined.any()
+        assert not bucket.valid.any()
+        coarse = coarse_normals(true.seen.patches.coarse, templates)
+        assert_close(bucket.normals_patch, coarse)
+        assert bucket.albedo.isfinite().all()
+        assert (bucket.albedo[templates.inside] > 0).float().mean() > 0.9
+
+
+def spoil(seen: PatchViews, how: str) -> PatchViews:
+    first = seen.buckets[0]
+    radiance, valid = first.radiance.clone(), first.valid.clone()
+    if how == "masked":
+        radiance[2], valid[2] = 0, False
+    else:
+        radiance[2] = math.nan if how == "nan" else math.inf
+    return seen.replace(buckets=(first.replace(radiance=radiance, valid=valid), *seen.buckets[1:]))
+
+
+@pytest.mark.parametrize("how", ["masked", "nan", "inf"])
+def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how):
+    true = scene()
+    without = spoil(true.seen, "masked")
+    keep = torch.tensor([0, 1, 3, 4])
+    with pytest.warns(PimperWarning, match="1 of 8"):
+        found = Factorize()(spoil(true.seen, how))
+    with pytest.warns(PimperWarning):
+        plain = Factorize()(without)
+    bad, good = found.buckets[0], plain.buckets[0]
+    assert not bad.determined[2]
+    assert not bad.valid[2].any()
+    for name in ("normals_patch", "albedo", "lights_patch", "confidence"):
+        assert getattr(bad, name).isfinite().all()
+        assert_close(getattr(bad, name)[keep], getattr(good, name)[keep])
+    assert bad.determined[keep].all()
+
+
+def test_a_view_that_sees_nothing_has_no_light(scene):
+    true = scene()
+    buckets = tuple(
+        each.replace(valid=each.valid & (torch.arange(12) != 4)[:, None, None])
+        for each in true.seen.buckets
+    )
+    found = Factorize()(true.seen.replace(buckets=buckets))
+    assert (found.buckets[0].lights_patch[:, 4] == 0).all()
+    assert (found.buckets[0].lights_patch[:, 5] != 0).any()
+    assert found.buckets[0].valid.any()
+
+
+def test_nothing_seen_at_all_is_told_not_raised(scene):
+    true = scene()
+    buckets = tuple(
+        each.replace(radiance=0 * each.radiance, valid=torch.zeros_like(each.valid))
+        for each in true.seen.buckets
+    )
+    with pytest.warns(PimperWarning, match="8 are nowhere seen lit in 4 views"):
+        found = Factorize()(true.seen.replace(buckets=buckets))
+    for bucket in found.buckets:
+        assert bucket.normals_patch.isfinite().all()
+        assert (bucket.albedo == 0).all()
+
+
+def test_chunks_make_no_difference(scene, monkeypatch):
+    true = scene()
+    whole = Factorize()(true.seen)
+    monkeypatch.setattr("pimper_torch.photometry.factorize.CHUNK_ENTRIES", 1)
+    single = Factorize()(true.seen)
+    for one, other in zip(whole.buckets, single.buckets, strict=True):
+        assert_close(one.normals_patch, other.normals_patch, rtol=0, atol=1e-8)
+        assert_close(one.albedo, other.albedo, rtol=0, atol=1e-8)
+        assert_close(one.convergence.iterations, other.convergence.iterations)
+
+
+def test_confidence_falls_with_noise(scene, generator):
+    true = scene()
+    noisy = true.seen.replace(
+        buckets=tuple(
+            each.replace(
+                radiance=each.radiance
+                + 0.2 * torch.randn(each.radiance.shape, generator=generator, dtype=torch.float64)
+            )
+            for each in true.seen.buckets
+        )
+    )
+    clean, dirty = Factorize()(true.seen).buckets[0], Factorize()(noisy).buckets[0]
+    assert dirty.confidence[dirty.valid].mean() < 0.8 * clean.confidence[clean.valid].mean()
+
+
+def test_gradients_reach_the_radiance_of_lit_samples_only(scene):
+    true = scene()
+    first = true.seen.buckets[0]
+    radiance = first.radiance.clone().requires_grad_()
+    seen = true.seen.replace(buckets=(first.replace(radiance=radiance), *true.seen.buckets[1:]))
+    found = Factorize()(seen).buckets[0]
+    (found.normals_patch[..., 0].sum() + found.albedo.sum()).backward()
+    assert radiance.grad.isfinite().all()
+    assert radiance.grad.abs().sum() > 0
+    assert (radiance.grad.movedim(2, -1)[~first.valid] == 0).all()
+
+
+def test_what_is_handed_in_is_left_alone(scene):
+    true = scene()
+    before = [each.radiance.clone() for each in true.seen.buckets]
+    Factorize()(true.seen)
+    for each, copy in zip(true.seen.buckets, before, strict=True):
+        assert_close(each.radiance, copy, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"light_coupling": -1.0},
+        {"geometry_weight": -0.1},
+        {"robust_scale": 0.0},
+        {"min_views": 2},
+        {"min_light_variation": 1.0},
+        {"max_iterations": 0},
+        {"tolerance": 0.0},
+    ],
+)
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ConfigError, match=f"factorize.{next(iter(wrong))}"):
+        FactorizeConfig(**wrong)
+
+
+@pytest.mark.parametrize("field", ["start", "solver"])
+def test_unknown_ways_are_refused(field):
+    config = FactorizeConfig()
+    object.__setattr__(config, field, "random")  # past the type checker of the tests
+    with pytest.raises(ConfigError, match=f"factorize.{field}"):
+        config.__post_init__()

@@ -1,0 +1,124 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.photometry.ambiguity import align_factorizations
+from pimper_torch.photometry.balm import solve_balm
+from pimper_torch.photometry.bilinear import objective, select
+from pimper_torch.photometry.certainty import refine_on_cone
+from pimper_torch.photometry.descent import solve_descent
+from pimper_torch.photometry.starts import start_from_data
+
+SOLVERS = pytest.mark.parametrize("solve", [solve_balm, solve_descent])
+
+
+def error(found, truth, weight, least=7):
+    """Largest error of shading vectors seen often enough, the ambiguity undone."""
+    often = (weight.sum(dim=1) >= least).double()
+    turn = align_factorizations(found, truth, often)
+    return ((turn.on_shading(found) - truth).abs().amax(dim=1) * often).max()
+
+
+@SOLVERS
+def test_factors_are_recovered_up_to_lorentz_with_60_percent_missing(problem, solve):
+    given, _, shading = problem(patches=1, missing=0.6)
+    found = solve(given, 600, 1e-7)
+    assert found.convergence.residual.max() < 1e-4  # of radiances about 1; the start is off by 0.1
+    assert error(found.shading, shading, given.weight) < 5e-3
+    assert_close(found.shading[:, 0], found.shading[:, 1:].norm(dim=1))
+    assert (found.shading - given.shading).abs().max() > 0.05
+
+
+def test_factors_are_recovered_when_whole_blocks_are_missing(problem):
+    given, _, shading = problem()
+    weight = torch.ones_like(given.weight)
+    for view in range(20):  # each view misses another contiguous half, as occlusion does
+        away = (torch.arange(150) - 7 * view) % 150 < 75
+        weight[:, view, away] = 0
+    given = given.replace(weight=weight, radiance=weight * given.radiance)
+    found = solve_descent(given, 800, 1e-8)
+    assert error(found.shading, shading, weight) < 1e-3
+
+
+def test_the_data_alone_are_a_start(problem):
+    given, lights, shading = problem(missing=0.3)
+    L, N = start_from_data(given.radiance, given.weight > 0, given.lights)
+    assert (N - shading).abs().median() < 0.05  # lights off by 0.05 fix the ambiguity so well
+    assert (L - lights).abs().median() < 0.05
+    assert (((L @ N - given.radiance) * given.weight) ** 2).mean().sqrt() < 1e-2
+    assert error(N, shading, given.weight) < 0.05
+
+
+def test_balm_and_descent_agree_on_clean_data(problem):
+    given, _, _ = problem(missing=0.3)
+    pull = torch.full_like(given.pull, 3.0)  # a hold on the gauge, so that factors compare
+    given = given.replace(pull=pull, geometry=torch.full_like(given.geometry, 0.1))
+    balm, descent = solve_balm(given, 800, 1e-8), solve_descent(given, 800, 1e-8)
+    assert_close(balm.shading, descent.shading, rtol=0, atol=2e-4)
+    assert_close(balm.lights, descent.lights, rtol=0, atol=2e-4)
+    costs = [objective(given, each.lights, each.shading, given.weight) for each in (balm, descent)]
+    assert_close(*costs, rtol=1e-4, atol=1e-8)
+    assert (costs[0] < objective(given, given.lights, given.shading, given.weight)).all()
+
+
+@SOLVERS
+def test_lights_that_are_held_stay(problem, solve):
+    given, _, _ = problem()
+    held = given.replace(pull=torch.full_like(given.pull, 1e9))
+    assert_close(solve(held, 40, 1e-6).lights, given.anchor, rtol=0, atol=1e-5)
+    assert (solve(given, 40, 1e-6).lights - given.anchor).abs().max() > 1e-2
+
+
+@SOLVERS
+def test_robust_weights_keep_outliers_out(problem, solve, generator):
+    given, lights, shading = problem(views=20)
+    gross = torch.rand(given.radiance.shape, generator=generator) < 0.1
+    given = given.replace(
+        radiance=torch.where(gross, given.radiance + 1.5, given.radiance),
+        lights=lights,
+        anchor=lights,
+        pull=torch.full_like(given.pull, 1e9),
+    )
+    plain = (solve(given, 100, 1e-6).shading - shading).norm(dim=1).median()
+    robust = solve(given.replace(robust_scale=2.385), 200, 1e-6)
+    assert (robust.shading - shading).norm(dim=1).median() < 0.02 * plain
+    assert robust.weight[gross].max() < 0.1
+
+
+@SOLVERS
+def test_a_patch_is_solved_as_if_it_were_alone(problem, solve):
+    given, _, _ = problem(patches=3, samples=60)
+    empty = given.replace(
+        weight=given.weight * torch.tensor([1.0, 0, 1]).double()[:, None, None],
+        radiance=given.radiance * torch.tensor([1.0, 0, 1]).double()[:, None, None],
+    )
+    together = solve(empty, 60, 1e-5)
+    for patch in (0, 2):
+        alone = solve(select(given, torch.tensor([patch])), 60, 1e-5)
+        assert_close(together.shading[patch], alone.shading[0], rtol=0, atol=1e-9)
+        assert together.convergence.iterations[patch] == alone.convergence.iterations[0]
+    assert together.shading.isfinite().all()
+    assert together.lights.isfinite().all()
+
+
+def test_the_last_step_reaches_the_minimum_of_every_sample_and_differentiates_it(problem):
+    given, lights, _ = problem(patches=1, samples=12, off=0.02)
+    given = given.replace(lights=lights, anchor=lights, pull=torch.full_like(given.pull, 1e9))
+    noisy = given.radiance + 0.01 * torch.sin(torch.arange(240.0)).double().reshape(1, 20, 12)
+    given = given.replace(radiance=noisy)
+    found = solve_balm(given, 300, 1e-7)
+    reached = refine_on_cone(given, found)
+    again = solve_descent(given.replace(shading=found.shading), 500, 1e-12)
+    assert_close(reached.albedo, again.shading[:, 0], rtol=0, atol=1e-5)
+
+    radiance = given.radiance.clone().requires_grad_()
+    refine_on_cone(given.replace(radiance=radiance), found).albedo[0, 3].backward()
+    step = 1e-3
+    there = []
+    for sign in (1, -1):
+        moved = noisy.clone()
+        moved[0, 5, 3] += sign * step
+        there.append(solve_descent(given.replace(radiance=moved), 500, 1e-12).shading[0, 0, 3])
+    slope = (there[0] - there[1]) / (2 * step)
+    assert_close(radiance.grad[0, 5, 3], slope, rtol=0.05, atol=1e-4)  # Gauss-Newton's part
+    assert (radiance.grad[0, :, :3] == 0).all()
