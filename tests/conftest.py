@@ -5,3 +5,126 @@ def pytest_configure(config: pytest.Config) -> None:
     # Not in pyproject.toml: pytest would import the package to resolve the category before
     # jaxtyping's hook is in place.
     config.addinivalue_line("filterwarnings", "error::pimper_torch.errors.PimperWarning")
+
+
+@pytest.fixture
+def reconstruction():
+    """A bump on a square seen by three cameras: a small, complete result."""
+    import torch
+    from torch.nn.functional import normalize
+
+    from pimper_torch.geometry.frames import rigid
+    from pimper_torch.geometry.projection import project
+    from pimper_torch.geometry.surfaces import vertex_normals
+    from pimper_torch.records import (
+        CoarseMesh,
+        Convergence,
+        DepthPatches,
+        Depths,
+        Lens,
+        Mesh,
+        PatchSet,
+        PhotometricPatches,
+        Photometry,
+        Reconstruction,
+        SparseScene,
+        StageReport,
+        Templates,
+        Views,
+    )
+    from pimper_torch.scenes.cameras import arc_cameras
+
+    generator = torch.Generator().manual_seed(75)
+    cameras = arc_cameras(3, width=60, height=40, focal_px=90.0, distance=6.0, span_deg=30.0)
+    cameras = cameras.replace(
+        intrinsics=cameras.intrinsics.float(), cam_from_world=cameras.cam_from_world.float()
+    )
+    side = torch.linspace(-1, 1, 15)
+    y, x = torch.meshgrid(side, side, indexing="ij")
+    vertices = torch.stack([x, y, 0.5 * torch.exp(-3 * (x**2 + y**2))], dim=-1).reshape(-1, 3)
+    first = (torch.arange(14)[:, None] * 15 + torch.arange(14)).reshape(-1)
+    lower = torch.stack([first, first + 1, first + 16], dim=1)
+    upper = torch.stack([first, first + 16, first + 15], dim=1)
+    faces = torch.cat([lower, upper])
+    mesh = Mesh(
+        vertices_world=vertices,
+        faces=faces,
+        normals_world=vertex_normals(vertices, faces),
+        albedo=3 * torch.rand(len(vertices), 3, generator=generator),
+        confidence=torch.rand(len(vertices), generator=generator),
+    )
+    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    coarse = CoarseMesh(
+        mesh=Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]])),
+        reference=1,
+        is_point=torch.tensor([True, True, True, False]),
+    )
+    images = torch.rand(3, 3, 40, 60, generator=generator)
+    views = Views(
+        images=images,
+        sizes_px=cameras.sizes_px,
+        names=("a.png", "b.png", "c.png"),
+        focals_px=torch.full((3,), torch.nan),
+    )
+    points = vertices[::8]
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    count = len(points)
+    lens = Lens(camera=1, model="PINHOLE", params=(90.0, 90.0, 30.0, 20.0), width=60, height=40)
+    scene = SparseScene(
+        views=views,
+        cameras=cameras,
+        points_world=points,
+        reprojection_errors_px=torch.zeros(count),
+        observation_point=torch.arange(count).repeat(3),
+        observation_view=torch.arange(3).repeat_interleave(count),
+        observation_pixels=pixels.reshape(-1, 2),
+        lenses=(lens,) * 3,
+        unregistered=("d.png",),
+    )
+    rotation = torch.linalg.qr(torch.randn(2, 3, 3, generator=generator)).Q
+    rotation = rotation * torch.linalg.det(rotation)[:, None, None]
+    ones = torch.ones(2, 4, 4)
+    templates = Templates(
+        facet=torch.tensor([1, 0]),
+        patch_from_world=rigid(rotation, torch.zeros(2, 3)),
+        origin=torch.zeros(2, 2),
+        spacing=torch.ones(2),
+        depth=torch.zeros(2, 4, 4),
+        barycentric=torch.full((2, 4, 4, 3), 1 / 3),
+        inside=ones > 0,
+    )
+    lights_patch = torch.randn(2, 3, 4, generator=generator)
+    lights_patch[0, 2] = 0  # a view that does not have the patch
+    photometry = Photometry(
+        normals_patch=normalize(torch.tensor([0.1, 0.2, -1.0]), dim=0).expand(2, 4, 4, 3),
+        albedo=ones[..., None].expand(2, 4, 4, 3),
+        lights_patch=lights_patch,
+        valid=ones > 0,
+        confidence=ones,
+        determined=torch.tensor([True, False]),
+        convergence=Convergence(
+            iterations=torch.tensor([12, 40]),
+            residual=torch.tensor([0.1, 0.3]),
+            converged=torch.tensor([True, False]),
+        ),
+    )
+    patches = PatchSet(coarse=coarse, buckets=(templates,))
+    photometric = PhotometricPatches(patches=patches, buckets=(photometry,))
+    depths = Depths(
+        depth=0 * ones, valid=ones > 0, transform=torch.tensor([[0.0, 0, 1, 0]]).repeat(2, 1)
+    )
+    return Reconstruction(
+        mesh=mesh,
+        scene=scene,
+        coarse=coarse,
+        patches=DepthPatches(photometric=photometric, buckets=(depths,)),
+        report=(
+            StageReport(
+                name="warp",
+                seconds=1.5,
+                peak_memory_mb=300.0,
+                figures={"samples": 96, "missing_share": 0.25},
+            ),
+            StageReport(name="extract", seconds=0.5, peak_memory_mb=310.0, figures={}),
+        ),
+    )

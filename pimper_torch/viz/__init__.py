@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""Figures of a result."""

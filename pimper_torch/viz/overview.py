@@ -1,0 +1,142 @@
+"""The contact sheet of a run: photograph, facets, normals, albedo, relief."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Cameras, Reconstruction
+from pimper_torch.sfm.photographs import srgb_from_linear
+from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
+from pimper_torch.viz.render import bounding_box, frame, shade, single, turn
+
+Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+
+_MARGIN = 0.05
+_TURN_DEG = 40.0
+_DIMMED = 0.45
+_ACROSS, _DOWN = 4, 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Panel:
+    """One picture of the sheet.
+
+    Attributes:
+        title: Above it.
+        picture: sRGB in [0, 1], rows first.
+        lines: Triangles to draw over it, pixels of ``picture``.
+    """
+
+    title: str
+    picture: Picture
+    lines: Picture | None = None
+
+
+def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> None:
+    """Draw the contact sheet of a run as PNG.
+
+    Shown in the reference view, cropped to the object: the photograph, the facets over it
+    and shaded, the normals and albedo that the mesh carries, the mesh's own shape shaded,
+    and that again from 40 degrees to the left and to the right.
+
+    Args:
+        result: Of a run.
+        path: Ends in ``.png``.
+        panel_px: Longer side of a rendered picture.
+    """
+    # Local, so that importing the package does not load matplotlib; Figure without pyplot
+    # leaves no global state behind.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import PolyCollection
+    from matplotlib.figure import Figure
+
+    shown = panels(result, panel_px)
+    tallest = max(panel.picture.shape[0] / panel.picture.shape[1] for panel in shown)
+    figure = Figure(figsize=(16, _DOWN * (4 * min(tallest, 1.6) + 0.4) + 0.4))
+    FigureCanvasAgg(figure)
+    figure.suptitle(headline(result), fontsize=13)
+    for place, panel in enumerate(shown, start=1):
+        axes = figure.add_subplot(_DOWN, _ACROSS, place)
+        height, width = panel.picture.shape[:2]
+        axes.imshow(panel.picture, extent=(0, width, height, 0), interpolation="antialiased")
+        if panel.lines is not None:
+            axes.add_collection(
+                PolyCollection(
+                    list(panel.lines), facecolors="none", edgecolors="#ffd24a", linewidths=0.6
+                )
+            )
+        axes.set_title(panel.title, fontsize=11)
+        axes.set_axis_off()
+    figure.tight_layout(pad=0.6)
+    figure.savefig(path, dpi=100, facecolor="white")
+
+
+def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
+    """Make the pictures of the contact sheet."""
+    reference = result.coarse.reference
+    own = single(result.cameras, reference)
+    vertices = result.mesh.vertices_world
+    camera = frame(own, vertices, panel_px, _MARGIN)
+    name = result.scene.views.names[reference]
+    photograph, facets = _photograph(result, own)
+    maps = view_maps(result.mesh, camera, 0)
+    albedo = (albedo_scale(result.mesh) * maps.albedo).clamp(0, 1)
+    center = vertices.mean(dim=0)
+    sides = [
+        frame(turn(own, center, angle), vertices, panel_px, _MARGIN)
+        for angle in (-_TURN_DEG, _TURN_DEG)
+    ]
+    mesh, coarse = result.mesh, result.coarse.mesh
+    return [
+        Panel(title=f"photograph {name}", picture=photograph),
+        Panel(
+            title=f"{len(coarse.faces)} facets on {len(coarse.vertices_world)} points",
+            picture=_DIMMED * photograph,
+            lines=facets,
+        ),
+        Panel(title="facets, shaded", picture=_array(shade(coarse, camera, flat=True))),
+        Panel(title="surface, shaded", picture=_array(shade(mesh, camera))),
+        Panel(title="normals", picture=_array(normal_colors(maps.normals_cam))),
+        Panel(title="albedo", picture=_array(_rgb(srgb_from_linear(albedo)))),
+        Panel(title=f"surface from {_TURN_DEG:.0f}° left", picture=_array(shade(mesh, sides[0]))),
+        Panel(title=f"surface from {_TURN_DEG:.0f}° right", picture=_array(shade(mesh, sides[1]))),
+    ]
+
+
+def headline(result: Reconstruction) -> str:
+    """Say in a line what went in and what came out."""
+    taken = result.scene.views.num_views
+    given = taken + len(result.scene.unregistered)
+    seconds = sum(report.seconds for report in result.report)
+    return (
+        f"{taken} of {given} photographs, {len(result.coarse.mesh.faces)} facets, "
+        f"{len(result.mesh.vertices_world):,} vertices, {seconds:.0f} s"
+    )
+
+
+def _photograph(result: Reconstruction, own: Cameras) -> tuple[Picture, Picture]:
+    """Crop the reference photograph to the object, and project the facets to the crop."""
+    reference = result.coarse.reference
+    width, height = (int(side) for side in own.sizes_px[0])
+    low, high = bounding_box(own, result.mesh.vertices_world, _MARGIN)
+    left, top = (max(0, int(corner)) for corner in low.floor())
+    right, bottom = (int(corner) for corner in high.ceil())
+    image = result.scene.views.images[reference, :, top : min(bottom, height), :]
+    image = image[..., left : min(right, width)].movedim(0, -1)
+    coarse = result.coarse.mesh
+    pixels, _ = project(coarse.vertices_world, own.cam_from_world[0], own.intrinsics[0])
+    corners = (pixels - pixels.new_tensor([left, top]))[coarse.faces]
+    return _array(_rgb(srgb_from_linear(image.clamp(0, 1)))), _array(corners)
+
+
+def _rgb(colors: Float[Tensor, "height width channel"]) -> Float[Tensor, "height width 3"]:
+    return colors.expand(*colors.shape[:2], 3)
+
+
+def _array(values: Float[Tensor, "*batch"]) -> Picture:
+    array: Picture = values.detach().cpu().float().numpy()
+    return array

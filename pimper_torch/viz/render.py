@@ -1,0 +1,127 @@
+"""Shaded pictures of a mesh, honest about its geometry."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, normalize
+
+from pimper_torch.geometry.frames import rigid, rotate, transform
+from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.visibility import cast_view
+from pimper_torch.records import Cameras, Mesh
+
+# A lamp behind the viewer, up on the left: relief reads best that way.
+_TO_LIGHT_CAM = (-0.45, -0.55, -0.70)
+_AMBIENT = 0.12
+_INSIDE = (0.55, 0.62, 0.75)  # tint of faces seen from behind
+_OVERSAMPLING = 2
+
+
+def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "height width 3"]:
+    """Draw a mesh as grey matte stuff under one lamp.
+
+    Its own shape is shaded, never the normals that it carries: relief that is seen is there.
+    Faces seen from behind are bluish. A constant to autograd.
+
+    Args:
+        mesh: Any.
+        camera: One view.
+        flat: Every face has one tone; else the faces' normals are averaged round vertices.
+
+    Returns:
+        sRGB in [0, 1], white where nothing is seen.
+    """
+    fine = Cameras(
+        intrinsics=scale_intrinsics(camera.intrinsics, float(_OVERSAMPLING), float(_OVERSAMPLING)),
+        cam_from_world=camera.cam_from_world,
+        sizes_px=camera.sizes_px * _OVERSAMPLING,
+    )
+    hits = cast_view(mesh, fine, 0)
+    seen = hits.face >= 0
+    per_face = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
+    shown = per_face[hits.face.clamp_min(0)]
+    if not flat:
+        smooth = vertex_normals(mesh.vertices_world, mesh.faces)
+        shown = normalize(hits.interpolate(smooth, mesh.faces), dim=-1)
+    normals_cam = rotate(fine.cam_from_world[0], shown)
+    faces_cam = rotate(fine.cam_from_world[0], per_face[hits.face.clamp_min(0)])
+    from_behind = (faces_cam * _towards(fine)).sum(dim=-1) > 0
+    normals_cam = torch.where(from_behind[..., None], -normals_cam, normals_cam)
+    lamp = normalize(normals_cam.new_tensor(_TO_LIGHT_CAM), dim=0)
+    light = _AMBIENT + (1 - _AMBIENT) * (normals_cam @ lamp).clamp_min(0)
+    tint = torch.where(from_behind[..., None], light.new_tensor(_INSIDE), 1.0)
+    radiance = torch.where(seen[..., None], light[..., None] * tint, 1.0)
+    radiance = avg_pool2d(radiance.movedim(-1, 0)[None], _OVERSAMPLING)[0].movedim(0, -1)
+    # Half way to a display's curve: steeper tones show more relief.
+    return radiance.clamp(0, 1) ** (1 / 1.5)
+
+
+def turn(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
+    """Walk round a point, about the vertical of the picture.
+
+    Args:
+        camera: One view.
+        center_world: Stays where it is in the picture, and as far away.
+        angle_deg: Positive walks to the right and shows the object's right side.
+    """
+    angle = math.radians(angle_deg)
+    cos, sin = math.cos(angle), math.sin(angle)
+    about_y = center_world.new_tensor([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    center_cam = transform(camera.cam_from_world[0], center_world[None])[0]
+    turned_from_cam = rigid(about_y, center_cam - about_y @ center_cam)
+    return camera.replace(cam_from_world=turned_from_cam[None] @ camera.cam_from_world)
+
+
+def frame(
+    camera: Cameras, points_world: Float[Tensor, "point 3"], longer_side_px: int, margin: float
+) -> Cameras:
+    """Crop and scale a camera's picture to the bounding box of some points.
+
+    Args:
+        camera: One view.
+        points_world: At least one of them before the camera.
+        longer_side_px: Of the new picture.
+        margin: Round the box, as a share of its longer side.
+    """
+    low, high = bounding_box(camera, points_world, margin)
+    factor = longer_side_px / float((high - low).max())
+    cropped = camera.intrinsics.clone()
+    cropped[:, :2, 2] = cropped[:, :2, 2] - low
+    sides = ((high - low) * factor).round().clamp_min(1).long()
+    return Cameras(
+        intrinsics=scale_intrinsics(cropped, factor, factor),
+        cam_from_world=camera.cam_from_world,
+        sizes_px=sides[None],
+    )
+
+
+def bounding_box(
+    camera: Cameras, points_world: Float[Tensor, "point 3"], margin: float
+) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"]]:
+    """Give the corners (top left, bottom right) of the pixels that some points cover."""
+    pixels, depth = project(points_world, camera.cam_from_world[0], camera.intrinsics[0])
+    pixels = pixels[depth > 0]
+    low, high = pixels.amin(dim=0), pixels.amax(dim=0)
+    room = margin * (high - low).max().clamp_min(1)
+    return low - room, high + room
+
+
+def single(cameras: Cameras, view: int) -> Cameras:
+    """Take one view out of several."""
+    return Cameras(
+        intrinsics=cameras.intrinsics[view : view + 1],
+        cam_from_world=cameras.cam_from_world[view : view + 1],
+        sizes_px=cameras.sizes_px[view : view + 1],
+    )
+
+
+def _towards(camera: Cameras) -> Float[Tensor, "height width 3"]:
+    """Give the viewing ray of every pixel, camera frame."""
+    width, height = (int(side) for side in camera.sizes_px[0])
+    pixels = pixel_centers(width, height, like=camera.intrinsics).reshape(-1, 2)
+    standing = torch.eye(4).to(camera.intrinsics)
+    return rays_through(pixels, standing, camera.intrinsics[0]).reshape(height, width, 3)

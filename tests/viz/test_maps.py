@@ -1,0 +1,63 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.records import Mesh
+from pimper_torch.scenes.cameras import look_at, pinholes
+from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
+
+
+@pytest.fixture
+def plane():
+    """A tilted plane: x from -1 to 1 to the right, y up, leaning back to the right."""
+    corners = torch.tensor([[-1.0, -1, 0.3], [1, -1, -0.3], [1, 1, -0.3], [-1, 1, 0.3]])
+    return Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.fixture
+def front():
+    eye, up = torch.tensor([[0.0, 0, 5]]), torch.tensor([0.0, 1, 0])
+    return pinholes(look_at(eye, torch.zeros(3), up), 20.0, 16, 12)
+
+
+def test_depth_and_normals_of_a_plane_are_those_of_the_formula(plane, front):
+    maps = view_maps(plane, front, 0)
+    # z = -0.3 x in the world; in the camera the plane is z = 5 + 0.3 x.
+    u = torch.arange(16) + 0.5
+    slope = (u - 8) / 20
+    wanted = (5 / (1 - 0.3 * slope)).expand(12, 16)
+    assert maps.seen[5:7, 5:11].all()
+    assert_close(maps.depth[maps.seen], wanted[maps.seen])
+    assert maps.depth[~maps.seen].isnan().all()
+    normal = torch.tensor([0.3, 0, -1]) / 1.09**0.5
+    assert_close(maps.normals_cam[maps.seen], normal.expand(int(maps.seen.sum()), 3))
+    assert (maps.normals_cam[~maps.seen] == 0).all()
+
+
+def test_a_mesh_shows_what_it_carries(plane, front):
+    carried = torch.nn.functional.normalize(torch.tensor([0.0, 0.6, 0.8]), dim=0).expand(4, 3)
+    height = plane.vertices_world[:, 1:2]
+    mesh = plane.replace(normals_world=carried, albedo=height, confidence=height[:, 0])
+    maps = view_maps(mesh, front, 0)
+    assert_close(maps.normals_cam[6, 8], torch.tensor([0.0, -0.6, -0.8]))
+    assert maps.albedo.shape == (12, 16, 1)
+    v = torch.arange(12) + 0.5
+    wanted = maps.depth * ((6 - v) / 20)[:, None]
+    assert_close(maps.albedo[maps.seen][:, 0], wanted[maps.seen])
+    assert_close(maps.confidence[maps.seen], wanted[maps.seen])
+
+
+def test_colours_of_normals_follow_the_custom():
+    normals = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1], [0, 0, 0]])
+    wanted = torch.tensor([[1.0, 0.5, 0.5], [0.5, 1, 0.5], [0.5, 0.5, 1], [0, 0, 0]])
+    assert_close(normal_colors(normals), wanted)
+
+
+def test_the_scale_of_albedo_ignores_a_few_highlights_and_what_is_unknown(plane):
+    albedo = torch.full((1000, 3), 2.0)
+    albedo[:5] = 1000.0
+    albedo[5:500] = 0.0
+    many = Mesh(vertices_world=torch.zeros(1000, 3), faces=plane.faces, albedo=albedo)
+    assert albedo_scale(many) == pytest.approx(0.45)
+    assert albedo_scale(plane) == 1.0
+    assert albedo_scale(plane.replace(albedo=torch.zeros(4, 3))) == 1.0

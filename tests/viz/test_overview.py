@@ -1,0 +1,46 @@
+import numpy as np
+from PIL import Image
+
+from pimper_torch.viz.overview import draw_overview, headline, panels
+
+
+def test_the_sheet_is_drawn(reconstruction, tmp_path):
+    draw_overview(reconstruction, tmp_path / "overview.png", 120)
+    with Image.open(tmp_path / "overview.png") as picture:
+        assert picture.size[0] == 1600
+        assert np.asarray(picture.convert("RGB")).std() > 20  # something is on it
+
+
+def test_every_panel_shows_the_object_of_the_reference_view(reconstruction):
+    shown = panels(reconstruction, 120)
+    assert len(shown) == 8
+    assert "b.png" in shown[0].title
+    for panel in shown:
+        assert panel.picture.shape[2] == 3
+        assert 0 <= panel.picture.min() < panel.picture.max() <= 1
+    photograph, facets = shown[0].picture, shown[1]
+    assert np.array_equal(facets.picture, np.float32(0.45) * photograph)
+    assert facets.lines.shape == (2, 3, 2)
+    height, width = photograph.shape[:2]
+    assert (facets.lines >= -0.5).all()
+    assert (facets.lines[..., 0] <= width + 0.5).all()
+    assert (facets.lines[..., 1] <= height + 0.5).all()
+
+
+def test_a_grey_result_without_normals_and_albedo_is_drawn_too(reconstruction, tmp_path):
+    views = reconstruction.scene.views
+    grey = reconstruction.scene.replace(views=views.replace(images=views.images[:, :1]))
+    bare = reconstruction.mesh.replace(normals_world=None, albedo=None, confidence=None)
+    draw_overview(reconstruction.replace(scene=grey, mesh=bare), tmp_path / "overview.png", 60)
+    assert (tmp_path / "overview.png").stat().st_size > 10_000
+
+
+def test_gradients_do_not_hinder_drawing(reconstruction, tmp_path):
+    vertices = reconstruction.mesh.vertices_world.clone().requires_grad_()
+    mesh = reconstruction.mesh.replace(vertices_world=vertices)
+    draw_overview(reconstruction.replace(mesh=mesh), tmp_path / "overview.png", 60)
+    assert (tmp_path / "overview.png").is_file()
+
+
+def test_the_headline_counts(reconstruction):
+    assert headline(reconstruction) == "3 of 4 photographs, 2 facets, 225 vertices, 2 s"

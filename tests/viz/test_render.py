@@ -1,0 +1,90 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Mesh
+from pimper_torch.scenes.cameras import look_at, pinholes
+from pimper_torch.viz.render import bounding_box, frame, shade, single, turn
+
+
+@pytest.fixture
+def front():
+    eye, up = torch.tensor([[0.0, 0, 5]]), torch.tensor([0.0, 1, 0])
+    return pinholes(look_at(eye, torch.zeros(3), up), 40.0, 32, 24)
+
+
+def square(tilt_x=0.0, tilt_y=0.0):
+    corners = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    depth = tilt_x * corners[:, 0] + tilt_y * corners[:, 1]
+    return Mesh(
+        vertices_world=torch.cat([corners, depth[:, None]], dim=1),
+        faces=torch.tensor([[0, 1, 2], [0, 2, 3]]),
+    )
+
+
+def test_the_lamp_is_up_on_the_left(front):
+    def tone(mesh):
+        return shade(mesh, front)[12, 16, 0]
+
+    # z towards the viewer growing to the right: the face looks to the left.
+    assert tone(square(tilt_x=0.4)) > tone(square()) > tone(square(tilt_x=-0.4))
+    assert tone(square(tilt_y=-0.4)) > tone(square()) > tone(square(tilt_y=0.4))
+
+
+def test_carried_normals_do_not_pretend_relief(front):
+    flat = square()
+    bumpy = flat.replace(normals_world=torch.eye(4, 3) + 0.1)
+    assert torch.equal(shade(bumpy, front), shade(flat, front))
+
+
+def test_a_face_seen_from_behind_is_bluish_and_emptiness_white(front):
+    behind = square().replace(faces=square().faces.flip(1))
+    red, _, blue = shade(behind, front)[12, 16]
+    assert blue > red + 0.1
+    assert (shade(behind, front)[0, 0] == 1).all()
+    assert_close(shade(square(), front)[12, 16, 0], shade(square(), front)[12, 16, 2])
+
+
+def test_flat_shading_shows_edges_that_smooth_shading_hides(front):
+    corners = torch.tensor(
+        [[-1.0, -1, 0], [0, -1, 0.5], [0, 1, 0.5], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]
+    )
+    roof = Mesh(
+        vertices_world=corners,
+        faces=torch.tensor([[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]]),
+    )
+    flat, smooth = (shade(roof, front, flat=flat)[12, 8:24, 0] for flat in (True, False))
+    assert flat.diff().abs().max() > 3 * smooth.diff().abs().max()
+
+
+def test_walking_to_the_right_shows_the_right_side_and_keeps_the_centre(front):
+    center = torch.tensor([0.2, 0.1, -0.3])
+    turned = turn(front, center, 40.0)
+    before, depth_before = project(center[None], front.cam_from_world[0], front.intrinsics[0])
+    after, depth_after = project(center[None], turned.cam_from_world[0], front.intrinsics[0])
+    assert_close(after, before, rtol=0, atol=1e-4)
+    assert_close(depth_after, depth_before)
+    assert turned.centers_world[0, 0] > front.centers_world[0, 0] + 1
+    assert_close(turned.centers_world[0, 1], front.centers_world[0, 1])
+    assert_close(turn(turned, center, -40.0).cam_from_world, front.cam_from_world)
+
+
+def test_a_frame_holds_the_points_at_the_size_asked_for(front):
+    points = torch.tensor([[-1.0, 0.5, 0], [0.5, -0.2, 0.3], [0, 0, 9.0]])  # the last behind
+    framed = frame(front, points, longer_side_px=200, margin=0.1)
+    pixels, _ = project(points[:2], framed.cam_from_world[0], framed.intrinsics[0])
+    width, height = framed.sizes_px[0].tolist()
+    assert max(width, height) == 200
+    # A margin of a tenth on either side leaves ten twelfths to the box.
+    assert_close(pixels[:, 0].min(), torch.tensor(200 / 12), rtol=0, atol=0.5)
+    assert_close(pixels[:, 0].max(), torch.tensor(200 * 11 / 12), rtol=0, atol=0.5)
+    low, high = bounding_box(front, points, 0.0)
+    assert_close(low, project(points[:2], front.cam_from_world[0], front.intrinsics[0])[0].amin(0))
+    assert (high > low).all()
+
+
+def test_single_takes_the_view_asked_for():
+    eyes = torch.tensor([[0.0, 0, 5], [1, 0, 5]])
+    both = pinholes(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1, 0])), 40.0, 32, 24)
+    assert_close(single(both, 1).centers_world, eyes[1:])
