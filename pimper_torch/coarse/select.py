@@ -2,7 +2,7 @@
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -94,6 +94,17 @@ def nearest_in_image(pixels: Float[Tensor, "point 2"], count: int) -> Int[Tensor
     coordinates = pixels.detach().cpu().numpy()
     _, index = cKDTree(coordinates).query(coordinates, k=list(range(2, count + 2)))
     return torch.as_tensor(index, device=pixels.device)
+
+
+def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
+    """Mark the corners of the points' convex hull in the image.
+
+    Chosen before all others, they let the mesh reach as far as the cloud does.
+    """
+    corners = ConvexHull(pixels.detach().cpu().double().numpy()).vertices
+    marked = torch.zeros(len(pixels), dtype=torch.bool)
+    marked[torch.from_numpy(corners.astype("int64"))] = True
+    return marked.to(pixels.device)
 
 
 def spread(

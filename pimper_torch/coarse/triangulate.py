@@ -12,6 +12,7 @@ from pimper_torch.coarse.select import (
     frontal_view,
     named_view,
     neighbours_agree,
+    on_hull,
     spread,
     spread_to_number,
     triangulation_angles,
@@ -107,6 +108,7 @@ class Triangulate(nn.Module):
             reference = frontal_view(scene)
         points, quality = self._trusted(scene, reference)
         pixels, _ = _project(points, cameras, reference)
+        quality = torch.where(on_hull(pixels), quality + quality.amax(), quality)
         edge_px = config.facet_edge_px
         if edge_px > 0:
             chosen = spread(pixels, quality, 0.8 * edge_px)

@@ -6,6 +6,7 @@ from pimper_torch.coarse.select import (
     frontal_view,
     named_view,
     neighbours_agree,
+    on_hull,
     spread,
     spread_to_number,
     triangulation_angles,
@@ -92,3 +93,15 @@ def test_spread_to_number_comes_close_to_the_number():
     pixels = 100 * torch.rand(1000, 2, generator=generator, dtype=torch.float64)
     chosen = spread_to_number(pixels, torch.ones(1000, dtype=torch.float64), 60)
     assert abs(len(chosen) - 60) <= 6
+
+
+def test_the_hull_holds_every_other_point():
+    generator = torch.Generator().manual_seed(4)
+    pixels = torch.rand(200, 2, generator=generator, dtype=torch.float64)
+    corners = pixels[on_hull(pixels)]
+    assert 3 <= len(corners) < 60
+    # Nothing lies further out than the hull's corners, whatever the direction.
+    angle = torch.linspace(0, 6.28, 100, dtype=torch.float64)
+    directions = torch.stack([angle.cos(), angle.sin()])
+    reach, of_corners = (pixels @ directions).amax(dim=0), (corners @ directions).amax(dim=0)
+    assert_close(of_corners, reach)
