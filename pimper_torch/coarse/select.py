@@ -107,6 +107,28 @@ def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
     return marked.to(pixels.device)
 
 
+def well_accompanied(
+    pixels: Float[Tensor, "point 2"], max_isolation: float
+) -> Bool[Tensor, " point"]:
+    """Mark all points but corners of the hull that stand alone, one shell after another.
+
+    Neighbours all on one side say little about a corner's depth, and one that is wrong
+    makes the mesh reach out to it. What tells is its distance: that to its third nearest
+    point, over the median of the same distance of its neighbours.
+    """
+    keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
+    while keep.sum() > 8:
+        index = keep.nonzero()[:, 0]
+        nearest = nearest_in_image(pixels[index], 8)
+        third = (pixels[index[nearest[:, 2]]] - pixels[index]).norm(dim=-1)
+        isolation = third / third[nearest].median(dim=1).values.clamp_min(1e-9)
+        alone = on_hull(pixels[index]) & (isolation > max_isolation)
+        if not alone.any():
+            break
+        keep[index[alone]] = False
+    return keep
+
+
 def spread(
     pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], distance_px: float
 ) -> Int[Tensor, " chosen"]:

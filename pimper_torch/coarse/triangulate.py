@@ -17,6 +17,7 @@ from pimper_torch.coarse.select import (
     spread_to_number,
     triangulation_angles,
     views_near,
+    well_accompanied,
 )
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
@@ -50,6 +51,8 @@ class TriangulateConfig:
         neighbours: Points around a point that must agree with it.
         max_slope: Depth over lateral distance between agreeing points.
         max_deviation: From the plane of the neighbours, in radii of the neighbourhood.
+        max_isolation: Times further from its neighbours than they from theirs that a point
+            at the rim of the cloud may be.
         max_tilt_deg: A facet turned further from the reference bridges a depth
             discontinuity and is dropped.
         min_altitude: Height over longest edge below which a facet at the rim is dropped.
@@ -70,6 +73,7 @@ class TriangulateConfig:
     neighbours: int = 12
     max_slope: float = 6.0
     max_deviation: float = 0.5
+    max_isolation: float = 3.0
     max_tilt_deg: float = 80.0
     min_altitude: float = 0.15
     min_coverage: float = 0.6
@@ -173,6 +177,8 @@ class Triangulate(nn.Module):
                 max_deviation=config.max_deviation,
             )
             index = index[agree]
+        if len(index) >= 4:
+            index = index[well_accompanied(pixels[index], config.max_isolation)]
         if len(index) < 4:
             counts = "; ".join(f"{int(passed.sum())} {test}" for test, passed in tests.items())
             raise ReconstructionError(

@@ -11,6 +11,7 @@ from pimper_torch.coarse.select import (
     spread_to_number,
     triangulation_angles,
     views_near,
+    well_accompanied,
 )
 from pimper_torch.errors import InputError
 
@@ -105,3 +106,13 @@ def test_the_hull_holds_every_other_point():
     directions = torch.stack([angle.cos(), angle.sin()])
     reach, of_corners = (pixels @ directions).amax(dim=0), (corners @ directions).amax(dim=0)
     assert_close(of_corners, reach)
+
+
+def test_lonely_corners_of_the_hull_are_dropped_shell_by_shell_and_no_inner_point():
+    generator = torch.Generator().manual_seed(7)
+    pixels = torch.rand(300, 2, generator=generator, dtype=torch.float64)
+    pixels[0] = torch.tensor([3.0, 3.0])
+    pixels[1] = torch.tensor([2.0, 2.5])  # in the first one's shadow until that is gone
+    kept = well_accompanied(pixels, 3.0)
+    assert not kept[:2].any()
+    assert kept[2:].float().mean() > 0.97
