@@ -88,7 +88,7 @@ def frame(
         margin: Round the box, as a share of its longer side.
     """
     low, high = bounding_box(camera, points_world, margin)
-    factor = longer_side_px / float((high - low).max())
+    factor = longer_side_px / float((high - low).detach().max())
     cropped = camera.intrinsics.clone()
     cropped[:, :2, 2] = cropped[:, :2, 2] - low
     sides = ((high - low) * factor).round().clamp_min(1).long()

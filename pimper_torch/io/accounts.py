@@ -1,0 +1,138 @@
+"""What a run found, in numbers: lights and the summary, ready for JSON."""
+
+import math
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.geometry.frames import rotate
+from pimper_torch.records import Reconstruction
+
+# What JSON can hold.
+Account = dict[str, object]
+
+
+def lights_account(result: Reconstruction) -> Account:
+    """Tell the light of every view, for each patch and averaged over the patches.
+
+    Lights are first-order harmonics ``l`` in the world frame: radiance is
+    ``albedo * (l[0] + l[1:] . n)`` with ``n`` the outward unit normal. A patch that a view
+    does not have is ``null`` there. The averages leave out such patches, and those whose
+    light varied too little for a factorization.
+    """
+    facets, lights_world, determined = world_lights(result)
+    lit = (lights_world != 0).any(dim=-1)
+    counted = (lit & determined[:, None])[..., None]
+    mean = (lights_world * counted).sum(dim=0) / counted.sum(dim=0).clamp_min(1)
+    views = result.scene.views.names
+    return {
+        "reference": views[result.coarse.reference],
+        "model": "radiance = albedo * (l[0] + l[1:] . n), world frame, n outward",
+        "views": [
+            {
+                "name": name,
+                "light": _rounded(mean[index]) if bool(counted[:, index].any()) else None,
+                "patches": int(counted[:, index].sum()),
+            }
+            for index, name in enumerate(views)
+        ],
+        "patches": [
+            {
+                "facet": int(facet),
+                "determined": bool(known),
+                "lights": [
+                    _rounded(light) if bool(there) else None
+                    for light, there in zip(lights, here, strict=True)
+                ],
+            }
+            for facet, known, lights, here in zip(
+                facets, determined, lights_world, lit, strict=True
+            )
+        ],
+    }
+
+
+def world_lights(
+    result: Reconstruction,
+) -> tuple[Int[Tensor, " patch"], Float[Tensor, "patch view 4"], Bool[Tensor, " patch"]]:
+    """Turn the lights of all patches to the world frame.
+
+    ``l . (1, R n) = (l_0, R^T l_xyz) . (1, n)`` for ``R`` from world to patch.
+
+    Returns:
+        In the order of the facets: the facet, its lights, whether they were determined.
+    """
+    photometric = result.patches.photometric
+    facets, lights, determined = [], [], []
+    for templates, found in zip(photometric.patches.buckets, photometric.buckets, strict=True):
+        world_from_patch = templates.patch_from_world.mT  # only its rotation is used
+        directed = rotate(world_from_patch, found.lights_patch[..., 1:])
+        lights.append(torch.cat([found.lights_patch[..., :1], directed], dim=-1))
+        facets.append(templates.facet)
+        determined.append(found.determined)
+    order = torch.cat(facets).argsort()
+    return torch.cat(facets)[order], torch.cat(lights)[order], torch.cat(determined)[order]
+
+
+def summary_account(result: Reconstruction, about: Mapping[str, object]) -> Account:
+    """Count what went in and came out, and what every stage cost.
+
+    Args:
+        result: Of the run.
+        about: More to tell, such as where the photographs lay.
+    """
+    scene = result.scene
+    figures = {key: value for report in result.report for key, value in report.figures.items()}
+    ends = [bucket.convergence for bucket in result.patches.photometric.buckets]
+    patches = sum(len(end.converged) for end in ends)
+    return {
+        "pimper_torch": installed_version(),
+        **about,
+        "reference": scene.views.names[result.coarse.reference],
+        "views": scene.views.num_views + len(scene.unregistered),
+        "registered": scene.views.num_views,
+        "unregistered": list(scene.unregistered),
+        "sparse_points": len(scene.points_world),
+        "mesh_points": len(result.coarse.mesh.vertices_world),
+        "triangles": len(result.coarse.mesh.faces),
+        "samples": figures.get("samples"),
+        "missing_share": _finite(figures.get("missing_share", math.nan)),
+        "vertices": len(result.mesh.vertices_world),
+        "faces": len(result.mesh.faces),
+        "seconds": sum(report.seconds for report in result.report),
+        "peak_memory_mb": max((report.peak_memory_mb for report in result.report), default=None),
+        "convergence": {
+            "patches": patches,
+            "converged": sum(int(end.converged.sum()) for end in ends),
+            "mean_iterations": sum(float(end.iterations.sum()) for end in ends) / max(1, patches),
+        },
+        "stages": [
+            {
+                "name": report.name,
+                "seconds": report.seconds,
+                "peak_memory_mb": report.peak_memory_mb,
+                **{key: _finite(value) for key, value in report.figures.items()},
+            }
+            for report in result.report
+        ],
+    }
+
+
+def installed_version() -> str:
+    """Name the version of the installed package."""
+    try:
+        return version("pimper_torch")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _finite(value: float | int) -> float | int | None:
+    return value if math.isfinite(value) else None
+
+
+def _rounded(light: Float[Tensor, " 4"]) -> list[float | None]:
+    """Keep six digits, more than any photograph determines."""
+    return [_finite(float(f"{value:.6g}")) for value in light.tolist()]

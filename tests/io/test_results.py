@@ -1,0 +1,291 @@
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yaml
+from PIL import Image
+from torch.testing import assert_close
+
+from pimper_torch.errors import OutputError
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.io import results
+from pimper_torch.io.accounts import lights_account, summary_account, world_lights
+from pimper_torch.io.meshes import write_glb, write_ply
+from pimper_torch.io.results import RESULT_NAMES, prepare_output, write_result
+from pimper_torch.sfm.photographs import srgb_from_linear
+from pimper_torch.viz.maps import albedo_scale
+
+
+@dataclass(frozen=True)
+class Config:
+    zeta: float = 0.5
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    draw = results.draw_overview
+    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+
+
+def names(folder: Path):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
+    write_result(reconstruction, Config(), tmp_path / "deep" / "out", about={"preset": "paper"})
+    out = tmp_path / "deep" / "out"
+    assert names(out) == sorted(RESULT_NAMES)
+    assert names(tmp_path / "deep") == ["out"]
+    assert yaml.safe_load((out / "config.yaml").read_text()) == {"zeta": 0.5}
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["preset"] == "paper"
+    assert summary["unregistered"] == ["d.png"]
+    assert (summary["views"], summary["registered"]) == (4, 3)
+    lights = json.loads((out / "lights.json").read_text())
+    assert [view["name"] for view in lights["views"]] == ["a.png", "b.png", "c.png"]
+
+
+def test_the_ply_holds_places_normals_colours_and_confidence(reconstruction, tmp_path):
+    mesh = reconstruction.mesh
+    write_ply(mesh, tmp_path / "mesh.ply")
+    read = trimesh.load(tmp_path / "mesh.ply", process=False)
+    assert np.allclose(read.vertices, mesh.vertices_world, atol=1e-6)
+    assert np.array_equal(read.faces, mesh.faces)
+    assert np.allclose(read.vertex_normals, mesh.normals_world, atol=1e-6)
+    encoded = 255 * srgb_from_linear((mesh.albedo * albedo_scale(mesh)).clamp(0, 1))
+    assert np.abs(read.visual.vertex_colors[:, :3] - encoded.numpy()).max() <= 0.51
+    stored = read.metadata["_ply_raw"]["vertex"]["data"]["confidence"]
+    assert np.allclose(np.ravel(stored), mesh.confidence, atol=1e-6)
+    assert b"format binary" in (tmp_path / "mesh.ply").read_bytes()[:80]
+
+
+def read_glb(path):
+    """The tree of a binary glTF, and the arrays of its one primitive."""
+    raw = path.read_bytes()
+    length = int.from_bytes(raw[12:16], "little")
+    tree = json.loads(raw[20 : 20 + length])
+    (primitive,) = tree["meshes"][0]["primitives"]
+    arrays = {}
+    for name, number in primitive["attributes"].items():
+        accessor = tree["accessors"][number]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        start = 28 + length + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        kind = {5126: np.float32, 5121: np.uint8}[accessor["componentType"]]
+        width = {"VEC3": 3, "VEC4": 4}[accessor["type"]]
+        flat = np.frombuffer(raw, kind, accessor["count"] * width, start)
+        arrays[name] = flat.reshape(-1, width)
+    return tree, primitive, arrays
+
+
+def test_the_glb_holds_the_same_in_the_same_frame_with_linear_colours(reconstruction, tmp_path):
+    mesh = reconstruction.mesh
+    write_glb(mesh, tmp_path / "mesh.glb")
+    (read,) = trimesh.load(tmp_path / "mesh.glb", process=False).dump()
+    assert np.allclose(read.vertices, mesh.vertices_world, atol=1e-6)
+    assert np.array_equal(read.faces, mesh.faces)
+    tree, primitive, arrays = read_glb(tmp_path / "mesh.glb")
+    assert np.allclose(arrays["POSITION"], mesh.vertices_world, atol=1e-6)
+    assert np.allclose(arrays["NORMAL"], mesh.normals_world, atol=1e-5)
+    linear = 255 * (mesh.albedo * albedo_scale(mesh)).clamp(0, 1)
+    assert np.abs(arrays["COLOR_0"][:, :3] - linear.numpy()).max() <= 0.51
+    matte = tree["materials"][primitive["material"]]
+    assert matte["pbrMetallicRoughness"]["metallicFactor"] == 0
+
+
+def test_a_bare_mesh_is_written_too(reconstruction, tmp_path):
+    bare = reconstruction.mesh.replace(normals_world=None, albedo=None, confidence=None)
+    write_ply(bare, tmp_path / "mesh.ply")
+    write_glb(bare, tmp_path / "mesh.glb")
+    assert len(trimesh.load(tmp_path / "mesh.ply", process=False).vertices) == 225
+
+
+def test_depth_leads_back_to_the_surface(reconstruction, tmp_path):
+    write_result(reconstruction, Config(), tmp_path / "out")
+    with np.load(tmp_path / "out" / "depth.npz", allow_pickle=False) as stored:
+        found = {key: torch.from_numpy(stored[key]) for key in stored.files if key != "name"}
+        assert str(stored["name"]) == "b.png"
+    assert_close(found["cam_from_world"], reconstruction.cameras.cam_from_world[1])
+    rows, columns = torch.nonzero(found["mask"], as_tuple=True)
+    pixels = torch.stack([columns, rows], dim=-1) + 0.5
+    rays = rays_through(pixels, found["cam_from_world"], found["intrinsics"])
+    center = reconstruction.cameras.centers_world[1]
+    points = center + found["depth"][rows, columns, None] * rays
+    x, y, z = points.unbind(dim=-1)
+    # The mesh's chords lie below or above the bump by up to its curvature over a cell.
+    assert (z - 0.5 * torch.exp(-3 * (x**2 + y**2))).abs().max() < 0.02
+    assert len(rows) > 500
+    assert found["depth"][~found["mask"]].isnan().all()
+
+
+def test_normals_and_albedo_are_pictures_of_the_reference_photographs_size(
+    reconstruction, tmp_path
+):
+    write_result(reconstruction, Config(), tmp_path / "out")
+    with Image.open(tmp_path / "out" / "normals.png") as picture:
+        assert (picture.size, picture.mode) == ((60, 40), "RGB")
+        colors = np.asarray(picture).astype(float)
+    assert (colors[0, 0] == 0).all()
+    middle = colors[20, 30]  # the top of the bump, seen from straight before it
+    assert middle[2] > 240
+    assert abs(middle[:2] - 127.5).max() < 40
+    left, right, up, down = colors[20, 25], colors[20, 35], colors[15, 30], colors[25, 30]
+    assert left[0] < 110 < 145 < right[0]
+    assert down[1] < 110 < 145 < up[1]
+    with Image.open(tmp_path / "out" / "albedo.png") as picture:
+        assert (picture.size, picture.mode) == ((60, 40), "RGB")
+
+
+def test_lights_in_the_world_shade_as_lights_in_the_patch(reconstruction):
+    facets, lights_world, determined = world_lights(reconstruction)
+    assert facets.tolist() == [0, 1]
+    assert determined.tolist() == [False, True]  # in the order of the facets
+    templates = reconstruction.patches.patches.buckets[0]
+    lights_patch = reconstruction.patches.photometric.buckets[0].lights_patch
+    normal_world = torch.tensor([[0.6, 0.0, 0.8]])
+    turning = templates.patch_from_world[:, :3, :3]
+    normals_patch = (turning @ normal_world.T)[..., 0]
+    wanted = lights_patch[..., 0] + (lights_patch[..., 1:] * normals_patch[:, None]).sum(dim=-1)
+    found = lights_world[..., 0] + lights_world[..., 1:] @ normal_world[0]
+    assert_close(found.flip(0), wanted)  # the bucket holds facet 1 first
+
+
+def test_the_mean_light_leaves_out_what_is_unknown(reconstruction):
+    account = lights_account(reconstruction)
+    _, lights_world, _ = world_lights(reconstruction)
+    # Facet 0 is not determined; view c does not have facet 1.
+    assert [view["patches"] for view in account["views"]] == [1, 1, 0]
+    assert_close(torch.tensor(account["views"][0]["light"]), lights_world[1, 0], rtol=1e-5, atol=0)
+    assert account["views"][2]["light"] is None
+    assert account["patches"][1]["lights"][2] is None
+    assert account["patches"][0]["lights"][2] is not None
+    assert account["reference"] == "b.png"
+
+
+def test_the_summary_counts(reconstruction):
+    summary = summary_account(reconstruction, {})
+    wanted = {
+        "mesh_points": 4,
+        "triangles": 2,
+        "samples": 96,
+        "missing_share": 0.25,
+        "vertices": 225,
+        "seconds": 2.0,
+        "peak_memory_mb": 310.0,
+        "convergence": {"patches": 2, "converged": 1, "mean_iterations": 26.0},
+    }
+    assert {key: summary[key] for key in wanted} == wanted
+    assert [stage["name"] for stage in summary["stages"]] == ["warp", "extract"]
+    assert summary["stages"][0]["samples"] == 96
+
+
+def test_numbers_that_json_cannot_hold_become_null(reconstruction, tmp_path):
+    report = reconstruction.report[0].replace(figures={"missing_share": float("nan")})
+    write_result(reconstruction.replace(report=(report,)), Config(), tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["missing_share"] is None
+    assert summary["stages"][0]["missing_share"] is None
+
+
+def test_a_failure_in_the_middle_leaves_nothing_behind(reconstruction, tmp_path, monkeypatch):
+    for error in (OSError(28, "No space left on device"), KeyboardInterrupt()):
+
+        def fail(*_, error=error):
+            raise error
+
+        monkeypatch.setattr(results, "write_model", fail)
+        with pytest.raises((OutputError, KeyboardInterrupt)) as raised:
+            write_result(reconstruction, Config(), tmp_path / "deep" / "out")
+        assert names(tmp_path) == []
+        if isinstance(error, OSError):
+            assert raised.type is OutputError
+            assert "No space left" in str(raised.value)
+
+
+def test_a_failure_keeps_the_former_result(reconstruction, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    write_result(reconstruction, Config(zeta=1.0), out)
+    with pytest.raises(OutputError, match=r"already holds albedo\.png"):
+        write_result(reconstruction, Config(zeta=2.0), out)
+
+    def fail(*_):
+        raise OSError("broken")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(results, "write_model", fail)
+        with pytest.raises(OutputError, match="broken"):
+            write_result(reconstruction, Config(zeta=2.0), out, overwrite=True)
+    assert "1.0" in (out / "config.yaml").read_text()
+    assert names(tmp_path) == ["out"]
+    write_result(reconstruction, Config(zeta=2.0), out, overwrite=True)
+    assert "2.0" in (out / "config.yaml").read_text()
+    assert names(tmp_path) == ["out"]
+
+
+def test_an_empty_folder_is_filled(reconstruction, tmp_path):
+    (tmp_path / "out").mkdir()
+    prepare_output(tmp_path / "out")
+    write_result(reconstruction, Config(), tmp_path / "out")
+    assert names(tmp_path / "out") == sorted(RESULT_NAMES)
+
+
+def test_a_folder_that_cannot_be_renamed_is_filled(reconstruction, tmp_path, monkeypatch):
+    out, rename = tmp_path / "out", Path.rename
+    write_result(reconstruction, Config(zeta=1.0), out)
+
+    def busy(path, target):
+        if path == out:
+            raise OSError(16, "Device or resource busy")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", busy)
+    write_result(reconstruction, Config(zeta=2.0), out, overwrite=True)
+    assert names(out) == sorted(RESULT_NAMES)
+    assert "2.0" in (out / "config.yaml").read_text()
+    assert names(tmp_path) == ["out"]
+
+
+def test_preparing_leaves_no_trace(tmp_path):
+    prepare_output(tmp_path / "a" / "b" / "out")
+    assert names(tmp_path) == []
+
+
+def test_a_folder_with_other_things_is_never_overwritten(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputError, match=r"holds thesis\.tex, which is no part"):
+        prepare_output(tmp_path / "out", overwrite=True)
+    with pytest.raises(OutputError, match=r"already holds thesis\.tex"):
+        prepare_output(tmp_path / "out")
+
+
+def test_a_place_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file: is a file"):
+        prepare_output(tmp_path / "file")
+    with pytest.raises(OutputError, match="out: cannot be written"):
+        prepare_output(tmp_path / "file" / "out")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(OutputError, match="link: is a link to nothing"):
+        prepare_output(tmp_path / "link")
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)  # root may write anywhere
+    with pytest.raises(OutputError, match=r"cannot be written.*Permission denied"):
+        prepare_output(tmp_path / "out")
+
+
+def test_the_sparse_model_shares_the_meshs_frame(reconstruction, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    write_result(reconstruction, Config(), tmp_path / "out")
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse")
+    (image,) = [image for image in model.images.values() if image.name == "b.png"]
+    vertex = reconstruction.mesh.vertices_world[112].double()
+    wanted = transform(reconstruction.cameras.cam_from_world[1].double(), vertex[None])[0]
+    assert np.allclose(image.cam_from_world() * vertex.numpy(), wanted, atol=1e-5)
