@@ -55,7 +55,8 @@ class TriangulateConfig:
             at the rim of the cloud may be.
         max_tilt_deg: A facet turned further from the reference bridges a depth
             discontinuity and is dropped.
-        min_altitude: Height over longest edge below which a facet at the rim is dropped.
+        min_altitude: Height over longest edge, in the image, below which a facet at the rim
+            is dropped.
         min_coverage: Share of a facet at the rim that must show the object.
         dark_level: Radiance in the reference view at or below which nothing is shown.
         smoothing_rounds: Of the vertex normals, over the mesh.
@@ -227,7 +228,7 @@ class Triangulate(nn.Module):
         steepest = torch.deg2rad(normals.new_tensor(self.config.max_tilt_deg)).cos()
         faces = faces[(normals * to_camera).sum(dim=-1) > steepest]
         shown = _shown(pixels[faces], views, reference, self.config.dark_level)
-        thin = _altitude(vertices[faces]) < self.config.min_altitude
+        thin = _altitude(pixels[faces]) < self.config.min_altitude
         return peel(faces, (shown < self.config.min_coverage) | thin)
 
 
@@ -304,11 +305,12 @@ def _shown(
     return sampled[0, 0].mean(dim=-1)
 
 
-def _altitude(corners: Float[Tensor, "face 3 3"]) -> Float[Tensor, " face"]:
-    """Give the smallest height over the longest edge; 0.87 for equal sides."""
-    longest = (corners - corners.roll(1, dims=1)).norm(dim=-1).amax(dim=1)
-    a, b, c = corners.unbind(dim=1)
-    area = torch.linalg.cross(b - a, c - a).norm(dim=-1)
+def _altitude(corners_px: Float[Tensor, "face 3 2"]) -> Float[Tensor, " face"]:
+    """Give the smallest height over the longest edge, in the image; 0.87 for equal sides."""
+    longest = (corners_px - corners_px.roll(1, dims=1)).norm(dim=-1).amax(dim=1)
+    a, b, c = corners_px.unbind(dim=1)
+    ab, ac = b - a, c - a
+    area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs()
     return area / longest.square().clamp_min(1e-30)
 
 
