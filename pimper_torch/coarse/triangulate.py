@@ -55,6 +55,8 @@ class TriangulateConfig:
             at the rim of the cloud may be.
         max_tilt_deg: A facet turned further from the reference bridges a depth
             discontinuity and is dropped.
+        max_stretch: Longest edge over the median facet's, in the scene, above which a facet
+            turned by more than 60 degrees is such a bridge too.
         min_altitude: Height over longest edge, in the image, below which a facet at the rim
             is dropped.
         min_coverage: Share of a facet at the rim that must show the object.
@@ -76,6 +78,7 @@ class TriangulateConfig:
     max_deviation: float = 0.5
     max_isolation: float = 3.0
     max_tilt_deg: float = 80.0
+    max_stretch: float = 3.0
     min_altitude: float = 0.15
     min_coverage: float = 0.6
     dark_level: float = 0.01
@@ -225,8 +228,11 @@ class Triangulate(nn.Module):
         to_camera = normalize(
             cameras.centers_world[reference] - vertices[faces].mean(dim=1), dim=-1
         )
-        steepest = torch.deg2rad(normals.new_tensor(self.config.max_tilt_deg)).cos()
-        faces = faces[(normals * to_camera).sum(dim=-1) > steepest]
+        facing = (normals * to_camera).sum(dim=-1)
+        steepest = torch.deg2rad(facing.new_tensor(self.config.max_tilt_deg)).cos()
+        longest = _edges(vertices[faces]).amax(dim=1)
+        far = longest > self.config.max_stretch * longest.median()
+        faces = faces[(facing > steepest) & ~(far & (facing < 0.5))]  # 0.5: turned by 60 degrees
         shown = _shown(pixels[faces], views, reference, self.config.dark_level)
         thin = _altitude(pixels[faces]) < self.config.min_altitude
         return peel(faces, (shown < self.config.min_coverage) | thin)
@@ -307,11 +313,15 @@ def _shown(
 
 def _altitude(corners_px: Float[Tensor, "face 3 2"]) -> Float[Tensor, " face"]:
     """Give the smallest height over the longest edge, in the image; 0.87 for equal sides."""
-    longest = (corners_px - corners_px.roll(1, dims=1)).norm(dim=-1).amax(dim=1)
+    longest = _edges(corners_px).amax(dim=1)
     a, b, c = corners_px.unbind(dim=1)
     ab, ac = b - a, c - a
     area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs()
     return area / longest.square().clamp_min(1e-30)
+
+
+def _edges(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"]:
+    return (corners - corners.roll(1, dims=1)).norm(dim=-1)
 
 
 def _rim_faces(faces: Int[Tensor, "face 3"]) -> Bool[Tensor, " face"]:
