@@ -38,6 +38,7 @@ class MatchSettings:
 
     max_ratio: float
     guided: bool
+    max_error_px: float
     min_inliers: int
     seed: int
     threads: int
@@ -159,6 +160,7 @@ def match_features(database: Path, settings: MatchSettings) -> None:
     options.sift.max_ratio = settings.max_ratio
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = settings.min_inliers
+    verification.ransac.max_error = settings.max_error_px
     verification.ransac.random_seed = settings.seed
     with _quiet():
         pycolmap.match_exhaustive(

@@ -71,6 +71,22 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
     )
 
 
+def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
+    """Drop views that see too few points for their pose to be trusted, until none is left.
+
+    Args:
+        model: Any.
+        fewest: Points that a view must see.
+    """
+    while model.num_views:
+        seen = torch.bincount(model.observation_view, minlength=model.num_views)
+        strong = torch.nonzero(seen >= fewest)[:, 0].tolist()
+        if len(strong) == model.num_views:
+            break
+        model = select_views(model, strong)
+    return model
+
+
 def match_names(model: SparseModel, names: Sequence[str], folder: Path) -> SparseModel:
     """Find the photographs in a model by file name and put it in their order.
 

@@ -15,7 +15,13 @@ from pimper_torch.progress import track
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.components import choose_component
-from pimper_torch.sfm.model import SparseModel, list_some, match_names, select_views
+from pimper_torch.sfm.model import (
+    SparseModel,
+    drop_weak_views,
+    list_some,
+    match_names,
+    select_views,
+)
 from pimper_torch.sfm.photographs import write_photographs
 from pimper_torch.sfm.scene import assemble_scene
 
@@ -35,8 +41,10 @@ class ReconstructConfig:
         domain_size_pooling: Average descriptors over scales.
         max_ratio: Of the distances to the best and the second best match.
         guided_matching: Look for more matches along the epipolar lines.
+        max_error_px: Distance from the epipolar line up to which a match is verified.
         min_matches: Verified matches below which a pair of photographs does not count.
-        min_registration_points: Points of the model that a view must see to be added.
+        min_registration_points: Points of the model that a view must see to be added, and
+            to stay in it.
         starts: Runs of the mapper, each with other random numbers; the best is kept.
         min_share: Of the photographs that the largest component must hold when the model
             splits.
@@ -50,11 +58,12 @@ class ReconstructConfig:
     edge_threshold: float = 10.0
     max_features: int = 8192
     affine_shape: bool = True
-    domain_size_pooling: bool = True
+    domain_size_pooling: bool = False
     max_ratio: float = 0.8
     guided_matching: bool = True
+    max_error_px: float = 2.0
     min_matches: int = 15
-    min_registration_points: int = 20
+    min_registration_points: int = 30
     starts: int = 3
     min_share: float = 0.6
     threads: int = 0
@@ -71,6 +80,7 @@ class ReconstructConfig:
         require(self.edge_threshold > 0, "edge_threshold", self.edge_threshold, "more than 0")
         require(self.max_features >= 8, "max_features", self.max_features, "at least 8")
         require(0 < self.max_ratio <= 1, "max_ratio", self.max_ratio, "in (0, 1]")
+        require(self.max_error_px > 0, "max_error_px", self.max_error_px, "more than 0")
         require(self.min_matches >= 8, "min_matches", self.min_matches, "at least 8")
         require(
             self.min_registration_points >= 6,
@@ -196,6 +206,7 @@ class Reconstruct(nn.Module):
         settings = colmap.MatchSettings(
             max_ratio=config.max_ratio,
             guided=config.guided_matching,
+            max_error_px=config.max_error_px,
             min_inliers=config.min_matches,
             seed=config.seed,
             threads=config.threads or -1,
@@ -211,12 +222,14 @@ class Reconstruct(nn.Module):
                 seed=config.seed + start,
                 threads=config.threads or -1,
             )
-            runs.append(colmap.map_views(place / "database.db", place / "images", settings))
-        return max(runs, key=_worth)
+            found = colmap.map_views(place / "database.db", place / "images", settings)
+            fewest = config.min_registration_points
+            runs.append([drop_weak_views(model, fewest) for model in found])
+        return max(runs, key=lambda models: max(map(_worth, models), default=(0, 0)))
 
 
-def _worth(models: Sequence[SparseModel]) -> tuple[int, int]:
-    return (models[0].num_views, len(models[0].points_world)) if models else (0, 0)
+def _worth(model: SparseModel) -> tuple[int, int]:
+    return model.num_views, len(model.points_world)
 
 
 def _follow_resize(model: SparseModel, views: Views) -> SparseModel:

@@ -1,0 +1,149 @@
+"""Compare settings of structure from motion on folders of photographs.
+
+Run as ``python benchmarks/sfm.py PHOTOS [PHOTOS ...]``; prints Markdown tables. With
+``--reference MODEL``, a COLMAP model whose images have the photographs' names, each view's
+rotation is compared with the model's; a view more than 2 degrees off counts as wrong.
+"""
+
+import argparse
+import dataclasses
+import resource
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pimper_torch.errors import PimperError, PimperWarning
+from pimper_torch.io.photographs import load_views
+from pimper_torch.records import SparseScene, Views
+from pimper_torch.sfm.colmap import read_model
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+
+COLMAP = ReconstructConfig(
+    peak_threshold=0.0067,
+    affine_shape=False,
+    domain_size_pooling=False,
+    guided_matching=False,
+    max_error_px=4.0,
+    min_registration_points=30,
+    starts=1,
+)
+
+
+COLUMNS = (
+    "settings",
+    "views",
+    "points",
+    "in 3 or more",
+    "mean track",
+    "error px",
+    "wrong views",
+    "median rotation error °",
+    "wall s",
+    "CPU s",
+)
+
+
+def variants() -> dict[str, ReconstructConfig]:
+    """Name the settings to compare: one change after another, from COLMAP's own to ours."""
+    change = dataclasses.replace
+    ours = ReconstructConfig()
+    return {
+        "COLMAP's defaults": COLMAP,
+        "contrast 0.002": change(COLMAP, peak_threshold=0.002),
+        "contrast 0.001": change(COLMAP, peak_threshold=0.001),
+        "edge 20": change(COLMAP, edge_threshold=20.0),
+        "ratio 0.9": change(COLMAP, max_ratio=0.9),
+        "guided": change(COLMAP, guided_matching=True),
+        "affine, 0.002": change(COLMAP, peak_threshold=0.002, affine_shape=True),
+        "DSP, 0.002": change(COLMAP, peak_threshold=0.002, domain_size_pooling=True),
+        "guided, 0.002": change(COLMAP, peak_threshold=0.002, guided_matching=True),
+        "affine, guided, 0.002": change(ours, max_error_px=4.0, starts=1),
+        "affine, guided, 0.002, 2 px": change(ours, starts=1),
+        "**ours**: the same, 3 starts": ours,
+        "ours and DSP": change(ours, domain_size_pooling=True),
+    }
+
+
+def main() -> None:
+    """Read the command line, run every variant on every folder, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("photos", nargs="+", type=Path, help="folders of photographs")
+    parser.add_argument("--reference", type=Path, help="COLMAP model to compare poses with")
+    parser.add_argument("--max-size", type=int, default=0, help="longest side in pixels")
+    parser.add_argument("--only", nargs="*", default=[], help="parts of the variants' names")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore", PimperWarning)
+    for folder in options.photos:
+        views = load_views(folder, max_size_px=options.max_size)
+        width, height = views.sizes_px.amax(dim=0).tolist()
+        say(f"\n{folder.name}: {views.num_views} photographs, {width}x{height}\n")
+        say("| " + " | ".join(COLUMNS) + " |")
+        say("|---|" + "--:|" * (len(COLUMNS) - 1))
+        for name, config in variants().items():
+            if not options.only or any(part in name for part in options.only):
+                say(f"| {name} | {row(views, config, options.reference)} |")
+
+
+def say(line: str) -> None:
+    """Write a line of the table at once."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def row(views: Views, config: ReconstructConfig, reference: Path | None) -> str:
+    """Run structure from motion once and give its figures as cells."""
+    wall, processor = time.perf_counter(), cpu_seconds()
+    try:
+        scene = Reconstruct(config)(views)
+        cells = figures(scene, reference)
+    except PimperError as error:
+        cells = [f"{type(error).__name__}: {str(error).split('.')[0]}", *[""] * 6]
+    wall, processor = time.perf_counter() - wall, cpu_seconds() - processor
+    return " | ".join([*cells, f"{wall:.0f}", f"{processor:.0f}"])
+
+
+def figures(scene: SparseScene, reference: Path | None) -> list[str]:
+    """Count what was found, and compare poses with the reference if there is one."""
+    length = torch.bincount(scene.observation_point)
+    wrong, median = "", ""
+    if reference is not None:
+        angles = rotation_errors_deg(scene, reference)
+        wrong, median = str(int((angles > 2).sum())), f"{angles.median():.2f}"
+    return [
+        f"{scene.views.num_views} of {scene.views.num_views + len(scene.unregistered)}",
+        str(len(length)),
+        str(int((length >= 3).sum())),
+        f"{length.double().mean():.2f}",
+        f"{scene.reprojection_errors_px.mean():.2f}",
+        wrong,
+        median,
+    ]
+
+
+def rotation_errors_deg(scene: SparseScene, reference: Path) -> Tensor:
+    """Give the angle between each view's rotation and the reference's, after alignment."""
+    model = read_model(reference)
+    number = {name: index for index, name in enumerate(model.names)}
+    shared = [index for index, name in enumerate(scene.views.names) if name in number]
+    theirs = model.cam_from_world[[number[scene.views.names[index]] for index in shared]]
+    mine = scene.cameras.cam_from_world[shared].double()
+    # The rotation between the worlds that most views agree on: of all the views' own, the one
+    # with the least median angle to the others.
+    between = theirs[:, :3, :3].mT @ mine[:, :3, :3]
+    trace = torch.einsum("aij,bij->ab", between, between)
+    angles = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).arccos())
+    return angles[angles.median(dim=1).values.argmin()]
+
+
+def cpu_seconds() -> float:
+    """Give the processor time this process has used, all threads together."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+import torch
+
+from pimper_torch.sfm.model import drop_weak_views, select_views
+
+
+def test_a_point_that_only_one_kept_view_sees_goes(model):
+    kept = select_views(model, [3, 1])
+    assert kept.names == ("d.jpg", "a.jpg")
+    seen = torch.zeros(40, 5, dtype=torch.bool)
+    seen[model.observation_point, model.observation_view] = True
+    both = seen[:, 3] & seen[:, 1]
+    assert 0 < both.sum() < 40
+    assert torch.equal(kept.points_world, model.points_world[both])
+    assert len(kept.observation_point) == 2 * both.sum()
+    # Each observation is still the one of its view and point.
+    for point, view, pixel in zip(
+        kept.observation_point, kept.observation_view, kept.observation_pixels, strict=True
+    ):
+        old_point, old_view = torch.nonzero(both)[point, 0], (3, 1)[view]
+        old = (model.observation_point == old_point) & (model.observation_view == old_view)
+        assert torch.equal(model.observation_pixels[old][0], pixel)
+
+
+def test_a_view_that_loses_its_points_with_a_weak_one_goes_too(model):
+    # View 2 sees 20 points with the others; view 3 sees 12 of which 8 only with view 4, and
+    # view 4 sees those 8: once 4 has gone, 3 keeps 4.
+    pairs = [(p, v) for p in range(20) for v in (0, 1, 2)]
+    pairs += [(p, 3) for p in range(4)] + [(p, v) for p in range(20, 28) for v in (3, 4)]
+    point, view = torch.tensor(pairs).T
+    tangled = model.replace(
+        observation_point=point, observation_view=view, observation_pixels=torch.zeros(80, 2)
+    )
+    left = drop_weak_views(tangled, 10)
+    assert left.names == model.names[:3]
+    assert len(left.points_world) == 20
+    assert drop_weak_views(left, 20).names == left.names
+    assert drop_weak_views(left, 21).num_views == 0
