@@ -1,0 +1,179 @@
+r"""The variational energy that keeps the middle of facets and smooths their seams.
+
+.. math:: E(S) = \int \lambda (1 - G) |\cup S_\mu - S|^2 + G |\nabla S|^2
+
+over the flat facets, in linear finite elements on the lattice: lumped masses, cotangents,
+and G averaged over each face. The surface S is a place for every vertex, so that the three
+coordinates are three right-hand sides of one system.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.lattice import Lattice
+from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.records import Record
+
+# Fidelity, as a share of the usual, that ties what no patch supports to the flat facets: it
+# makes the system definite on an island without support, and is nothing elsewhere.
+_TIE = 1e-9
+
+# A needle's area is taken as at least this share of its longest edge squared: its cotangents
+# would otherwise spoil the condition of the whole system.
+_LEAST_SHAPE = 1e-4
+
+# A facet with a smaller share of supported vertices is taken to lie as the coarse mesh does.
+_TREND_SHARE = 0.5
+
+
+def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    r"""Give G: where a facet is a seam and where it is its middle.
+
+    :math:`G = \frac12 \sqrt{|a - b| + |a - c| + |c - b|}` of the barycentric coordinates.
+
+    >>> corner, edge, middle = [1.0, 0, 0], [0.5, 0.5, 0], [1 / 3] * 3
+    >>> seam_weight(torch.tensor([corner, edge, middle]))
+    tensor([0.7071, 0.5000, 0.0000])
+    """
+    return (barycentric - barycentric.roll(1, dims=-1)).abs().sum(dim=-1).sqrt() / 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class System(Record):
+    """Normal equations ``(M + L) S = M (union) + pull``.
+
+    Attributes:
+        rows: Of the entries of ``M + L``; entries named twice add up.
+        cols: Likewise.
+        values: The entries, float64; symmetric and positive definite.
+        mass: The diagonal of ``M``.
+    """
+
+    rows: Int[Tensor, " entry"]
+    cols: Int[Tensor, " entry"]
+    values: Float[Tensor, " entry"]
+    mass: Float[Tensor, " vertex"]
+
+
+def assemble(
+    lattice: Lattice, fidelity: Float[Tensor, " facet"], supported: Bool[Tensor, " vertex"]
+) -> System:
+    """Assemble the normal equations of the energy.
+
+    Args:
+        lattice: What the energy is integrated over.
+        fidelity: Lambda of each facet, 1/length^2.
+        supported: Where the union is known. Elsewhere the mass is (nearly) zero, and the
+            smoothness term alone fills S in.
+
+    Constant to autograd: it holds the geometry of the flat facets only.
+    """
+    weights = seam_weight(lattice.barycentric.double())
+    gradients, area = _elements(lattice)
+    share = (area * fidelity.double()[lattice.face_facet] / 3)[:, None].expand(-1, 3)
+    count = len(lattice.points)
+    mass = area.new_zeros(count).index_add(0, lattice.faces.flatten(), share.flatten())
+    mass = mass * (1 - weights) * torch.where(supported, 1, _TIE)
+    shape = torch.maximum(area, _LEAST_SHAPE * gradients.square().sum(-1).amax(dim=1))
+    smoothness = weights[lattice.faces].mean(dim=1) / (4 * shape)
+    blocks = smoothness[:, None, None] * (gradients @ gradients.mT)
+    rows, cols = lattice.faces[:, :, None], lattice.faces[:, None, :]
+    diagonal = torch.arange(count, device=mass.device)
+    return System(
+        rows=torch.cat([rows.expand_as(blocks).flatten(), diagonal]),
+        cols=torch.cat([cols.expand_as(blocks).flatten(), diagonal]),
+        values=torch.cat([blocks.flatten(), mass]),
+        mass=mass,
+    )
+
+
+def facet_trends(
+    lattice: Lattice,
+    union: Float[Tensor, "vertex 3"],
+    supported: Bool[Tensor, " vertex"],
+    num_facets: int,
+) -> tuple[Float[Tensor, "facet 3 3"], Bool[Tensor, " facet"]]:
+    """Fit how the union, facet by facet, stretches and tilts the flat facet.
+
+    Returns:
+        J of the least-squares fit ``union = J (point) + constant`` over each facet's
+        supported vertices, and whether it was fitted: not, and then the identity, where
+        fewer than half of the vertices, or fewer than three, are supported.
+
+    Differentiable in ``union``.
+    """
+    known = supported.double()
+    number = _per_facet(known, lattice, num_facets)
+    total = _per_facet(torch.ones_like(known), lattice, num_facets)
+    per_one = 1 / number.clamp_min(1)[:, None]
+    points = lattice.points.detach().double()
+    lift = torch.where(supported[:, None], union.double() - points, 0)
+    center = _per_facet(known[:, None] * points, lattice, num_facets) * per_one
+    mean = _per_facet(lift, lattice, num_facets) * per_one
+    away = known[:, None] * (points - center[lattice.facet])
+    change = known[:, None] * (lift - mean[lattice.facet])
+    spread = _per_facet(away[:, :, None] * away[:, None, :], lattice, num_facets)
+    common = _per_facet(change[:, :, None] * away[:, None, :], lattice, num_facets)
+    # The spread has rank two, for a facet is flat; a ridge would not leave planes exact.
+    inverse = torch.linalg.pinv(spread, rtol=1e-8, hermitian=True)
+    usable = (number >= _TREND_SHARE * total) & (number >= 3)
+    slope = torch.where(usable[:, None, None], common @ inverse, 0)
+    return torch.eye(3, dtype=slope.dtype, device=slope.device) + slope, usable
+
+
+def plane_pull(
+    lattice: Lattice, trends: Float[Tensor, "facet 3 3"], fitted: Bool[Tensor, " facet"]
+) -> Float[Tensor, "vertex 3"]:
+    r"""Give the right-hand side that keeps S from sliding along itself.
+
+    The energy is that of a membrane: taken literally it draws an open rim inward by about
+    the smoothing radius, and pulls the surface along itself wherever G changes, both on
+    perfectly flat data. What it exerts on a facet's own plane (slope J, from
+    :func:`facet_trends`) is therefore subtracted, :math:`b = \int G J : \nabla\varphi`,
+    save for the part at inner seams, :math:`\oint G J \nu`, where planes of unlike slope
+    meet: that difference is the crease to be smoothed. Data on one plane then stay exactly
+    what they are, whatever G does. Between two facets whose slope could not be fitted the
+    crease stays as the coarse mesh has it, for want of anything better: an island without
+    support keeps its shape.
+    """
+    weights = seam_weight(lattice.barycentric.double())
+    gradients, _ = _elements(lattice)
+    slope = trends[lattice.face_facet]
+    pull = weights[lattice.faces].mean(dim=1)[:, None, None] / 2 * (gradients @ slope.mT)
+    total = trends.new_zeros(len(lattice.points), 3)
+    total = total.index_add(0, lattice.faces.flatten(), pull.flatten(0, 1))
+    on_border = (lattice.barycentric == 0).any(dim=1)[lattice.faces].sum(dim=1) >= 2
+    near = on_border.nonzero()[:, 0]  # a small share of all faces, and pairing is not cheap
+    pairs, ends = face_pairs(lattice.faces[near])
+    faces = near[pairs]
+    facets = lattice.face_facet[faces]
+    seam = (facets[:, 0] != facets[:, 1]) & fitted[facets].any(dim=1)
+    faces, ends = faces[seam], ends[seam]
+    weight = weights[ends].mean(dim=1, keepdim=True) / 2
+    for face in faces.unbind(dim=1):
+        corners = lattice.faces[face]
+        opposite = (corners[:, :, None] != ends[:, None, :]).all(dim=-1)
+        inward = (opposite[..., None] * gradients[face]).sum(dim=1)
+        flux = weight * (slope[face] @ inward[..., None])[..., 0]
+        total = total.index_add(0, ends.flatten(), flux.repeat_interleave(2, dim=0))
+    return total
+
+
+def _elements(lattice: Lattice) -> tuple[Float[Tensor, "face 3 3"], Float[Tensor, " face"]]:
+    """Give the hat functions' gradients times twice the area, and the areas."""
+    points = lattice.points.detach().double()
+    doubled = face_normals(points, lattice.faces)
+    corners = points[lattice.faces]
+    opposite = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
+    normal = normalize(doubled, dim=-1)[:, None].expand_as(opposite)
+    return torch.linalg.cross(normal, opposite), doubled.norm(dim=-1) / 2
+
+
+def _per_facet(
+    values: Float[Tensor, "vertex ..."], lattice: Lattice, num_facets: int
+) -> Float[Tensor, "facet ..."]:
+    return values.new_zeros(num_facets, *values.shape[1:]).index_add(0, lattice.facet, values)

@@ -1,0 +1,151 @@
+"""Refinement: relief of all patches in, one joined surface out."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.lattice import Lattice, subdivide
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.records import Convergence, DepthPatches, PatchSet, Surface
+from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull
+from pimper_torch.refinement.union import Union, ray_directions, unite
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefineConfig:
+    """How finely the patches are joined, and how much seams are smoothed.
+
+    Attributes:
+        samples_per_vertex: Template samples between neighbouring vertices of the surface.
+            Time and memory fall with its square.
+        smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
+            ``1 / (r * spacing)^2``. Details finer than about ``r sqrt(G / (1 - G))`` vertices
+            are smoothed: ``r`` on the middle of an edge, 1.55 ``r`` at a vertex of the
+            coarse mesh, nothing in the middle of a facet.
+        hold_planes: Cancel what the energy's tension does to flat data, which it would
+            shrink at the open rim and shift where G changes. False is the published energy.
+        outlier_samples: How far, in samples, a patch may lie from the others before they
+            outvote it, where three or more meet; infinite for the plain mean.
+    """
+
+    samples_per_vertex: float = 1.0
+    smoothing_radius_samples: float = 2.0
+    hold_planes: bool = True
+    outlier_samples: float = 4.0
+
+    def __post_init__(self) -> None:
+        for name in ("samples_per_vertex", "smoothing_radius_samples", "outlier_samples"):
+            value = getattr(self, name)
+            require(value > 0, name, value, "above 0")
+
+
+class Refine(nn.Module):
+    r"""Join the patches and smooth their seams, keeping the middle of every facet.
+
+    Minimises :math:`\int \lambda (1-G) |\cup S_\mu - S|^2 + G |\nabla S|^2` over the lattice
+    of the coarse mesh, with places S as unknowns: one sparse factorization, three right-hand
+    sides. See :mod:`~pimper_torch.refinement.energy` for the discretisation and for what
+    ``hold_planes`` adds to the published energy, and
+    :mod:`~pimper_torch.refinement.union` for the union. Vertices that no patch supports are
+    filled by the smoothness term and have confidence 0.
+
+    Differentiable in depth, photometric normals, albedo and confidence; the coarse mesh and
+    the templates are constants.
+    """
+
+    def __init__(self, config: RefineConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or RefineConfig()
+
+    def forward(self, depths: DepthPatches) -> Surface:
+        """Refine the union of all patches.
+
+        The convergence's residual is the root mean square distance between the union and
+        the surface, in scene units.
+
+        Raises:
+            ReconstructionError: No patch has valid relief anywhere on the mesh.
+        """
+        patches = depths.patches
+        mesh = patches.coarse.mesh
+        spacing = vertex_spacing(patches, self.config.samples_per_vertex)
+        lattice = subdivide(mesh.vertices_world.detach(), mesh.faces, spacing)
+        directions = ray_directions(lattice, patches.coarse).detach()
+        union = unite(depths, lattice, directions, self.config.outlier_samples)
+        if not bool(union.supported.any()):
+            raise ReconstructionError(
+                f"refinement: none of the {len(lattice.points)} vertices of the surface is "
+                "supported by a patch with valid relief, and some must be. Look at the share of "
+                "missing data that the report gives: the masks or the limits on dark, saturated "
+                "and grazing samples may leave nothing."
+            )
+        points = lattice.points + union.heights[:, None] * directions
+        refined = self._solve(lattice, points, union, spacing)
+        vertices = refined.to(points)
+        apart = (refined - points.double())[union.supported].detach()
+        return Surface(
+            vertices_world=vertices,
+            faces=lattice.faces,
+            facet=lattice.facet,
+            barycentric=lattice.barycentric,
+            normals_world=_normals(union, vertices, lattice),
+            albedo=_filled_albedo(union, lattice),
+            confidence=union.confidence,
+            convergence=Convergence(
+                iterations=torch.ones(1, dtype=torch.long, device=points.device),
+                residual=apart.square().sum(dim=-1).mean().sqrt()[None].to(points),
+                converged=torch.ones(1, dtype=torch.bool, device=points.device),
+            ),
+        )
+
+    def _solve(
+        self,
+        lattice: Lattice,
+        points: Float[Tensor, "vertex 3"],
+        union: Union,
+        spacing: Float[Tensor, " facet"],
+    ) -> Float[Tensor, "vertex 3"]:
+        fidelity = (self.config.smoothing_radius_samples * spacing.double()) ** -2
+        system = assemble(lattice, fidelity, union.supported)
+        rhs = system.mass[:, None] * points.double()
+        if self.config.hold_planes:
+            trends, fitted = facet_trends(lattice, points, union.supported, len(spacing))
+            rhs = rhs + plane_pull(lattice, trends, fitted)
+        factor = SparseCholesky(
+            system.rows, system.cols, system.values, size=len(points), what="the refinement"
+        )
+        return factor.solve(rhs)
+
+
+def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
+    """Give each facet's wanted distance between neighbouring vertices, scene units."""
+    facet = torch.cat([bucket.facet for bucket in patches.buckets])
+    spacing = torch.cat([bucket.spacing for bucket in patches.buckets])
+    return torch.empty_like(spacing).index_put((facet,), spacing * samples_per_vertex)
+
+
+def _normals(
+    union: Union, vertices: Float[Tensor, "vertex 3"], lattice: Lattice
+) -> Float[Tensor, "vertex 3"]:
+    """Take photometric normals where there are any, else those of the surface itself."""
+    own = normalize(vertex_normals(vertices, lattice.faces), dim=-1)
+    photometric = union.seen & (union.normals_world.detach().norm(dim=-1) > 0.5)
+    return torch.where(photometric[:, None], union.normals_world, own)
+
+
+def _filled_albedo(union: Union, lattice: Lattice) -> Float[Tensor, "vertex channel"]:
+    """Give vertices without albedo their facet's mean, or the mean of all."""
+    count = int(lattice.facet.max()) + 1
+    known = union.seen.to(union.albedo)
+    total = known.new_zeros(count).index_add(0, lattice.facet, known)
+    summed = union.albedo.new_zeros(count, union.albedo.shape[1])
+    summed = summed.index_add(0, lattice.facet, union.albedo * known[:, None])
+    overall = summed.sum(dim=0) / total.sum().clamp_min(1)
+    mean = torch.where((total > 0)[:, None], summed / total.clamp_min(1)[:, None], overall)
+    return torch.where(union.seen[:, None], union.albedo, mean[lattice.facet])

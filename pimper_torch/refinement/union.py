@@ -1,0 +1,284 @@
+"""The union of the patches, sampled on the lattice of the coarse mesh.
+
+A lattice vertex has one ray: from its place on the flat facet along the coarse mesh's
+smoothed normal, interpolated as Phong does, so that rays are continuous across facets. The
+vertex's own patch and the neighbours whose enlarged triangle the ray passes say how high
+the surface lies along it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
+from torch.nn.functional import normalize
+from torch.nn.utils.rnn import pad_sequence
+
+from pimper_torch.geometry.frames import rotate, transform
+from pimper_torch.geometry.lattice import Lattice
+from pimper_torch.geometry.reliefs import intersect_relief, sample_raster
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.progress import track
+from pimper_torch.records import CoarseMesh, DepthPatches, Depths, Photometry, Record, Templates
+
+# A ray turned more than this from the patch's own normal (cosine) says nothing of its height.
+_FACING = 0.2
+
+# How far outside the band a ray may cross the facet's plane and still meet its relief inside.
+_SLACK_BANDS = 2.0
+
+# Samples at the border of a template whose cells are not whole, so that no ray meets them.
+_RAGGED_SAMPLES = 1.5
+
+# An outlier twice as far away as allowed counts an eleventh.
+_DISTRUST = 10.0
+
+# Less weight than this is a border that tapered out.
+_LEAST_WEIGHT = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Union(Record):
+    """What the patches together say at every vertex of the lattice.
+
+    Attributes:
+        heights: Along the vertex's ray, scene units; 0 where no patch supports the vertex.
+        supported: True where a patch has valid relief.
+        normals_world: Photometric, unit; zero where no patch has one.
+        albedo: Linear; zero where no patch has one.
+        seen: True where normal and albedo are photometric.
+        confidence: In [0, 1]; 0 where not supported or not determined by the photographs.
+    """
+
+    heights: Float[Tensor, " vertex"]
+    supported: Bool[Tensor, " vertex"]
+    normals_world: Float[Tensor, "vertex 3"]
+    albedo: Float[Tensor, "vertex channel"]
+    seen: Bool[Tensor, " vertex"]
+    confidence: Float[Tensor, " vertex"]
+
+
+def ray_directions(lattice: Lattice, coarse: CoarseMesh) -> Float[Tensor, "vertex 3"]:
+    """Give the lattice vertices' rays: smoothed normals of the coarse mesh, interpolated."""
+    mesh = coarse.mesh
+    normals = mesh.normals_world
+    if normals is None:
+        normals = vertex_normals(mesh.vertices_world, mesh.faces)
+    return normalize(lattice.interpolate(normals, mesh.faces), dim=-1)
+
+
+def unite(
+    depths: DepthPatches,
+    lattice: Lattice,
+    directions: Float[Tensor, "vertex 3"],
+    outlier_samples: float,
+) -> Union:
+    r"""Blend the patches on the lattice.
+
+    Each patch counts with :math:`\prod_c s(b_c)` over its barycentric coordinates, where
+    ``s`` climbs smoothly from 0 at the border of the enlarged triangle through 1/2 on the
+    facet's edge to 1 as far inside: the union is continuous across seams, and on the middle
+    of a seam both patches count alike. Where three or more patches meet, one that lies
+    ``d > outlier_samples`` samples from the weighted median has its weight divided by
+    ``1 + 10 (d / outlier_samples - 1)^2``: a wild patch is outvoted.
+
+    Differentiable in depth, normals, albedo and confidence; which samples are blended is
+    decided without gradient.
+    """
+    coarse = depths.patches.coarse
+    held = torch.bincount(lattice.facet, minlength=len(coarse.mesh.faces)).tolist()
+    vertices_of = torch.split(lattice.facet.argsort(stable=True), held)
+    buckets = zip(depths.patches.buckets, depths.buckets, depths.photometric.buckets, strict=True)
+    estimates = [
+        _estimates(coarse, *bucket, lattice, directions, vertices_of)
+        for bucket in track(list(buckets))
+    ]
+    joined = _Estimates(
+        vertex=torch.cat([one.vertex for one in estimates]),
+        height=torch.cat([one.height for one in estimates]),
+        weight=torch.cat([one.weight for one in estimates]),
+        scale=torch.cat([one.scale for one in estimates]),
+        known=torch.cat([one.known for one in estimates]),
+        values=torch.cat([one.values for one in estimates]),
+    )
+    return _blend(joined, len(lattice.points), outlier_samples)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Estimates:
+    """What single patches say of single vertices; ``values`` are normal, confidence, albedo."""
+
+    vertex: Int[Tensor, " estimate"]
+    height: Float[Tensor, " estimate"]
+    weight: Float[Tensor, " estimate"]
+    scale: Float[Tensor, " estimate"]
+    known: Float[Tensor, " estimate"]
+    values: Float[Tensor, "estimate value"]
+
+
+def _estimates(
+    coarse: CoarseMesh,
+    templates: Templates,
+    relief: Depths,
+    photometry: Photometry,
+    lattice: Lattice,
+    directions: Float[Tensor, "vertex 3"],
+    vertices_of: Sequence[Int[Tensor, "..."]],
+) -> _Estimates:
+    """Intersect the rays near each patch of a bucket with its relief."""
+    corners, bands = _bands(coarse, templates)
+    vertex, present = _rays_near(
+        coarse, templates, corners, bands, lattice, directions, vertices_of
+    )
+    origins = transform(templates.patch_from_world, lattice.points[vertex])
+    along = rotate(templates.patch_from_world, directions[vertex])
+    points, hit = intersect_relief(
+        relief.depth, relief.valid, templates.origin, templates.spacing, origins, along
+    )
+    from_patch = _barycentric_map(corners)
+    barycentric = points[..., :2] @ from_patch[..., :2].mT + from_patch[:, None, :, 2]
+    weight = _taper(barycentric, bands)
+    found = present & hit & (weight > 0)
+    xy = points[..., :2].detach()
+    inverse = templates.patch_from_world.mT
+    normals_world = photometry.normals_patch @ inverse[:, None, :3, :3].mT
+    layers = torch.cat([normals_world, photometry.confidence[..., None], photometry.albedo], dim=-1)
+    place = (xy, templates.origin, templates.spacing)
+    values = sample_raster(layers.movedim(-1, 1), *place, valid=photometry.valid)
+    known = sample_raster(photometry.valid[:, None].to(relief.depth), *place)[:, 0]
+    return _Estimates(
+        vertex=vertex[found],
+        height=((points - origins) * along).sum(dim=-1)[found],
+        weight=weight[found],
+        scale=templates.spacing[:, None].expand_as(weight)[found],
+        known=known[found],
+        values=values.movedim(1, -1)[found],
+    )
+
+
+def _bands(
+    coarse: CoarseMesh, templates: Templates
+) -> tuple[Float[Tensor, "patch 3 2"], Float[Tensor, "patch 3"]]:
+    """Give corners in the patch frame, and how far outside the facet weights reach.
+
+    The band is in barycentric coordinates and ends a little inside the enlarged triangle.
+    """
+    vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces[templates.facet]
+    corners = transform(templates.patch_from_world, vertices[faces])[..., :2]
+    opposite = (corners.roll(-1, dims=1) - corners.roll(-2, dims=1)).norm(dim=-1)
+    twice_area = face_normals(vertices, faces).norm(dim=-1, keepdim=True)
+    step = templates.spacing[:, None] * opposite / twice_area  # barycentric, for one sample
+    inside = templates.inside[..., None]
+    reach = torch.where(inside, -templates.barycentric, 0).amax(dim=(1, 2))
+    return corners, torch.maximum(reach - _RAGGED_SAMPLES * step, step / 2)
+
+
+def _rays_near(
+    coarse: CoarseMesh,
+    templates: Templates,
+    corners: Float[Tensor, "patch 3 2"],
+    bands: Float[Tensor, "patch 3"],
+    lattice: Lattice,
+    directions: Float[Tensor, "vertex 3"],
+    vertices_of: Sequence[Int[Tensor, "..."]],
+) -> tuple[Int[Tensor, "patch ray"], Bool[Tensor, "patch ray"]]:
+    """List, for each patch, the vertices of its facet and of those around it that it may know.
+
+    Returns:
+        Vertices, padded with 0, and which entries are meant.
+    """
+    from_patch = _barycentric_map(corners)
+    near = []
+    for patch, around in enumerate(_facets_around(coarse, templates.facet)):
+        vertex = torch.cat([vertices_of[facet] for facet in around])
+        frame = templates.patch_from_world[patch]
+        start = lattice.points[vertex] @ frame[:3, :3].T + frame[:3, 3]
+        along = directions[vertex] @ frame[:3, :3].T
+        facing = along[:, 2] < -_FACING
+        distance = -start[:, 2] / torch.where(facing, along[:, 2], 1)
+        crossing = start[:, :2] + distance[:, None] * along[:, :2]
+        barycentric = crossing @ from_patch[patch, :, :2].T + from_patch[patch, :, 2]
+        close = (barycentric > -(1 + _SLACK_BANDS) * bands[patch]).all(dim=-1)
+        near.append(vertex[facing & close])
+    listed = pad_sequence(near, batch_first=True)
+    counts = torch.tensor([len(vertex) for vertex in near], device=listed.device)
+    return listed, torch.arange(listed.shape[1], device=listed.device) < counts[:, None]
+
+
+def _facets_around(coarse: CoarseMesh, facets: Int[Tensor, " patch"]) -> list[list[int]]:
+    """List, for each facet, itself and the facets that share a corner with it."""
+    at_corner: dict[int, list[int]] = {}
+    faces: list[list[int]] = coarse.mesh.faces.tolist()
+    for facet, face in enumerate(faces):
+        for corner in face:
+            at_corner.setdefault(corner, []).append(facet)
+    return [
+        sorted({facet for corner in faces[own] for facet in at_corner[corner]})
+        for own in facets.tolist()
+    ]
+
+
+def _barycentric_map(corners: Float[Tensor, "patch 3 2"]) -> Float[Tensor, "patch 3 3"]:
+    """Give the affine map from (x, y, 1) in the patch frame to barycentric coordinates."""
+    ones = torch.ones_like(corners[..., :1])
+    return torch.linalg.inv(torch.cat([corners, ones], dim=-1).mT)
+
+
+def _taper(
+    barycentric: Float[Tensor, "patch ray 3"], bands: Float[Tensor, "patch 3"]
+) -> Float[Tensor, "patch ray"]:
+    """Weigh a patch: 0 at the end of the band, 1/2 on the facet's edge, 1 as far inside."""
+    share = ((barycentric / bands[:, None] + 1) / 2).clamp(0, 1)
+    return (share * share * (3 - 2 * share)).prod(dim=-1)
+
+
+def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Union:
+    """Average the estimates of each vertex."""
+    vertex, height = estimates.vertex, estimates.height
+    weight = estimates.weight * _agreement(estimates, count, outlier_samples)
+    total = _sum_at(vertex, weight, count)
+    seen_weight = weight * estimates.known
+    seen_total = _sum_at(vertex, seen_weight, count)
+    supported, seen = total > _LEAST_WEIGHT, seen_total > _LEAST_WEIGHT
+    per_support = torch.where(supported, 1 / total.clamp_min(_LEAST_WEIGHT), 0)
+    per_seen = torch.where(seen, 1 / seen_total.clamp_min(_LEAST_WEIGHT), 0)
+    values = _sum_at(vertex, seen_weight[:, None] * estimates.values, count)
+    normals, confidence, albedo = values[:, :3], values[:, 3], values[:, 4:]
+    return Union(
+        heights=_sum_at(vertex, weight * height, count) * per_support,
+        supported=supported,
+        normals_world=normalize(normals * per_seen[:, None], dim=-1),
+        albedo=albedo * per_seen[:, None],
+        seen=seen,
+        # Divided by the whole weight: a patch that does not know speaks against certainty.
+        confidence=(confidence * per_support).clamp(0, 1),
+    )
+
+
+def _agreement(
+    estimates: _Estimates, count: int, outlier_samples: float
+) -> Float[Tensor, " estimate"]:
+    """Lower the weight of an estimate far from the weighted median of three or more."""
+    with torch.no_grad():
+        by_height = estimates.height.argsort(stable=True)
+        order = by_height[estimates.vertex[by_height].argsort(stable=True)]
+        vertex, weight = estimates.vertex[order], estimates.weight[order].double()
+        number = torch.bincount(vertex, minlength=count)
+        total = _sum_at(vertex, weight, count)
+        running = weight.cumsum(0)
+        before = (total.cumsum(0) - total)[vertex]
+        below = _sum_at(vertex, (running - before < total[vertex] / 2).long(), count)
+        middle = (number.cumsum(0) - number + below.clamp_max((number - 1).clamp_min(0)))[vertex]
+        median = torch.empty_like(estimates.height)
+        median[order] = estimates.height[order][middle]
+    away = (estimates.height - median) / (outlier_samples * estimates.scale)
+    many = number[estimates.vertex] >= 3
+    beyond = (away.abs() - 1).clamp_min(0)
+    return torch.where(many, 1 / (1 + _DISTRUST * beyond.square()), 1)
+
+
+def _sum_at(
+    index: Int[Tensor, " entry"], values: Shaped[Tensor, "entry ..."], count: int
+) -> Shaped[Tensor, "vertex ..."]:
+    return values.new_zeros(count, *values.shape[1:]).index_add(0, index, values)
