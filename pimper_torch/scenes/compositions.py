@@ -19,7 +19,7 @@ def potato_on_table(
     span_deg: float = 50.0,
     flash: float = 0.0,
     gloss: float = 0.0,
-    contrast: float = 2.0,
+    contrast: float = 1.5,
     sensor: SensorConfig | None = None,
 ) -> RenderedScene:
     """Photograph a bumpy, textured potato under a lamp that moves between photographs.
@@ -47,7 +47,9 @@ def potato_on_table(
         ),
         Body(
             mesh=table(),
-            texture=random_speckle(generator, cells=(0.4, 0.15, 0.05), contrast=contrast),
+            texture=random_speckle(
+                generator, cells=(0.53, 0.23, 0.097, 0.043, 0.019), contrast=contrast
+            ),
         ),
     )
     middle = (0.0, 0.0, 0.7)

@@ -108,7 +108,7 @@ class Speckle:
 def random_speckle(
     generator: torch.Generator,
     *,
-    cells: tuple[float, ...] = (0.25, 0.09, 0.035),
+    cells: tuple[float, ...] = (0.41, 0.17, 0.071, 0.031, 0.014),
     darkest: float = 0.15,
     brightest: float = 0.85,
     contrast: float = 2.5,
@@ -126,7 +126,7 @@ def random_speckle(
         colour: 0 is gray; 1 gives the channels nothing in common.
         channels: Of the albedo.
     """
-    side = 32  # repeats after 32 cells: farther than the finest octave is seen at once
+    side = 64  # repeats after 64 cells; no two octaves repeat together
     shape = (len(cells), 1, side, side, side)
     shared = torch.randn(shape, generator=generator)
     own = torch.randn((len(cells), channels, side, side, side), generator=generator)

@@ -20,6 +20,7 @@ def sparse_scene(
     noise_px: float = 0.0,
     outlier_share: float = 0.0,
     in_views: tuple[int, ...] | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> SparseScene:
     """Sample visible surface points, follow them through the views and triangulate them.
 
@@ -37,6 +38,8 @@ def sparse_scene(
             half their depth, keeping their short, wrong tracks.
         in_views: Pick points in the maps of these views; ``None`` is all of them, so that
             some points lie on sides that the middle view does not see.
+        dtype: Of photographs, cameras and points; the default is what structure from
+            motion gives.
     """
     require(min_views >= 2, "min_views", min_views, "2 or more to triangulate from")
     require(0 <= outlier_share < 1, "outlier_share", outlier_share, "at least 0, below 1")
@@ -58,13 +61,16 @@ def sparse_scene(
     errors = (where - pixels).norm(dim=-1)
     point_index, view_index = torch.nonzero(seen, as_tuple=True)
     return SparseScene(
-        views=scene.views,
-        cameras=cameras,
-        points_world=points,
-        reprojection_errors_px=(errors * seen).sum(dim=1) / seen.sum(dim=1),
+        views=scene.views.replace(images=scene.views.images.to(dtype)),
+        cameras=cameras.replace(
+            intrinsics=cameras.intrinsics.to(dtype),
+            cam_from_world=cameras.cam_from_world.to(dtype),
+        ),
+        points_world=points.to(dtype),
+        reprojection_errors_px=((errors * seen).sum(dim=1) / seen.sum(dim=1)).to(dtype),
         observation_point=point_index,
         observation_view=view_index,
-        observation_pixels=pixels[seen],
+        observation_pixels=pixels[seen].to(dtype),
         lenses=_lenses(cameras),
     )
 

@@ -11,6 +11,10 @@ from pimper_torch.scenes.shapes import Plane, Sphere
 from pimper_torch.scenes.sparse import sparse_scene, triangulate_rays
 
 
+def exact_cloud(*inputs, **settings):
+    return sparse_scene(*inputs, dtype=torch.float64, **settings)
+
+
 @pytest.fixture
 def scene(generator):
     cameras = arc_cameras(6, width=80, height=60, focal_px=90.0, distance=4.0, span_deg=60.0)
@@ -19,7 +23,7 @@ def scene(generator):
 
 
 def test_points_lie_on_the_surface_and_project_on_their_observations(scene, generator):
-    sparse = sparse_scene(scene, 150, generator)
+    sparse = exact_cloud(scene, 150, generator)
     assert len(sparse.points_world) == 150
     assert_close(sparse.points_world.norm(dim=1), torch.ones(150, dtype=torch.float64))
     pixels, _ = project(
@@ -32,7 +36,7 @@ def test_points_lie_on_the_surface_and_project_on_their_observations(scene, gene
 
 
 def test_no_point_is_observed_from_behind_the_sphere(scene, generator):
-    sparse = sparse_scene(scene, 300, generator)
+    sparse = exact_cloud(scene, 300, generator)
     points = sparse.points_world[sparse.observation_point]
     toward = sparse.cameras.centers_world[sparse.observation_view] - points
     assert ((points * toward).sum(dim=1) > 0).all()
@@ -43,7 +47,7 @@ def test_no_point_is_observed_from_behind_the_sphere(scene, generator):
 
 
 def test_noise_is_on_the_observations_and_reaches_the_points(scene, generator):
-    sparse = sparse_scene(scene, 300, generator, noise_px=0.5)
+    sparse = exact_cloud(scene, 300, generator, noise_px=0.5)
     off = (sparse.points_world.norm(dim=1) - 1).abs()
     assert 1e-4 < off.mean() < 0.02
     # A track of v views keeps 2v - 3 of 2v noisy numbers: below 0.5 sqrt(pi / 2).
@@ -51,7 +55,7 @@ def test_noise_is_on_the_observations_and_reaches_the_points(scene, generator):
 
 
 def test_outliers_are_few_and_gross_and_have_short_tracks(scene, generator):
-    sparse = sparse_scene(scene, 200, generator, outlier_share=0.1)
+    sparse = exact_cloud(scene, 200, generator, outlier_share=0.1)
     off = (sparse.points_world.norm(dim=1) - 1).abs()
     gross = off > 1e-6
     assert gross.sum() == 20
@@ -76,7 +80,7 @@ def test_a_plane_fills_all_views_with_points(generator):
     cameras = arc_cameras(4, width=40, height=30, focal_px=50.0, distance=4.0, span_deg=20.0)
     lights = torch.ones(4, 4, dtype=torch.float64)
     scene = render_shape(Plane(), cameras, lights, random_speckle(generator))
-    sparse = sparse_scene(scene, 100, generator, in_views=(1,))
+    sparse = exact_cloud(scene, 100, generator, in_views=(1,))
     assert_close(sparse.points_world[:, 2], torch.zeros(100, dtype=torch.float64))
     assert sparse.observed[:, 1].all()
 
@@ -87,3 +91,10 @@ def test_a_plane_fills_all_views_with_points(generator):
 def test_impossible_clouds_are_refused(scene, generator, setting, words):
     with pytest.raises(ConfigError, match=words):
         sparse_scene(scene, 10, generator, **setting)
+
+
+def test_a_cloud_is_single_precision_as_structure_from_motion_gives_it(scene, generator):
+    sparse = sparse_scene(scene, 10, generator)
+    assert sparse.points_world.dtype == torch.float32
+    assert sparse.cameras.cam_from_world.dtype == torch.float32
+    assert sparse.observation_pixels.dtype == torch.float32
