@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""The command line."""

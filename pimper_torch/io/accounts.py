@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.geometry.frames import rotate
+from pimper_torch.io.version import installed_version
 from pimper_torch.records import Reconstruction
 
 # What JSON can hold.
@@ -119,14 +119,6 @@ def summary_account(result: Reconstruction, about: Mapping[str, object]) -> Acco
             for report in result.report
         ],
     }
-
-
-def installed_version() -> str:
-    """Name the version of the installed package."""
-    try:
-        return version("pimper_torch")
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def _finite(value: float | int) -> float | int | None:

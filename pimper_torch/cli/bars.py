@@ -1,0 +1,77 @@
+"""How far a run has come, on the terminal."""
+
+import types
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from pimper_torch.records import StageReport
+
+
+class Bars:
+    """An observer with a bar and the time left for every stage.
+
+    Where the output is no terminal, it writes a line when a stage ends instead.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self._progress = Progress(
+            TextColumn("{task.description:<12}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("[dim]{task.fields[found]}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> "Bars":
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: types.TracebackType | None,
+    ) -> None:
+        self._progress.stop()
+
+    def started(self, stage: str) -> None:
+        """Begin a bar; it moves to and fro until the stage tells how far it has come."""
+        self._task = self._progress.add_task(stage, total=None, found="")
+
+    def progressed(self, done: int, total: int) -> None:
+        """Fill the bar."""
+        if self._task is not None:
+            self._progress.update(self._task, completed=done, total=total)
+
+    def finished(self, report: StageReport) -> None:
+        """Complete the bar, and say what was found."""
+        found = ", ".join(list(_figures(report))[:3])
+        if self._task is not None:
+            self._progress.update(self._task, completed=1, total=1, found=found)
+        if not self.console.is_terminal:
+            self.console.print(
+                f"{report.name:<12} {report.seconds:7.1f} s  {found}", highlight=False
+            )
+        self._task = None
+
+
+def _figures(report: StageReport) -> list[str]:
+    return [f"{name.replace('_', ' ')} {_short(value)}" for name, value in report.figures.items()]
+
+
+def _short(value: float | int) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.3g}"

@@ -1,0 +1,120 @@
+"""``pimper``: which command, and how it ends.
+
+What takes long to import is imported when a command needs it.
+"""
+
+import difflib
+import signal
+import sys
+import types
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TextIO
+
+from pimper_torch.errors import PimperError, PimperWarning
+
+_HELP = """\
+usage: pimper reconstruct PHOTOS -o OUT [options]
+       pimper demo [-o OUT] [options]
+       pimper --version
+
+Photographs from many places under many unknown lights, to a dense surface with normals,
+albedo and light.
+
+  reconstruct   a folder of photographs
+  demo          the photographs of a skull that come with the package
+
+`pimper reconstruct --help` tells every option and every setting of every stage.
+"""
+_COMMANDS = ("reconstruct", "demo")
+_FAILED, _INTERRUPTED = 2, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Returns:
+        0; 2 for anything the user can mend, told in one message; 130 when interrupted.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in ("-h", "--help"):
+        sys.stdout.write(_HELP)
+        return 0 if given else _FAILED
+    if given[0] == "--version":
+        from pimper_torch.io.version import installed_version
+
+        sys.stdout.write(f"pimper_torch {installed_version()}\n")
+        return 0
+    if given[0] not in _COMMANDS:
+        near = difflib.get_close_matches(given[0], _COMMANDS, n=1)
+        hint = f" Did you mean `{near[0]}`?" if near else ""
+        _tell("error", f"there is no command `{given[0]}`.{hint} See `pimper --help`.")
+        return _FAILED
+    with _readable_warnings(), _terminable():
+        return _run(given[0], given[1:])
+
+
+def _run(command: str, arguments: list[str]) -> int:
+    from pimper_torch.cli.run import run
+
+    try:
+        run(command, arguments)
+    except PimperError as error:
+        _tell("error", str(error))
+        return _FAILED
+    except KeyboardInterrupt:
+        _tell("error", "interrupted; nothing was written.")
+        return _INTERRUPTED
+    return 0
+
+
+def _tell(kind: str, message: str) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    color = "bold red" if kind == "error" else "bold yellow"
+    text = Text.assemble((f"{kind}: ", color), message)
+    Console(stderr=True, soft_wrap=True).print(text)
+
+
+@contextmanager
+def _readable_warnings() -> Iterator[None]:
+    """Show our warnings as sentences, without a line of source; others as Python does."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", PimperWarning)
+        usual = warnings.showwarning
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, PimperWarning):
+                _tell("warning", str(message))
+            else:
+                usual(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let a polite kill clean up as Ctrl-C does."""
+
+    def interrupt(number: int, frame: types.FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        former = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not in the main thread, where no signals arrive
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)

@@ -1,0 +1,130 @@
+"""The options of every command, and the settings of every stage as options."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from pimper_torch.pipeline import PimperConfig, load_config
+
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommonOptions:
+    """Options that every command has.
+
+    Attributes:
+        preset: Settings to start from: paper, default, fast, or a YAML file of your own.
+        reference: Name of the photograph that the facets and pictures are seen from; chosen
+            automatically unless given.
+        device: Where everything after structure from motion runs.
+        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+        overwrite: Replace a former result in OUT.
+    """
+
+    preset: str = "default"
+    reference: str = ""
+    device: Literal["cpu", "cuda"] = "cpu"
+    max_size_px: int = 0
+    overwrite: Flag = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputOptions:
+    """What the photographs come with.
+
+    Attributes:
+        masks: Folder with a mask for each photograph, of the same name; zero off the object.
+        sparse: Folder of a COLMAP model of these photographs, used instead of structure
+            from motion.
+        linear: The files hold linear radiance, not sRGB.
+    """
+
+    masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    sparse: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    linear: Flag = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """All that a run is told."""
+
+    photos: Path
+    out: Path
+    common: CommonOptions
+    config: PimperConfig
+    inputs: InputOptions = field(default_factory=InputOptions)
+
+
+def parse(command: str, arguments: Sequence[str]) -> Job:
+    """Read the arguments of a command.
+
+    The preset is read first: its settings are the defaults that other options change, and
+    that ``--help`` shows.
+
+    Raises:
+        ConfigError: No such preset, or an impossible setting.
+        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+    """
+    preset = load_config(_preset(arguments))
+
+    def reconstruct(
+        photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")],
+        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],
+        inputs: Annotated[InputOptions, tyro.conf.arg(name="")] = InputOptions(),
+        common: Annotated[CommonOptions, tyro.conf.arg(name="")] = CommonOptions(),
+        config: Annotated[PimperConfig, tyro.conf.arg(name="")] = preset,
+    ) -> Job:
+        """Reconstruct the surface that a folder of photographs shows.
+
+        Args:
+            photos: Folder of JPEG, PNG or TIFF files.
+            out: Folder for the result; new or empty.
+            inputs: What the photographs come with.
+            common: The run.
+            config: The stages.
+        """
+        return Job(photos=photos, out=out, common=common, inputs=inputs, config=config)
+
+    def demo(
+        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")] = Path("pimper_demo"),
+        common: Annotated[CommonOptions, tyro.conf.arg(name="")] = CommonOptions(),
+        config: Annotated[PimperConfig, tyro.conf.arg(name="")] = preset,
+    ) -> Job:
+        """Reconstruct the skull whose photographs come with the package.
+
+        Args:
+            out: Folder for the result; new or empty.
+            common: The run.
+            config: The stages.
+        """
+        return Job(photos=bundled_photographs(), out=out, common=common, config=config)
+
+    job = tyro.cli(
+        reconstruct if command == "reconstruct" else demo,
+        prog=f"pimper {command}",
+        args=list(arguments),
+    )
+    if job.common.reference:
+        triangulate = dataclasses.replace(job.config.triangulate, reference=job.common.reference)
+        config = dataclasses.replace(job.config, triangulate=triangulate)
+        job = dataclasses.replace(job, config=config)
+    return job
+
+
+def bundled_photographs() -> Path:
+    """Give the folder of the skull's photographs; their licence lies beside them."""
+    return Path(str(resources.files("pimper_torch"))) / "data" / "skull"
+
+
+def _preset(arguments: Sequence[str]) -> str:
+    for place, argument in enumerate(arguments):
+        name, equals, value = argument.partition("=")
+        if name == "--preset":
+            return value if equals else "".join(arguments[place + 1 : place + 2]) or "default"
+    return CommonOptions().preset

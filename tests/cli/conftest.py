@@ -1,0 +1,46 @@
+import numpy as np
+import pytest
+from PIL import Image
+
+from pimper_torch.records import StageReport
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    noise = np.random.default_rng(76).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    for number in range(3):
+        Image.fromarray(noise).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.fixture
+def chain(reconstruction, monkeypatch):
+    """Put a chain in the place of the real one that tells what it was given."""
+    from pimper_torch.cli import run
+    from pimper_torch.io import results
+
+    class Chain:
+        given = None
+
+        def __init__(self, config, observer):
+            self.config, self.observer = config, observer
+
+        def __call__(self, views, sparse_model=None):
+            Chain.given = (self.config, views, sparse_model)
+            self.observer.started("warp")
+            self.observer.progressed(1, 2)
+            self.work()
+            self.observer.finished(
+                StageReport(name="warp", seconds=1.0, peak_memory_mb=9.0, figures={"samples": 1200})
+            )
+            return reconstruction
+
+        def work(self):
+            """Whatever a test wants to happen in the middle of a run."""
+
+    draw = results.draw_overview
+    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+    monkeypatch.setattr(run, "Pimper", Chain)
+    return Chain

@@ -1,0 +1,188 @@
+import json
+import os
+import signal
+import warnings
+
+import pytest
+import torch
+import yaml
+
+from pimper_torch.cli.main import main
+from pimper_torch.errors import PimperWarning, ReconstructionError
+from pimper_torch.io.results import RESULT_NAMES
+from pimper_torch.io.version import installed_version
+from pimper_torch.pipeline import PimperConfig, load_config
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def held(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys):
+    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
+    assert held(tmp_path / "out") == sorted(RESULT_NAMES)
+    config, views, sparse = chain.given
+    assert config == PimperConfig() == load_config("default")
+    assert views.names == ("0.png", "1.png", "2.png")
+    assert sparse is None
+    told = capsys.readouterr()
+    assert f"{tmp_path}/out/mesh.ply" in told.out
+    assert "3 of 4 photographs" in told.out
+    for stage in ("read", "warp", "write"):
+        assert stage in told.err
+    assert "samples 1,200" in told.err
+
+
+def test_options_reach_their_places(photos, chain, tmp_path):
+    out = tmp_path / "out"
+    code = run(
+        *("reconstruct", photos, "--out", out, "--linear", "--max-size-px", "16"),
+        *("--reference", "1.png", "--sparse", tmp_path, "--reconstruct.starts", "7"),
+    )
+    assert code == 0
+    config, views, sparse = chain.given
+    assert views.images.shape[-2:] == (12, 16)
+    assert (config.reconstruct.starts, config.triangulate.reference) == (7, "1.png")
+    assert sparse == tmp_path
+    written = yaml.safe_load((out / "config.yaml").read_text())
+    assert written["reconstruct"]["starts"] == 7
+    assert load_config(out / "config.yaml") == config
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["linear"], summary["photographs"]) == (True, str(photos))
+
+
+def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):
+    preset = tmp_path / "mine.yaml"
+    preset.write_text("reconstruct: {starts: 5, seed: 3}\n")
+    for place, given in enumerate((["--preset", preset], [f"--preset={preset}"])):
+        out = tmp_path / str(place)
+        assert run("reconstruct", photos, "-o", out, *given, "--reconstruct.seed", "4") == 0
+        settings = chain.given[0].reconstruct
+        assert (settings.starts, settings.seed) == (5, 4)
+
+
+def test_masks_are_read(photos, chain, tmp_path):
+    assert run("reconstruct", photos, "-o", tmp_path / "out", "--masks", photos) == 0
+    assert chain.given[1].masks is not None
+
+
+def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("demo", "--max-size-px", "60") == 0
+    assert held(tmp_path / "pimper_demo") == sorted(RESULT_NAMES)
+    assert chain.given[1].num_views == 24
+    assert "37.jpg" in chain.given[1].names
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--preset", "papre"], "Did you mean `paper`?"),
+        (["--preset", "nowhere/mine.yaml"], "there is no such file"),
+        (["--reconstruct.starts", "0"], "starts is 0; needed: at least 1"),
+        (["--max-size-px", "-3"], "max_size_px is -3"),
+        (["--masks", "nowhere"], "nowhere: found nothing; needed: a folder"),
+    ],
+)
+def test_what_the_user_can_mend_is_one_message_and_code_2(
+    photos, chain, tmp_path, capsys, arguments, told
+):
+    assert run("reconstruct", photos, "-o", tmp_path / "out", *arguments) == 2
+    message = capsys.readouterr().err
+    assert "error: " in message
+    assert told in message
+    assert "Traceback" not in message
+    assert held(tmp_path) == ["photos"]
+
+
+def test_an_occupied_out_is_refused_before_photographs_are_read(photos, chain, tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mesh.ply").write_text("former")
+    assert run("reconstruct", tmp_path / "nowhere", "-o", tmp_path / "out") == 2
+    assert "out: already holds mesh.ply" in capsys.readouterr().err
+    assert run("reconstruct", photos, "-o", tmp_path / "out", "--overwrite") == 0
+    assert held(tmp_path / "out") == sorted(RESULT_NAMES)
+
+
+def test_a_missing_gpu_is_told_before_the_run(photos, chain, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert run("reconstruct", photos, "-o", tmp_path / "out", "--device", "cuda") == 2
+    assert "finds no CUDA device" in capsys.readouterr().err
+    assert chain.given is None
+
+
+def fail():
+    raise ReconstructionError("reconstruct: only 2 of 3 photographs [1, 2] registered.")
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+def terminate():
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.parametrize(
+    ("event", "code", "told"),
+    [
+        (fail, 2, "error: reconstruct: only 2 of 3 photographs [1, 2] registered."),
+        (interrupt, 130, "interrupted; nothing was written"),
+        (terminate, 130, "interrupted; nothing was written"),
+    ],
+)
+def test_a_run_that_ends_early_leaves_nothing(
+    photos, chain, tmp_path, capsys, monkeypatch, event, code, told
+):
+    former = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(chain, "work", lambda self: event())
+    assert run("reconstruct", photos, "-o", tmp_path / "out") == code
+    assert told in capsys.readouterr().err
+    assert held(tmp_path) == ["photos"]
+    assert signal.getsignal(signal.SIGTERM) is former
+
+
+def test_warnings_are_sentences(photos, chain, tmp_path, capsys, monkeypatch):
+    def warn(_):
+        warnings.warn("light hardly varies.", PimperWarning, stacklevel=1)
+
+    monkeypatch.setattr(chain, "work", warn)
+    usual = warnings.showwarning
+    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
+    assert "warning: light hardly varies.\n" in capsys.readouterr().err
+    assert warnings.showwarning is usual
+
+
+def test_help_names_the_commands_and_version_the_version(capsys):
+    assert run("--help") == 0
+    told = capsys.readouterr().out
+    assert "pimper reconstruct PHOTOS" in told
+    assert "pimper demo" in told
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"pimper_torch {installed_version()}\n"
+    assert run() == 2
+
+
+def test_a_misspelt_command_names_the_nearest(capsys):
+    assert run("reconstuct") == 2
+    assert "Did you mean `reconstruct`?" in capsys.readouterr().err
+
+
+def test_every_setting_is_an_option_with_its_help(capsys):
+    with pytest.raises(SystemExit) as ended:
+        run("demo", "--help")
+    assert ended.value.code == 0
+    told = capsys.readouterr().out
+    for name in ("--reconstruct.starts", "--triangulate.reference", "--overwrite", "--preset"):
+        assert name in told
+
+
+def test_an_unknown_option_is_refused(photos, chain, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run("reconstruct", photos, "-o", tmp_path / "out", "--sede", "3")
+    assert ended.value.code == 2
+    assert chain.given is None
