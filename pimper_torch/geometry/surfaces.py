@@ -49,13 +49,16 @@ def face_pairs(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "pair 2"], Int
         For every edge with exactly two faces: the faces, and the edge's two vertices.
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
-    face = torch.arange(len(faces), device=faces.device).repeat_interleave(3)
-    unique, inverse, counts = torch.unique(edges, dim=0, return_inverse=True, return_counts=True)
-    order = torch.argsort(inverse, stable=True)
-    first = torch.cumsum(counts, dim=0) - counts
-    inner = counts == 2
-    pairs = torch.stack([face[order[first[inner]]], face[order[first[inner] + 1]]], dim=1)
-    return pairs, unique[inner]
+    if len(edges) == 0:
+        return edges, edges
+    # One number an edge: sorting rows takes twenty times as long.
+    key, order = (edges[:, 0] * (edges.max() + 1) + edges[:, 1]).sort(stable=True)
+    new = torch.ones_like(key, dtype=torch.bool)
+    new[1:] = key[1:] != key[:-1]
+    start = new.nonzero()[:, 0]
+    counts = torch.diff(start, append=start.new_tensor([len(key)]))
+    first = start[counts == 2]
+    return torch.stack([order[first], order[first + 1]], dim=1) // 3, edges[order[first]]
 
 
 def boundary_vertices(
