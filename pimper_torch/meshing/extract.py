@@ -1,0 +1,151 @@
+"""Extraction: the joined surface in, one connected mesh out."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.meshing.components import face_components, vertex_components, vertex_fans
+from pimper_torch.records import Mesh, Surface
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtractConfig:
+    """What of the surface is worth keeping.
+
+    Attributes:
+        min_confidence: Vertices with no more than this have no support of their own.
+        max_hole: Connected vertices without support stay, as a filled hole, when they
+            extend over no more than this share of the surface's extent (both diagonals
+            of bounding boxes).
+        max_stretch: Longest edge of a face, in multiples of the surface's median edge;
+            longer ones are spikes or cliffs. Infinite keeps all.
+        drop_overturned: Leave out faces turned more than 90 degrees from the mean of
+            their facet.
+        largest_only: Keep only the largest connected piece, by area.
+    """
+
+    min_confidence: float = 0.0
+    max_hole: float = 0.2
+    max_stretch: float = 10.0
+    drop_overturned: bool = True
+    largest_only: bool = True
+
+    def __post_init__(self) -> None:
+        require(0 <= self.min_confidence < 1, "min_confidence", self.min_confidence, "in [0, 1)")
+        require(self.max_hole >= 0, "max_hole", self.max_hole, "0 or more")
+        require(self.max_stretch > 1, "max_stretch", self.max_stretch, "above 1")
+
+
+class Extract(nn.Module):
+    """Keep what the photographs support, as one connected manifold mesh.
+
+    Faces without support and spikes go; of what remains, the largest piece stays, and where
+    two fans of faces touched in one vertex only, each gets its own copy. Orientation is the
+    coarse mesh's: counter-clockwise from outside.
+
+    Differentiable: what is kept is decided without gradient, and the kept vertices, normals,
+    albedo and confidence carry theirs.
+    """
+
+    def __init__(self, config: ExtractConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or ExtractConfig()
+
+    def forward(self, surface: Surface) -> Mesh:
+        """Extract the mesh.
+
+        Raises:
+            ReconstructionError: Nothing is left.
+        """
+        vertices = surface.vertices_world.detach()
+        supported = surface.confidence.detach() > self.config.min_confidence
+        filled = small_holes(vertices, surface.faces, supported, self.config.max_hole)
+        keep = (supported | filled)[surface.faces].all(dim=1)
+        with_support = int(keep.sum())
+        keep = keep & ~self._spikes(surface)
+        faces = surface.faces[keep]
+        if len(faces) == 0:
+            raise ReconstructionError(
+                f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
+                f"{len(faces)} of those are no spikes; at least one is needed. Lower "
+                f"`extract.min_confidence` (now {self.config.min_confidence}), raise "
+                f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the share "
+                "of missing data that the report gives."
+            )
+        if self.config.largest_only:
+            faces = faces[largest_piece(vertices, faces)]
+        source, faces = vertex_fans(faces)
+        return Mesh(
+            vertices_world=surface.vertices_world[source],
+            faces=faces,
+            normals_world=normalize(surface.normals_world[source], dim=-1),
+            albedo=surface.albedo[source],
+            confidence=surface.confidence[source],
+        )
+
+    def _spikes(self, surface: Surface) -> Bool[Tensor, " face"]:
+        vertices = surface.vertices_world.detach()
+        corners = vertices[surface.faces]
+        longest = (corners - corners.roll(1, dims=1)).norm(dim=-1)
+        spikes = longest.amax(dim=1) > self.config.max_stretch * longest.median()
+        if self.config.drop_overturned:
+            spikes = spikes | overturned(vertices, surface.faces, surface.facet)
+        return spikes
+
+
+def small_holes(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    supported: Bool[Tensor, " vertex"],
+    max_extent: float,
+) -> Bool[Tensor, " vertex"]:
+    """Mark vertices without support that lie in a small connected group of their kind.
+
+    Args:
+        vertices: World.
+        faces: Of the surface.
+        supported: The others are grouped along edges.
+        max_extent: Diagonal of a group's bounding box, as a share of that of all vertices.
+    """
+    label = vertex_components(faces, ~supported)
+    count = int(label.max()) + 1 if len(label) else 0
+    index = label[:, None].expand_as(vertices)
+    like = vertices.new_zeros(count, 3)
+    high = like.scatter_reduce(0, index, vertices, "amax", include_self=False)
+    low = like.scatter_reduce(0, index, vertices, "amin", include_self=False)
+    whole = (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()
+    small = (high - low).norm(dim=-1) <= max_extent * whole
+    return ~supported & small[label]
+
+
+def overturned(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    facet: Int[Tensor, " vertex"],
+) -> Bool[Tensor, " face"]:
+    """Mark faces that look more than 90 degrees away from the mean of their facet.
+
+    Args:
+        vertices: World.
+        faces: Of the surface.
+        facet: Of each vertex; a face belongs to the facet that most of its vertices name.
+    """
+    normals = face_normals(vertices, faces)
+    owner = facet[faces].mode(dim=1).values
+    total = normals.new_zeros(int(facet.max()) + 1, 3).index_add(0, owner, normals)
+    return (normals * total[owner]).sum(dim=-1) < 0
+
+
+def largest_piece(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Bool[Tensor, " face"]:
+    """Mark the faces of the piece with the largest area; pieces hang together by edges."""
+    label = face_components(faces)
+    area = face_normals(vertices, faces).norm(dim=-1).double()
+    areas = area.new_zeros(int(label.max()) + 1).index_add(0, label, area)
+    return label == areas.argmax()

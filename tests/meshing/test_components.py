@@ -1,0 +1,40 @@
+import torch
+
+from pimper_torch.meshing.components import face_components, vertex_components, vertex_fans
+
+
+def test_faces_that_share_only_a_vertex_do_not_hang_together():
+    faces = torch.tensor([[0, 1, 2], [1, 3, 2], [3, 4, 5]])
+    first, second, third = face_components(faces).tolist()
+    assert first == second != third
+
+
+def test_a_vertex_between_two_fans_becomes_two():
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 4, 5], [0, 5, 6]])
+    source, renamed = vertex_fans(faces)
+    assert source.tolist() == [0, 0, 1, 2, 3, 4, 5, 6]
+    assert torch.equal(source[renamed], faces)
+    assert len(renamed[:2].unique()) == 4
+    assert not set(renamed[:2].flatten().tolist()) & set(renamed[2:].flatten().tolist())
+
+
+def test_a_closed_fan_keeps_its_middle_and_unused_vertices_go():
+    faces = torch.tensor([[9, 1, 2], [9, 2, 3], [9, 3, 1]])
+    source, renamed = vertex_fans(faces)
+    assert source.tolist() == [1, 2, 3, 9]
+    assert torch.equal(source[renamed], faces)
+
+
+def test_three_faces_at_an_edge_part():
+    faces = torch.tensor([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    source, renamed = vertex_fans(faces)
+    assert len(source) == 9
+    assert torch.equal(source[renamed], faces)
+
+
+def test_vertices_are_grouped_through_their_kind_only():
+    faces = torch.tensor([[0, 1, 2], [1, 3, 2], [3, 4, 5]])
+    among = torch.tensor([True, False, False, True, True, False])
+    label = vertex_components(faces, among).tolist()
+    assert label[3] == label[4]
+    assert len(set(label)) == 5

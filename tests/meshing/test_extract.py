@@ -1,0 +1,158 @@
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.meshing.extract import Extract, ExtractConfig, small_holes
+from pimper_torch.records import Convergence, Surface
+
+SIDE = 21
+
+
+def sheet(side=SIDE, confidence=None):
+    """A gently bent square sheet of unit steps, seen from -z; two facets."""
+    row, column = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
+    x, y = column.flatten().double(), row.flatten().double()
+    vertices = torch.stack([x, y, 0.01 * x * x], dim=1)
+    here = (row[:-1, :-1] * side + column[:-1, :-1]).flatten()
+    right, below, across = here + 1, here + side, here + side + 1
+    faces = torch.cat(
+        [torch.stack([here, below, across], dim=1), torch.stack([here, across, right], dim=1)]
+    )
+    normals = torch.stack([0.02 * x, 0 * x, -torch.ones_like(x)], dim=1)
+    return Surface(
+        vertices_world=vertices,
+        faces=faces,
+        facet=(y > x).long(),
+        barycentric=torch.full_like(vertices, 1 / 3),
+        normals_world=torch.nn.functional.normalize(normals, dim=-1),
+        albedo=vertices / side,
+        confidence=torch.ones_like(x) if confidence is None else confidence,
+        convergence=Convergence(
+            iterations=torch.ones(1, dtype=torch.long),
+            residual=torch.zeros(1, dtype=torch.float64),
+            converged=torch.ones(1, dtype=torch.bool),
+        ),
+    )
+
+
+def columns(surface):
+    return surface.vertices_world[:, 0]
+
+
+def as_trimesh(mesh):
+    return trimesh.Trimesh(mesh.vertices_world.numpy(), mesh.faces.numpy(), process=False)
+
+
+def test_a_surface_with_support_everywhere_comes_out_as_it_is():
+    surface = sheet()
+    mesh = Extract()(surface)
+    assert_close(mesh.vertices_world, surface.vertices_world)
+    assert torch.equal(mesh.faces, surface.faces)
+    assert_close(mesh.normals_world, surface.normals_world)
+    assert_close(mesh.albedo, surface.albedo)
+    assert_close(mesh.confidence, surface.confidence)
+
+
+def test_small_holes_stay_filled_and_large_ones_open():
+    surface = sheet()
+    x, y = columns(surface), surface.vertices_world[:, 1]
+    small = (x - 4).abs().maximum((y - 4).abs()) <= 1
+    large = (x - 13).abs().maximum((y - 13).abs()) <= 4
+    confidence = (~(small | large)).double()
+    mesh = Extract(ExtractConfig(max_hole=0.2))(surface.replace(confidence=confidence))
+    assert (mesh.confidence == 0).sum() == 9
+    assert len(mesh.vertices_world) == SIDE**2 - 81
+    assert as_trimesh(mesh).euler_number == 0  # a disc with one hole
+    closed = Extract(ExtractConfig(max_hole=0.5))(surface.replace(confidence=confidence))
+    assert as_trimesh(closed).euler_number == 1
+
+
+def test_unsupported_groups_are_measured_one_by_one():
+    surface = sheet()
+    supported = (columns(surface) + surface.vertices_world[:, 1]) % 4 != 0
+    marked = small_holes(surface.vertices_world, surface.faces, supported, 0.1)
+    assert torch.equal(marked, ~supported)  # scattered singles, however far apart
+    band = columns(surface) > 1
+    marked = small_holes(surface.vertices_world, surface.faces, band, 0.5)
+    assert not marked.any()
+
+
+def test_islands_go_and_the_largest_piece_stays():
+    surface = sheet(confidence=((columns(sheet()) < 6) | (columns(sheet()) > 9)).double())
+    mesh = Extract(ExtractConfig(max_hole=0.1))(surface)
+    assert columns(mesh).min() == 10
+    assert len(as_trimesh(mesh).split(only_watertight=False)) == 1
+    both = Extract(ExtractConfig(max_hole=0.1, largest_only=False))(surface)
+    assert columns(both).min() == 0
+    assert len(as_trimesh(both).split(only_watertight=False)) == 2
+
+
+def test_pieces_that_touch_in_a_vertex_are_parted():
+    surface = sheet()
+    x, y = columns(surface), surface.vertices_world[:, 1]
+    hourglass = ((x <= 10) & (y >= 10)) | ((x >= 10) & (y <= 10))
+    mesh = Extract(ExtractConfig(max_hole=0.1, largest_only=False))(
+        surface.replace(confidence=hourglass.double())
+    )
+    # Diagonals run the other way, so that no face bridges the two squares.
+    waist = (mesh.vertices_world[:, :2] == 10).all(dim=1)
+    assert waist.sum() == 2
+    assert (
+        len(
+            Extract(ExtractConfig(max_hole=0.1))(
+                surface.replace(confidence=hourglass.double())
+            ).vertices_world
+        )
+        == 121
+    )
+
+
+def test_spikes_and_overturned_faces_go():
+    surface = sheet()
+    vertices = surface.vertices_world.clone()
+    spike, folded = 5 * SIDE + 15, 15 * SIDE + 5
+    vertices[spike, 2] = -30
+    vertices[folded, 0] += 2.5  # over its neighbours: some faces look away
+    bent = surface.replace(vertices_world=vertices)
+    mesh = Extract(ExtractConfig())(bent)
+    assert mesh.vertices_world[:, 2].min() > -1
+    assert len(mesh.vertices_world) == SIDE**2 - 1  # the folded vertex keeps its good faces
+    gone = len(surface.faces) - len(mesh.faces)
+    assert 6 < gone <= 12
+    kept = Extract(ExtractConfig(drop_overturned=False, max_stretch=torch.inf))(bent)
+    assert len(kept.faces) == len(surface.faces)
+
+
+def test_vertices_carry_gradients():
+    surface = sheet()
+    vertices = surface.vertices_world.clone().requires_grad_()
+    confidence = (columns(surface) < 15).double()
+    mesh = Extract(ExtractConfig(max_hole=0.1))(
+        surface.replace(vertices_world=vertices, confidence=confidence)
+    )
+    mesh.vertices_world.sum().backward()
+    kept = (columns(surface) < 15).double()[:, None].expand(-1, 3)
+    assert_close(vertices.grad, kept)
+
+
+def test_normals_come_out_unit_and_faces_outward():
+    surface = sheet()
+    mesh = Extract()(surface.replace(normals_world=3 * surface.normals_world))
+    assert_close(mesh.normals_world.norm(dim=-1), torch.ones(SIDE**2).double())
+    own = torch.tensor(as_trimesh(mesh).face_normals)
+    assert ((mesh.normals_world[mesh.faces[:, 0]] * own).sum(-1) > 0).all()
+
+
+def test_a_surface_without_support_is_refused():
+    with pytest.raises(ReconstructionError, match="0 have support"):
+        Extract()(sheet(confidence=torch.zeros(SIDE**2).double()))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("min_confidence", 1.0), ("max_hole", -0.1), ("max_stretch", 1.0)]
+)
+def test_settings_that_mean_nothing_are_refused(name, value):
+    with pytest.raises(ConfigError, match=name):
+        ExtractConfig(**{name: value})
