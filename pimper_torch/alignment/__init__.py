@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""Reliefs of all patches, put in one frame."""

@@ -162,10 +162,18 @@ class Depths(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DepthPatches(Record):
-    """Relief of all patches, with the photometry it was integrated from."""
+    """Relief of all patches, with the photometry it was integrated from.
+
+    Attributes:
+        photometric: Normals, albedo and light the reliefs come from.
+        buckets: The reliefs.
+        mismatch: Root mean square distance of neighbouring reliefs where they overlap, scene
+            units: before alignment, then after each of its rounds. ``None`` before it.
+    """
 
     photometric: PhotometricPatches
     buckets: tuple[Depths, ...]
+    mismatch: Float[Tensor, " round"] | None = None
 
     @property
     def patches(self) -> PatchSet:

@@ -1,0 +1,108 @@
+import pytest
+import torch
+from scipy.spatial import Delaunay
+
+from pimper_torch.geometry.frames import transform
+from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.records import (
+    Cameras,
+    CoarseMesh,
+    Convergence,
+    DepthPatches,
+    Depths,
+    Mesh,
+    PhotometricPatches,
+    Photometry,
+)
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(7417)
+
+
+@pytest.fixture
+def facets_over(generator):
+    """Facets between points of a surface z(x, y) over a jittered grid on [-1, 1]^2."""
+
+    def build(height, side=5, sample=0.02, overlap=6.0):
+        axis = torch.linspace(-1, 1, side, dtype=torch.float64)
+        y, x = torch.meshgrid(axis, axis, indexing="ij")
+        xy = torch.stack([x, y], dim=-1).reshape(-1, 2)
+        inner = (xy.abs() < 0.999).all(dim=1, keepdim=True)
+        jitter = torch.rand(xy.shape, generator=generator, dtype=torch.float64) - 0.5
+        xy = xy + inner * jitter * 0.8 / side
+        vertices = torch.cat([xy, height(xy[:, 0], xy[:, 1])[:, None]], dim=1)
+        faces = torch.from_numpy(Delaunay(xy.numpy()).simplices).long()
+        a, b, c = xy[faces].unbind(dim=1)
+        turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+        # Outward is -z, toward the camera: clockwise in (x right, y down).
+        faces = torch.where((turn > 0)[:, None], faces[:, [0, 2, 1]], faces)
+        faces = faces[turn.abs() > 1e-6]
+        cam_from_world = torch.eye(4, dtype=torch.float64)[None].clone()
+        cam_from_world[0, 2, 3] = 10.0
+        focal = 10.0 / sample
+        intrinsics = torch.tensor([[focal, 0, 0], [0, focal, 0], [0, 0, 1]], dtype=torch.float64)
+        cameras = Cameras(
+            intrinsics=intrinsics[None],
+            cam_from_world=cam_from_world,
+            sizes_px=torch.tensor([[100, 100]]),
+        )
+        coarse = CoarseMesh(
+            mesh=Mesh(vertices_world=vertices, faces=faces),
+            reference=0,
+            is_point=torch.ones(len(vertices), dtype=torch.bool),
+        )
+        return Decompose(DecomposeConfig(overlap_samples=overlap))(coarse, cameras)
+
+    return build
+
+
+@pytest.fixture
+def reliefs():
+    """Give patches a relief, ``(points_patch, patch_from_world) -> depth``."""
+
+    def build(patches, relief):
+        buckets = []
+        for templates in patches.buckets:
+            depth = relief(templates.points_patch, templates.patch_from_world)
+            identity = torch.tensor([0.0, 0, 1, 0], dtype=depth.dtype).expand(len(depth), 4)
+            buckets.append(Depths(depth=depth, valid=templates.inside, transform=identity))
+        return DepthPatches(photometric=_blank(patches), buckets=tuple(buckets))
+
+    return build
+
+
+@pytest.fixture
+def sphere_relief():
+    """Closed form: the near side of a sphere, seen along each patch's z."""
+
+    def build(center, radius):
+        def relief(points, patch_from_world):
+            center_patch = transform(patch_from_world, center[None])[:, None]
+            x, y, _ = (points - center_patch).unbind(dim=-1)
+            return center_patch[..., 2] - (radius**2 - x**2 - y**2).sqrt()
+
+        return relief
+
+    return build
+
+
+def _blank(patches):
+    buckets = []
+    for templates in patches.buckets:
+        count, height, width = templates.depth.shape
+        like = templates.depth
+        one = like.new_ones(count)
+        buckets.append(
+            Photometry(
+                normals_patch=like.new_tensor([0, 0, -1]).expand(count, height, width, 3),
+                albedo=like.new_ones(count, height, width, 1),
+                lights_patch=like.new_ones(count, 1, 4),
+                valid=templates.inside,
+                confidence=templates.inside.to(like),
+                determined=one > 0,
+                convergence=Convergence(iterations=one.long(), residual=0 * one, converged=one > 0),
+            )
+        )
+    return PhotometricPatches(patches=patches, buckets=tuple(buckets))
