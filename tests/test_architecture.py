@@ -1,0 +1,134 @@
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import pimper_torch
+
+PACKAGE = Path(pimper_torch.__file__).parent
+ROOT = Path(__file__).parents[1]
+
+# A room imports from rooms above it in this list. viz stands above io, which draws the
+# contact sheet of a result with it.
+ROOMS = [
+    "errors",
+    "config",
+    "progress",
+    "records",
+    "geometry",
+    "linalg",
+    "sfm",
+    "coarse",
+    "patches",
+    "photometry",
+    "sweep",
+    "integration",
+    "alignment",
+    "fusion",
+    "refinement",
+    "meshing",
+    "reporting",
+    "pipeline",
+    "photometric_stereo",
+    "scenes",
+    "datasets",
+    "metrics",
+    "baselines",
+    "viz",
+    "io",
+    "cli",
+]
+
+SOLE_IMPORTERS = {
+    "pycolmap": {"sfm/colmap.py"},
+    "embreex": {"geometry/visibility.py"},
+    "kornia_rs": {"io/decode.py"},
+    "tifffile": {"io/decode.py"},
+    "yaml": {"config.py"},
+    "tyro": {"cli/options.py"},
+    "matplotlib": {"viz/overview.py"},
+}
+
+# Where a distribution's module has another name.
+MODULES = {"pyyaml": "yaml", "pillow": "PIL", "scikit-image": "skimage"}
+
+
+def files() -> list[Path]:
+    found = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
+    assert len(found) > 30
+    return sorted(found)
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Every module a file imports, inside functions too."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield str(node.module)
+
+
+def room(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("path", files(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_only_upward(path):
+    assert room(path) in ROOMS, f"{room(path)} has no place in the layout"
+    for module in imports(path):
+        head, _, rest = module.partition(".")
+        if head == "pimper_torch":
+            assert rest, f"{path.name} imports the package as a whole"
+            assert ROOMS.index(rest.split(".")[0]) <= ROOMS.index(room(path)), module
+
+
+@pytest.mark.parametrize("package", SOLE_IMPORTERS)
+def test_a_boundary_has_one_importer(package):
+    found = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in files()
+        if any(module.split(".")[0] == package for module in imports(path))
+    }
+    assert found == SOLE_IMPORTERS[package]
+
+
+def test_whatever_is_imported_is_declared():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = [re.split(r"[<>=\[ ]", entry)[0].lower() for entry in project["dependencies"]]
+    declared = {MODULES.get(name, name.replace("-", "_")) for name in names}
+    used = {module.split(".")[0] for path in files() for module in imports(path)}
+    assert used - set(sys.stdlib_module_names) - {"pimper_torch"} <= declared
+
+
+def loaded_by(statement: str) -> set[str]:
+    code = f"import sys; {statement}; print(*{{name.split('.')[0] for name in sys.modules}})"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(ran.stdout.split())
+
+
+def test_importing_the_package_loads_neither_colmap_nor_matplotlib():
+    loaded = loaded_by("import pimper_torch; pimper_torch.Pimper, pimper_torch.load_views")
+    assert "torch" in loaded  # or this test saw nothing
+    assert not loaded & {"pycolmap", "matplotlib", "tyro", "rich"}
+
+
+def test_the_newest_heading_of_the_changelog_is_the_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    assert headings[0] == project["version"]
+
+
+def test_ci_runs_the_test_command_of_the_readme():
+    readme = (ROOT / "README.md").read_text().splitlines()
+    (command,) = [line.strip() for line in readme if line.startswith("    ") and "pytest" in line]
+    assert command in (ROOT / ".ci" / "run").read_text().splitlines()
+
+
+def test_the_readme_shows_how_to_run_the_demo():
+    assert "    pip install . && pimper demo" in (ROOT / "README.md").read_text().splitlines()
