@@ -61,6 +61,10 @@ class Job:
     inputs: InputOptions = field(default_factory=InputOptions)
 
 
+# The skull's cranium and face both show in this photograph.
+SKULL = CommonOptions(reference="37")
+
+
 def parse(command: str, arguments: Sequence[str]) -> Job:
     """Read the arguments of a command.
 
@@ -93,7 +97,7 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
 
     def demo(
         out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")] = Path("pimper_demo"),
-        common: Annotated[CommonOptions, tyro.conf.arg(name="")] = CommonOptions(),
+        common: Annotated[CommonOptions, tyro.conf.arg(name="")] = SKULL,
         config: Annotated[PimperConfig, tyro.conf.arg(name="")] = preset,
     ) -> Job:
         """Reconstruct the skull whose photographs come with the package.

@@ -1,0 +1,105 @@
+"""The chain: photographs in, surface out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from torch import nn
+
+from pimper_torch.alignment.align import Align, AlignConfig
+from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.config import build, find_config, overlay, read_mapping
+from pimper_torch.integration.integrate import Integrate, IntegrateConfig
+from pimper_torch.meshing.extract import Extract, ExtractConfig
+from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.patches.warp import Warp, WarpConfig
+from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.records import Reconstruction, Views
+from pimper_torch.refinement.refine import Refine, RefineConfig
+from pimper_torch.reporting import Observer, Silent, recorded
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PimperConfig:
+    """The settings of every stage, in the order they run."""
+
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
+    triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
+    decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
+    warp: WarpConfig = field(default_factory=WarpConfig)
+    factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
+    integrate: IntegrateConfig = field(default_factory=IntegrateConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    extract: ExtractConfig = field(default_factory=ExtractConfig)
+
+
+class Pimper(nn.Module):
+    """Piecewise reconstruction of an object from many viewpoints under many unknown lights.
+
+    To swap a stage, assign another module that takes and gives the same records:
+    ``pimper.factorize = MyFactorize()``.
+
+    Structure from motion, the coarse mesh and the patches' layout are constants to autograd;
+    gradients run from the photographs' radiance in ``warp`` to the vertices of the mesh.
+
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, piecewise dense 3D reconstruction from
+    multi-view and multi-illumination images, 2015.
+    """
+
+    def __init__(
+        self, config: PimperConfig | None = None, observer: Observer | None = None
+    ) -> None:
+        super().__init__()
+        self.config = config = config or PimperConfig()
+        self.observer = observer or Silent()
+        self.reconstruct = Reconstruct(config.reconstruct)
+        self.triangulate = Triangulate(config.triangulate)
+        self.decompose = Decompose(config.decompose)
+        self.warp = Warp(config.warp)
+        self.factorize = Factorize(config.factorize)
+        self.integrate = Integrate(config.integrate)
+        self.align = Align(config.align)
+        self.refine = Refine(config.refine)
+        self.extract = Extract(config.extract)
+
+    def forward(self, views: Views, sparse_model: Path | None = None) -> Reconstruction:
+        """Reconstruct the surface that the photographs show.
+
+        Args:
+            views: Photographs, on the device that everything after structure from motion
+                is to run on.
+            sparse_model: Folder of a COLMAP model of these photographs, used instead of
+                running structure from motion.
+
+        Raises:
+            PimperError: What was found at which stage, what was needed, what to do.
+        """
+        with recorded(self, self.observer) as report:
+            scene = self.reconstruct(views, sparse_model)
+            coarse = self.triangulate(scene)
+            patches = self.decompose(coarse, scene.cameras)
+            seen = self.warp(scene.views, scene.cameras, patches)
+            depths = self.integrate(self.factorize(seen))
+            aligned = self.align(depths)
+            mesh = self.extract(self.refine(aligned))
+        return Reconstruction(
+            mesh=mesh, scene=scene, coarse=coarse, patches=aligned, report=tuple(report)
+        )
+
+
+def load_config(
+    name_or_path: str | Path = "default", changes: Mapping[str, object] | None = None
+) -> PimperConfig:
+    """Read a preset, or a YAML file of one's own, which holds only what differs.
+
+    Args:
+        name_or_path: ``"default"``, ``"paper"``, ``"fast"``, or a file.
+        changes: Laid over the file, nested by stage like it.
+
+    Raises:
+        ConfigError: Names the file, the section and the key, and the nearest valid one.
+    """
+    path = find_config(name_or_path)
+    return build(PimperConfig, overlay(read_mapping(path), changes or {}), str(path))
