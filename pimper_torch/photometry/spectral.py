@@ -34,12 +34,14 @@ def factorize_rank_four(
     for _ in range(FILL_STEPS):
         filled = torch.where(weight > 0, radiance, basis @ (basis.mT @ filled))
         basis = _leading(filled)
-    lights, shading = basis, basis.mT @ filled
+    # A nearly flat patch is of lower rank but for its noise: float32 normal equations would
+    # amplify their own rounding without limit.
+    lights, mask, seen = basis.double(), weight.double(), (weight * radiance).double()
     for _ in range(ALTERNATIONS):
-        shading = _solve(outer(lights.mT) @ weight, lights.mT @ (weight * radiance))
-        packed = (weight @ outer(shading).mT).mT
-        lights = _solve(packed, ((weight * radiance) @ shading.mT).mT).mT
-    return lights, shading
+        shading = _solve(outer(lights.mT) @ mask, lights.mT @ seen)
+        packed = (mask @ outer(shading).mT).mT
+        lights = _solve(packed, (seen @ shading.mT).mT).mT
+    return lights.to(radiance), shading.to(radiance)
 
 
 def upgrade_to_cone(
