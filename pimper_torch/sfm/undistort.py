@@ -8,25 +8,24 @@ from torch.nn.functional import grid_sample
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.progress import track
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of
+from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_pixels
+
+_MOST_ZOOM = 1.25
 
 
 def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tensor, "view 3 3"]]:
     """Resample photographs so that straight lines in space are straight in the image.
 
-    The pinhole keeps the lens's focal length and principal point and the photograph's
-    size: at the image's centre one pixel stays one pixel, and nothing moves there. A lens
-    that pulls the corners in (pincushion) leaves pixels of the pinhole without a source;
-    they become zero and false in the masks. One that bulges (barrel) loses a rim of the
-    photograph instead.
+    The pinholes are those of :func:`pinhole_for`, of the photographs' sizes.
 
     Args:
         views: Any; padding stays zero.
         lenses: One a view, of the photograph's size.
 
     Returns:
-        The views, and ``K`` of each. Masks come to be where something fell outside, and
-        stay ``None`` where nothing did. Radiance is interpolated bilinearly, masks at one
+        The views, and ``K`` of each. A pixel that looks past the photograph's edge is zero
+        and false in the masks, which come to be for that; where there are none and nothing
+        looks past, they stay ``None``. Radiance is interpolated bilinearly, masks at one
         half; differentiable in the radiance. A view without distortion is left untouched.
     """
     images, inside = [], []
@@ -34,7 +33,7 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
         image, valid = _undistort_image(views, index, lenses[index])
         images.append(image)
         inside.append(valid)
-    intrinsics = torch.stack([pinhole_of(lens) for lens in lenses]).to(views.images)
+    intrinsics = torch.stack([pinhole_for(lens) for lens in lenses]).to(views.images)
     valid = torch.stack(inside)
     whole = bool((valid == views.inside).all())
     masks = views.masks
@@ -65,13 +64,39 @@ def _undistort_image(
     return sampled[:-1], sampled[-1] > 0.5
 
 
+def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:
+    """Choose the pinhole that a photograph is undistorted to; ``K`` in float64.
+
+    It keeps the lens's principal point and, for a lens that bulges (barrel), its focal
+    length: a rim of the photograph is lost, the middle keeps its scale. For a lens that
+    pulls the corners out (pincushion) the focal length grows until no pixel looks past the
+    photograph's edge, but never by more than a quarter.
+    """
+    K = pinhole_of(lens)
+    if is_pinhole(lens):
+        return K
+    size = K.new_tensor([lens.width, lens.height])
+    along = torch.linspace(0, 1, 65, dtype=K.dtype)[:, None] * size  # 64 steps: smooth curves
+    zoom = torch.ones(())
+    for axis in range(2):
+        for end in (0.0, float(size[axis])):
+            edge = along.clone()
+            edge[:, axis] = end
+            reach = undistort_pixels(lens, edge)[:, axis].nan_to_num(nan=torch.inf).abs().min()
+            needed = (end - K[axis, 2]).abs() / K[axis, axis]
+            zoom = torch.maximum(zoom, needed / reach.clamp_min(1e-12))
+    zoom = zoom.clamp_max(_MOST_ZOOM)
+    return torch.stack([K[0] * K.new_tensor([zoom, 1, 1]), K[1] * K.new_tensor([1, zoom, 1]), K[2]])
+
+
 def photograph_pixels(lens: Lens) -> Float[Tensor, "height width 2"]:
     """Find where in the photograph each pixel of its pinhole image comes from.
 
     Returns:
         Pixels of the photograph in float64; NaN where the lens cannot image the direction.
     """
-    K = pinhole_of(lens)
+    K = pinhole_for(lens)
     pixels = pixel_centers(lens.width, lens.height, like=K).reshape(-1, 2)
-    rays = torch.cat([(pixels - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(pixels[:, :1])], 1)
+    plane = (pixels - K[:2, 2]) / K.diagonal()[:2]
+    rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
     return distort(lens, rays).reshape(lens.height, lens.width, 2)

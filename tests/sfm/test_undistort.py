@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import distort, undistort_pixels
-from pimper_torch.sfm.undistort import photograph_pixels, undistort
+from pimper_torch.sfm.undistort import photograph_pixels, pinhole_for, undistort
 
 
 def bent(width: int, height: int, strength: float) -> Lens:
@@ -27,7 +27,7 @@ def ramp_views(sizes: list[tuple[int, int]]) -> Views:
     )
 
 
-@pytest.mark.parametrize("strength", [0.3, -0.2])
+@pytest.mark.parametrize("strength", [3.0, 0.3, -0.2])
 def test_a_ramp_of_the_photograph_shows_where_each_pinhole_pixel_came_from(strength):
     sizes = [(50, 40), (36, 44)]
     views = ramp_views(sizes)
@@ -35,27 +35,45 @@ def test_a_ramp_of_the_photograph_shows_where_each_pinhole_pixel_came_from(stren
     undistorted, intrinsics = undistort(views, lenses)
     for index, (w, h) in enumerate(sizes):
         f, cx, cy, k = lenses[index].params
-        assert_close(
-            intrinsics[index],
-            torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64),
-        )
-        x = (pixel_centers(w, h, like=views.images) - torch.tensor([cx, cy])) / f
-        source = f * (1 + k * x.square().sum(-1, keepdim=True)) * x + torch.tensor([cx, cy])
+        center = torch.tensor([cx, cy], dtype=torch.float64)
+        zoom = intrinsics[index, 0, 0] / f
+        assert_close(intrinsics[index, 1, 1] / f, zoom)
+        assert_close(intrinsics[index, :2, 2], center)
+        x = (pixel_centers(w, h, like=views.images) - center) / (zoom * f)
+        source = f * (1 + k * x.square().sum(-1, keepdim=True)) * x + center
         # Half a pixel from the rim the ramp itself ends; interpolation is exact inside.
         size = torch.tensor([w, h])
         exact = ((source >= 0.5) & (source <= size - 0.5)).all(-1)
         outside = ((source < 0) | (source > size)).any(-1)
         assert exact.sum() > 0.6 * w * h
         found = 100 * undistorted.images[index, :, :h, :w].permute(1, 2, 0)
-        assert_close(found[exact], source[exact].double())
+        assert_close(found[exact], source[exact])
         assert (found[outside] == 0).all()
-        if strength > 0:
+        if strength == 3.0:
             assert outside.any()
+            assert zoom == 1.25
             assert (undistorted.masks[index, :h, :w] == ~outside).all()
             assert not undistorted.masks[index, h:].any()
             assert not undistorted.masks[index, :, w:].any()
-    if strength < 0:
+    if strength != 3.0:
         assert undistorted.masks is None
+
+
+def test_a_pinhole_zooms_in_just_enough_to_see_no_edge():
+    lens = bent(50, 40, 0.3)
+    f, cx, cy, k = lens.params
+    K = pinhole_for(lens)
+    assert 1 < K[0, 0] / f < 1.25
+    pixels = pixel_centers(200, 160, like=K) / 4 - torch.tensor([cx, cy])
+
+    def overhang(focal: torch.Tensor) -> torch.Tensor:
+        x = pixels / focal
+        source = f * (1 + k * x.square().sum(-1, keepdim=True)) * x + torch.tensor([cx, cy])
+        return torch.maximum(-source, source - torch.tensor([50, 40])).max()
+
+    assert overhang(K[0, 0]) <= 1e-6  # COLMAP's inverse is iterative
+    assert overhang(0.97 * K[0, 0]) > 0
+    assert pinhole_for(bent(50, 40, -0.2))[0, 0] == f
 
 
 def test_the_padding_of_a_smaller_photograph_never_leaks_in():
