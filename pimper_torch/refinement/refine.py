@@ -8,7 +8,6 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
-from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.linalg.sparse import SparseCholesky
@@ -69,8 +68,8 @@ class Refine(nn.Module):
         The convergence's residual is the root mean square distance between the union and
         the surface, in scene units.
 
-        Raises:
-            ReconstructionError: No patch has valid relief anywhere on the mesh.
+        Where no patch has valid relief anywhere, as under one light for all views, the
+        surface is that of the facets, its seams smoothed, with confidence 0.
         """
         patches = depths.patches
         mesh = patches.coarse.mesh
@@ -79,12 +78,7 @@ class Refine(nn.Module):
         directions = ray_directions(lattice, patches.coarse).detach()
         union = unite(depths, lattice, directions, self.config.outlier_samples)
         if not bool(union.supported.any()):
-            raise ReconstructionError(
-                f"refinement: none of the {len(lattice.points)} vertices of the surface is "
-                "supported by a patch with valid relief, and some must be. Look at the share of "
-                "missing data that the report gives: the masks or the limits on dark, saturated "
-                "and grazing samples may leave nothing."
-            )
+            union = union.replace(supported=torch.ones_like(union.supported))
         points = lattice.points + union.heights[:, None] * directions
         refined = self._solve(lattice, points, union, spacing)
         vertices = refined.to(points)

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import boundary_vertices
 from pimper_torch.refinement.refine import Refine, RefineConfig, vertex_spacing
@@ -176,10 +176,16 @@ def test_gradients_reach_the_depth(builder):
     assert_close(analytic, ((up - down) * probe).sum() / (2 * small), rtol=1e-6, atol=1e-8)
 
 
-def test_relief_that_is_valid_nowhere_is_refused(cap):
+def test_relief_that_is_valid_nowhere_leaves_the_facets_without_confidence(cap):
     nowhere = changed(cap, lambda _, relief: {"valid": torch.zeros_like(relief.valid)})
-    with pytest.raises(ReconstructionError, match="none of the"):
-        Refine()(nowhere)
+    surface = Refine()(nowhere)
+    mesh = nowhere.patches.coarse.mesh
+    flat = subdivide(mesh.vertices_world, mesh.faces, vertex_spacing(nowhere.patches, 1.0))
+    assert surface.vertices_world.shape == flat.points.shape
+    away = (surface.vertices_world - flat.points).norm(dim=1)
+    assert away.max() < 3 * SPACING  # seams are smoothed, nothing else
+    assert away.median() < 0.2 * SPACING
+    assert (surface.confidence == 0).all()
 
 
 @pytest.mark.parametrize(
