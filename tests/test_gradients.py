@@ -42,7 +42,8 @@ def test_gradients_run_from_the_photographs_to_the_vertices_of_the_mesh():
     assert gradient.isfinite().all()
     felt = gradient.abs().amax(dim=(1, 2, 3)) > 0
     assert felt.all()  # every view shapes the surface
-    corners = gradient[:, :, [0, 0, -1, -1], [0, -1, 0, -1]]  # beyond the facets in all views
-    assert corners.abs().max() == 0
+    # A constant factor on all photographs is the albedo's, so the shape does not feel it.
+    along = (gradient * images).sum().abs()
+    assert along < 0.02 * (gradient * images).abs().sum()
     assert mesh.albedo is not None
     assert mesh.albedo.requires_grad
