@@ -18,6 +18,7 @@ from pimper_torch.config import (
     to_yaml,
 )
 from pimper_torch.errors import ConfigError
+from pimper_torch.pipeline import PimperConfig, load_config
 
 
 class Shade(Enum):
@@ -199,3 +200,25 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
     path.write_bytes(b"\xff\xfe\x00a")
     with pytest.raises(ConfigError, match="cannot be read"):
         read_mapping(path)
+
+
+def leaves(mapping, section=""):
+    for key, value in mapping.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{section}{key}.")
+        else:
+            yield f"{section}{key}", value
+
+
+@pytest.mark.parametrize("name", presets())
+def test_a_preset_holds_only_what_differs_from_the_stages_defaults(name):
+    mapping = read_mapping(find_config(name))
+    assert build(PimperConfig, mapping, name) == load_config(name)
+    defaults = dict(leaves(to_mapping(PimperConfig())))
+    assert not [path for path, value in leaves(mapping) if defaults[path] == value]
+
+
+def test_changes_are_laid_over_a_preset():
+    changed = load_config("fast", {"reconstruct": {"seed": 12}})
+    assert changed.reconstruct.seed == 12
+    assert changed.decompose == load_config("fast").decompose
