@@ -73,9 +73,9 @@ class FactorizeConfig:
     start: Literal["mesh", "svd"] = "mesh"
     solver: Literal["balm", "descent"] = "balm"
     light_coupling: float = 1.0
-    geometry_weight: float = 0.05
+    geometry_weight: float = 0.1
     robust: bool = True
-    robust_scale: float = 2.385
+    robust_scale: float = 2.0
     min_views: int = 4
     min_light_variation: float = 0.02
     max_iterations: int = 60
@@ -202,7 +202,7 @@ class Factorize(nn.Module):
             shading = start_from_mesh(gray, rows.seen, anchor, rows.normals)
             lights = anchor
             if config.start == "svd":
-                lights, shading = start_from_data(gray, rows.seen, anchor)
+                lights, shading = start_from_data(gray, rows.seen, anchor, shading)
             if config.light_coupling == 0:
                 anchor = lights
             square = shading[:, 0] ** 2

@@ -30,20 +30,30 @@ def start_from_data(
     radiance: Float[Tensor, "patch view sample"],
     seen: Bool[Tensor, "patch view sample"],
     reference: Float[Tensor, "patch view 4"],
+    fallback: Float[Tensor, "patch 4 sample"],
 ) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
     """Factorize without the mesh, then fix the ambiguity by reference lights.
 
     Singular vectors of the filled data, upgraded to the cone; of all Lorentz transformations
     the one is applied that brings the lights nearest to ``reference``. Normals would be the
     worse reference: those of a mesh are smoother than the true ones, and the transformation
-    that fits them best flattens the relief.
+    that fits them best flattens the relief. A patch whose data is not of rank four, such as
+    one that three views see, starts at ``reference`` and ``fallback``.
     """
     weight = seen.to(radiance.dtype)
     # Samples that fewer than four views see say nothing of the cone.
     told = (weight.sum(dim=1) >= 4).to(radiance.dtype)
     lights, shading = factorize_rank_four(radiance, weight)
     lights, shading = upgrade_to_cone(lights, shading, told)
+    enough = (weight.sum(dim=2) > 0).sum(dim=1) >= 4
+    sound = lights.isfinite().all(dim=(1, 2)) & shading.isfinite().all(dim=(1, 2)) & enough
+    sound = sound[:, None, None]
+    lights, shading = torch.where(sound, lights, reference), torch.where(sound, shading, fallback)
     # L A^-1 = reference, transposed: lights are columns that A^-T moves.
     moves = align_factorizations(lights.mT, reference.mT, weight.sum(dim=2))
     turn = Ambiguity(matrix=moves.matrix.mT).inverse()
-    return turn.on_lights(lights), project_to_cone(turn.on_shading(shading).mT).mT
+    turned_lights, turned = turn.on_lights(lights), turn.on_shading(shading)
+    sound = sound & turned_lights.isfinite().all(dim=(1, 2))[:, None, None]
+    sound = sound & turned.isfinite().all(dim=(1, 2))[:, None, None]
+    start = project_to_cone(torch.where(sound, turned, fallback).mT).mT
+    return torch.where(sound, turned_lights, reference), start

@@ -42,11 +42,22 @@ def test_factors_are_recovered_when_whole_blocks_are_missing(problem):
 
 def test_the_data_alone_are_a_start(problem):
     given, lights, shading = problem(missing=0.3)
-    L, N = start_from_data(given.radiance, given.weight > 0, given.lights)
+    L, N = start_from_data(given.radiance, given.weight > 0, given.lights, given.shading)
     assert (N - shading).abs().median() < 0.05  # lights off by 0.05 fix the ambiguity so well
     assert (L - lights).abs().median() < 0.05
     assert (((L @ N - given.radiance) * given.weight) ** 2).mean().sqrt() < 1e-2
     assert error(N, shading, given.weight) < 0.05
+
+
+def test_patches_that_three_views_see_start_where_they_are_told(problem):
+    given, _, _ = problem(patches=2, samples=40)
+    weight = given.weight.clone()
+    weight[1, 3:] = 0
+    seen, J = weight > 0, weight * given.radiance
+    L, N = start_from_data(J, seen, given.lights, given.shading)
+    assert_close(L[1], given.lights[1])
+    assert_close(N[1], given.shading[1])
+    assert (L[0] - given.lights[0]).abs().max() > 1e-3
 
 
 def test_balm_and_descent_agree_on_clean_data(problem):
