@@ -127,44 +127,58 @@ class Align(nn.Module):
 
         Returns:
             Changed depths with the transforms that changed them, and how far neighbours
-            were apart before and after each round.
+            were apart before and after each round. Where no patch meets a neighbour, what
+            came in.
 
         Raises:
             SingularSystemError: Depths that are not finite.
         """
         config, patches = self.config, depths.patches
         seams = find_seams(patches, config.rows, config.columns, config.reach_samples)
-        unit = seams.edge_lengths.median() if len(seams.facets) else seams.edge_lengths.sum()
+        if len(seams.facets) == 0:
+            return depths
+        unit = seams.edge_lengths.median()
         in_scene = torch.stack([torch.ones_like(unit)] * 3 + [unit])
         # h_0 is in units of the edge length here, so that no term of the system has a unit.
         transforms = unit.new_tensor([0, 0, 1, 0]).expand(patches.num_patches, 4)
+        corners, known = relief_at_corners(patches, depths.buckets)
+        anchors = _with_one(corners / unit), self._corner_weight(depths, known)
         apart = []
         for done in range(config.rounds):
             overlaps = meet_overlaps(seams, patches, depths.buckets, transforms * in_scene)
             if not bool(overlaps.met.any()):
                 return depths
-            pulls = self._pulls(depths, seams, overlaps, unit)
+            pulls = self._pulls(anchors, seams, overlaps, unit)
             apart.append(_root_mean_square(pulls, transforms))
             transforms = self._solve_round(pulls, transforms, fresh=done == 0)
             report(done + 1, config.rounds)
         with torch.no_grad():
             overlaps = meet_overlaps(seams, patches, depths.buckets, transforms * in_scene)
-            pulls = self._pulls(depths, seams, overlaps, unit)
+            pulls = self._pulls(anchors, seams, overlaps, unit)
             mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * unit
         return depths.replace(
             buckets=_apply(depths, transforms * in_scene),
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
         )
 
-    def _pulls(
-        self, depths: DepthPatches, seams: Seams, overlaps: Overlaps, unit: Float[Tensor, ""]
-    ) -> Pulls:
-        corners, known = relief_at_corners(depths.patches, depths.buckets)
+    def _corner_weight(
+        self, depths: DepthPatches, known: Bool[Tensor, "face 3"]
+    ) -> Float[Tensor, "face 3"]:
         coarse = depths.patches.coarse
+        certain = torch.where(coarse.is_point, 1.0, _FILLED_VERTEX)[coarse.mesh.faces]
+        return self.config.anchor * certain.double() * known
+
+    def _pulls(
+        self,
+        anchors: tuple[Float[Tensor, "face 3 4"], Float[Tensor, "face 3"]],
+        seams: Seams,
+        overlaps: Overlaps,
+        unit: Float[Tensor, ""],
+    ) -> Pulls:
+        corners, corner_weight = anchors
         met = overlaps.met.flatten(1)
         touching = seams.facets[met.any(dim=1)]
-        moves = torch.zeros_like(known[:, 0]).index_fill(0, touching.reshape(-1), value=True)
-        certain = torch.where(coarse.is_point, 1.0, _FILLED_VERTEX)[coarse.mesh.faces]
+        moves = torch.zeros_like(corner_weight).index_fill(0, touching.reshape(-1), 1)
         prior = torch.full_like(corners[0, :1, 0], self.config.prior).expand(4).clone()
         if not self.config.offset:
             prior[3] = torch.inf
@@ -176,8 +190,8 @@ class Align(nn.Module):
             gap=(overlaps.feet[:, 0] - overlaps.feet[:, 1]).flatten(1, 2) / unit,
             weight=met.to(corners) / count[:, None],
             curvature=curvature_along(overlaps.samples[..., 2], overlaps.met, seams.edge_lengths),
-            corners=_with_one(corners / unit),
-            corner_weight=self.config.anchor * certain.to(corners) * known * moves[:, None],
+            corners=corners,
+            corner_weight=corner_weight * moves,
             prior_weight=prior,
         )
 

@@ -125,9 +125,9 @@ def relief_at_corners(
         vertices = coarse.mesh.vertices_world[coarse.mesh.faces[templates.facet]].double()
         corners = transform(templates.patch_from_world.double(), vertices)[..., :2]
         place = templates.origin.double(), templates.spacing.double()
-        raster = torch.stack([depths.depth, depths.valid.to(depths.depth)], dim=1).double()
-        height = sample_raster(raster[:, :1], corners, *place, valid=depths.valid)
-        support = sample_raster(raster[:, 1:], corners, *place)[:, 0]
+        height = sample_raster(depths.depth[:, None], corners, *place, valid=depths.valid)
+        valid = depths.valid[:, None].to(depths.depth)
+        support = sample_raster(valid, corners, *place)[:, 0]
         samples.append(torch.cat([corners, height.mT], dim=-1))
         known.append(support > 0.5)
         facets.append(templates.facet)
@@ -151,20 +151,34 @@ def _meet_bucket(
     directions_world = seams.directions[seam][:, :, None].expand_as(origins_world)
     origins = transform(patch_from_world, origins_world.flatten(1, 2))
     directions = rotate(patch_from_world, directions_world.flatten(1, 2))
-    place = templates.origin.double(), templates.spacing.double()
-    relief = depths.depth.double()
-    now = transformed(templates.points_patch.double(), relief, transforms)
-    points, hit = intersect_relief(now, depths.valid, *place, origins, directions)
-
-    xy = points[..., :2]
-    height = sample_raster(relief[:, None], xy, *place, valid=depths.valid)[:, 0]
-    feet = torch.cat([xy, torch.zeros_like(xy[..., :1])], dim=-1)
-    rays = origins_world.shape[2]
-    met = hit.reshape(count, 3, rays) & (own >= 0)[..., None]
+    # A ray meets the transformed relief where the ray transformed back meets the relief.
+    points, hit = intersect_relief(
+        depths.depth,
+        depths.valid,
+        templates.origin.double(),
+        templates.spacing.double(),
+        *_transformed_back(origins, directions, transforms),
+    )
+    feet = torch.cat([points[..., :2], torch.zeros_like(points[..., :1])], dim=-1)
+    shape = (count, 3, origins_world.shape[2])
     return (
-        torch.cat([xy, height[..., None]], dim=-1).reshape(count, 3, rays, 3),
-        transform(invert_rigid(patch_from_world), feet).reshape(count, 3, rays, 3),
-        met,
+        points.reshape(*shape, 3),
+        transform(invert_rigid(patch_from_world), feet).reshape(*shape, 3),
+        hit.reshape(shape) & (own >= 0)[..., None],
+    )
+
+
+def _transformed_back(
+    origins: Float[Tensor, "patch ray 3"],
+    directions: Float[Tensor, "patch ray 3"],
+    transforms: Float[Tensor, "patch 4"],
+) -> tuple[Float[Tensor, "patch ray 3"], Float[Tensor, "patch ray 3"]]:
+    hx, hy, hz, h0 = transforms[:, :, None].unbind(dim=1)
+    height = origins[..., 2] - hx * origins[..., 0] - hy * origins[..., 1] - h0
+    sinking = directions[..., 2] - hx * directions[..., 0] - hy * directions[..., 1]
+    return (
+        torch.cat([origins[..., :2], (height / hz)[..., None]], dim=-1),
+        torch.cat([directions[..., :2], (sinking / hz)[..., None]], dim=-1),
     )
 
 

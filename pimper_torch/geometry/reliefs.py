@@ -78,7 +78,8 @@ def intersect_relief(
         valid: True where there is a relief.
         origin: x and y of the first sample.
         spacing: Between samples.
-        ray_origins: Patch frame; any point of the ray.
+        ray_origins: Patch frame; any point of the ray. Their dtype is that of the answer:
+            float64 rays meet a float32 relief in float64.
         ray_directions: Any length and sign; the ray is the whole line.
         steps: Newton's steps.
 
@@ -91,22 +92,23 @@ def intersect_relief(
     function: only the last step carries gradients, with its slope held, which is exact once
     the steps before it have converged.
     """
-    known = torch.where(valid, depth, 0)
     normal_enough = 1e-3 * ray_directions.norm(dim=-1)
     toward_plane = _away_from_zero(ray_directions[..., 2], normal_enough)
     distance = -ray_origins[..., 2] / toward_plane
     with torch.no_grad():
         for _ in range(steps - 1):
-            gap, rate = _gap(known, valid, origin, spacing, ray_origins, ray_directions, distance)
+            gap, rate = _gap(depth, valid, origin, spacing, ray_origins, ray_directions, distance)
             distance = distance - gap / _away_from_zero(rate, normal_enough)
     distance = distance.detach()
-    gap, rate = _gap(known, valid, origin, spacing, ray_origins, ray_directions, distance)
+    gap, rate = _gap(depth, valid, origin, spacing, ray_origins, ray_directions, distance)
     distance = distance - gap / _away_from_zero(rate.detach(), normal_enough)
     points = ray_origins + distance[..., None] * ray_directions
 
     with torch.no_grad():
-        gap, rate = _gap(known, valid, origin, spacing, ray_origins, ray_directions, distance)
-        supported = sample_raster(valid[:, None].to(depth), points[..., :2], origin, spacing)[:, 0]
+        gap, rate = _gap(depth, valid, origin, spacing, ray_origins, ray_directions, distance)
+        neighbours, across, down = _cell(points[..., :2], origin, spacing, depth.shape[-2:])
+        known = _gather(valid[:, None], neighbours)[:, 0]
+        supported = (_bilinear_weights(across, down) * known).sum(dim=-1)
         hit = (
             (supported >= 1 - _NEGLIGIBLE_WEIGHT)
             & _within(points[..., :2], origin, spacing, depth.shape[-2:])
@@ -128,11 +130,11 @@ def _gap(
     """Give the ray's height over the relief along z, and its derivative along the ray."""
     points = ray_origins + distance[..., None] * ray_directions
     neighbours, across, down = _cell(points[..., :2], origin, spacing, depth.shape[-2:])
-    corners = _gather(depth[:, None], neighbours)[:, 0]
     known = _gather(valid[:, None], neighbours)[:, 0]
+    corners = torch.where(known, _gather(depth[:, None], neighbours)[:, 0].to(across), 0)
     # A half-known cell continues its known corners level: rays that pass over the rim of
     # the relief on their way are not thrown off by what lies beyond it.
-    level = (corners * known).sum(dim=-1) / known.sum(dim=-1).clamp_min(1)
+    level = corners.sum(dim=-1) / known.sum(dim=-1).clamp_min(1)
     corners = torch.where(known, corners, level[..., None])
     height = (corners * _bilinear_weights(across, down)).sum(dim=-1)
     top_left, top_right, low_left, low_right = corners.unbind(dim=-1)

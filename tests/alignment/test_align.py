@@ -178,6 +178,18 @@ def test_patches_that_meet_nobody_are_handed_back(sphere):
     assert Align()(alone) is alone
 
 
+def test_a_single_facet_is_handed_back(facets_over, reliefs):
+    patches = facets_over(lambda x, y: 0 * x, side=2)
+    mesh = patches.coarse.mesh
+    first = patches.buckets[0]
+    lone = patches.replace(
+        coarse=patches.coarse.replace(mesh=mesh.replace(faces=mesh.faces[first.facet[:1]])),
+        buckets=(_one_template(first),),
+    )
+    depths = reliefs(lone, lambda points, _: 0.1 * points[..., 0] ** 2)
+    assert Align()(depths) is depths
+
+
 def test_a_step_in_one_patch_is_left_standing_instead_of_tilting_it(sphere):
     facet = 0
     bucket = next(i for i, t in enumerate(sphere.patches.buckets) if facet in t.facet)
@@ -246,6 +258,18 @@ def test_gradients_run_from_depths_to_aligned_depths(
 def test_impossible_settings_are_refused(setting):
     with pytest.raises(ConfigError, match=next(iter(setting))):
         AlignConfig(**setting)
+
+
+def _one_template(templates):
+    return templates.replace(
+        facet=torch.tensor([0]),
+        patch_from_world=templates.patch_from_world[:1],
+        origin=templates.origin[:1],
+        spacing=templates.spacing[:1],
+        depth=templates.depth[:1],
+        barycentric=templates.barycentric[:1],
+        inside=templates.inside[:1],
+    )
 
 
 def _but_first(depths):
