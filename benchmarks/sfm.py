@@ -52,19 +52,19 @@ def variants() -> dict[str, ReconstructConfig]:
     change = dataclasses.replace
     ours = ReconstructConfig()
     return {
-        "COLMAP's defaults": COLMAP,
+        "COLMAP's": COLMAP,
         "contrast 0.002": change(COLMAP, peak_threshold=0.002),
         "contrast 0.001": change(COLMAP, peak_threshold=0.001),
-        "edge 20": change(COLMAP, edge_threshold=20.0),
-        "ratio 0.9": change(COLMAP, max_ratio=0.9),
         "guided": change(COLMAP, guided_matching=True),
-        "affine, 0.002": change(COLMAP, peak_threshold=0.002, affine_shape=True),
-        "DSP, 0.002": change(COLMAP, peak_threshold=0.002, domain_size_pooling=True),
-        "guided, 0.002": change(COLMAP, peak_threshold=0.002, guided_matching=True),
-        "affine, guided, 0.002": change(ours, max_error_px=4.0, starts=1),
-        "affine, guided, 0.002, 2 px": change(ours, starts=1),
-        "**ours**: the same, 3 starts": ours,
-        "ours and DSP": change(ours, domain_size_pooling=True),
+        "0.002, affine": change(COLMAP, peak_threshold=0.002, affine_shape=True),
+        "0.002, DSP": change(COLMAP, peak_threshold=0.002, domain_size_pooling=True),
+        "0.002, affine, guided": change(ours, max_error_px=4.0, starts=1),
+        "0.002, affine, guided, 2 px": change(ours, starts=1),
+        "ours: the same, 3 starts": ours,
+        "ours, edge 20": change(ours, edge_threshold=20.0),
+        "ours, ratio 0.9": change(ours, max_ratio=0.9),
+        "ours, DSP": change(ours, domain_size_pooling=True),
+        "ours, 1 px": change(ours, max_error_px=1.0),
     }
 
 

@@ -4,6 +4,7 @@ pycolmap is loaded when a function needs it, so that importing this package stay
 Photographs go by their number here: the file ``000007.png`` is view 7.
 """
 
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -46,9 +47,18 @@ class MatchSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapSettings:
-    """How views are added to a model."""
+    """How views are added to a model.
+
+    Attributes:
+        min_inliers: Points of the model that a new view must see.
+        pairs_count: Points that only two views see take part, too: they tie views with
+            little overlap, less exactly.
+        seed: Of everything random.
+        threads: -1 for all cores.
+    """
 
     min_inliers: int
+    pairs_count: bool
     seed: int
     threads: int
 
@@ -193,9 +203,8 @@ def map_views(database: Path, images: Path, settings: MapSettings) -> list[Spars
     options.num_threads = settings.threads
     options.random_seed = settings.seed
     options.mapper.abs_pose_min_num_inliers = settings.min_inliers
-    output = database.parent / f"models_{settings.seed}"
-    output.mkdir()
-    with _quiet():
+    options.triangulation.ignore_two_view_tracks = not settings.pairs_count
+    with tempfile.TemporaryDirectory(dir=database.parent) as output, _quiet():
         found = pycolmap.incremental_mapping(database, images, output, options)
     models = [_model_of(reconstruction) for reconstruction in found.values()]
     return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))

@@ -45,7 +45,9 @@ class ReconstructConfig:
         min_matches: Verified matches below which a pair of photographs does not count.
         min_registration_points: Points of the model that a view must see to be added, and
             to stay in it.
-        starts: Runs of the mapper, each with other random numbers; the best is kept.
+        starts: Runs of the mapper, each with other random numbers; the one that registers
+            most views, then finds most points, is kept. Where it leaves views out, one more
+            run also counts points that only two views see.
         min_share: Of the photographs that the largest component must hold when the model
             splits.
         threads: 0 for all cores. With 1 the result is the same bit for bit.
@@ -159,7 +161,7 @@ class Reconstruct(nn.Module):
             place = Path(folder)
             files = self._find_features(views, place)
             self._match(place)
-            models = self._map(place)
+            models = self._map(place, views.num_views)
         names = dict(zip(files, views.names, strict=True))
         models = [
             model.replace(names=tuple(names[file] for file in model.names)) for model in models
@@ -213,23 +215,33 @@ class Reconstruct(nn.Module):
         )
         colmap.match_features(place / "database.db", settings)
 
-    def _map(self, place: Path) -> list[SparseModel]:
+    def _map(self, place: Path, num_views: int) -> list[SparseModel]:
+        runs = [
+            self._map_once(place, start, pairs=False) for start in track(range(self.config.starts))
+        ]
+        best = max(runs, key=_most)
+        if _most(best)[0] < num_views:
+            # Points of two views make poses less exact where all views register without them:
+            # median error 0.19 instead of 0.13 degrees on 24 photographs of a skull.
+            tied = self._map_once(place, 0, pairs=True)
+            best = tied if _most(tied)[0] > _most(best)[0] else best
+        return best
+
+    def _map_once(self, place: Path, start: int, *, pairs: bool) -> list[SparseModel]:
         config = self.config
-        runs = []
-        for start in track(range(config.starts)):
-            settings = colmap.MapSettings(
-                min_inliers=config.min_registration_points,
-                seed=config.seed + start,
-                threads=config.threads or -1,
-            )
-            found = colmap.map_views(place / "database.db", place / "images", settings)
-            fewest = config.min_registration_points
-            runs.append([drop_weak_views(model, fewest) for model in found])
-        return max(runs, key=lambda models: max(map(_worth, models), default=(0, 0)))
+        settings = colmap.MapSettings(
+            min_inliers=config.min_registration_points,
+            pairs_count=pairs,
+            seed=config.seed + start,
+            threads=config.threads or -1,
+        )
+        found = colmap.map_views(place / "database.db", place / "images", settings)
+        return [drop_weak_views(model, config.min_registration_points) for model in found]
 
 
-def _worth(model: SparseModel) -> tuple[int, int]:
-    return model.num_views, len(model.points_world)
+def _most(models: Sequence[SparseModel]) -> tuple[int, int]:
+    sizes = [(model.num_views, len(model.points_world)) for model in models]
+    return max(sizes, default=(0, 0))
 
 
 def _follow_resize(model: SparseModel, views: Views) -> SparseModel:
