@@ -71,6 +71,7 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
             )
         axes.set_title(panel.title, fontsize=11)
         axes.set_axis_off()
+        axes.set_anchor("N")
     figure.tight_layout(pad=0.6)
     figure.savefig(path, dpi=100, facecolor="white")
 

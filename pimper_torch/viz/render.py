@@ -14,15 +14,16 @@ from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.visibility import cast_view
 from pimper_torch.records import Cameras, Mesh
 
-# A lamp behind the viewer, up on the left: relief reads best that way.
-_TO_LIGHT_CAM = (-0.45, -0.55, -0.70)
-_AMBIENT = 0.12
+# Raking light from up on the left shows relief; a weaker one beside the viewer keeps the far
+# side from drowning.
+_LAMPS_CAM = ((0.62, (-0.60, -0.60, -0.53)), (0.26, (0.0, 0.0, -1.0)))
+_AMBIENT = 0.04
 _INSIDE = (0.55, 0.62, 0.75)  # tint of faces seen from behind
 _OVERSAMPLING = 2
 
 
 def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "height width 3"]:
-    """Draw a mesh as grey matte stuff under one lamp.
+    """Draw a mesh as grey matte stuff under a raking lamp.
 
     Its own shape is shaded, never the normals that it carries: relief that is seen is there.
     Faces seen from behind are bluish. A constant to autograd.
@@ -51,13 +52,15 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     faces_cam = rotate(fine.cam_from_world[0], per_face[hits.face.clamp_min(0)])
     from_behind = (faces_cam * _towards(fine)).sum(dim=-1) > 0
     normals_cam = torch.where(from_behind[..., None], -normals_cam, normals_cam)
-    lamp = normalize(normals_cam.new_tensor(_TO_LIGHT_CAM), dim=0)
-    light = _AMBIENT + (1 - _AMBIENT) * (normals_cam @ lamp).clamp_min(0)
+    light = torch.full_like(normals_cam[..., 0], _AMBIENT)
+    for strength, direction in _LAMPS_CAM:
+        lamp = normalize(normals_cam.new_tensor(direction), dim=0)
+        light = light + strength * (normals_cam @ lamp).clamp_min(0)
     tint = torch.where(from_behind[..., None], light.new_tensor(_INSIDE), 1.0)
     radiance = torch.where(seen[..., None], light[..., None] * tint, 1.0)
     radiance = avg_pool2d(radiance.movedim(-1, 0)[None], _OVERSAMPLING)[0].movedim(0, -1)
-    # Half way to a display's curve: steeper tones show more relief.
-    return radiance.clamp(0, 1) ** (1 / 1.5)
+    # Well short of a display's curve: steeper tones show more relief.
+    return radiance.clamp(0, 1) ** (1 / 1.3)
 
 
 def turn(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
