@@ -59,6 +59,35 @@ def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[T
     return cosine >= torch.deg2rad(cosine.new_tensor(max_angle_deg)).cos()
 
 
+def behind_others(
+    pixels: Float[Tensor, "point 2"],
+    points_cam: Float[Tensor, "point 3"],
+    *,
+    neighbours: int,
+    slope: float,
+) -> Bool[Tensor, " point"]:
+    """Mark points that a nearer layer surrounds in the image, so that it must hide them.
+
+    Another view may see past the contour of what is in front, and tracks now and then hold
+    a false match in the very view that cannot see the point. Of the nearest points in the
+    image those count that are nearer to the camera by more than ``slope`` times their
+    lateral distance; if three or more leave no open half-plane, the point is hidden. Where
+    a point is just beside a contour, or on a steep rim, they are all on one side.
+    """
+    nearest = nearest_in_image(pixels, neighbours)
+    steps = points_cam[nearest] - points_cam[:, None]
+    front = (steps[..., 2] < 0) & (_steepness(points_cam, nearest) > slope)
+    count = front.sum(dim=1)
+    aside = pixels[nearest] - pixels[:, None]
+    angle = torch.atan2(aside[..., 1], aside[..., 0])
+    ordered = torch.where(front, angle, torch.inf).sort(dim=1).values
+    gaps = torch.diff(ordered, dim=1)
+    widest = torch.where(gaps.isfinite(), gaps, 0).amax(dim=1)
+    last = ordered.gather(1, (count - 1).clamp_min(0)[:, None])[:, 0]
+    widest = torch.maximum(widest, ordered[:, 0] + 2 * torch.pi - last)
+    return (count >= 3) & (widest < torch.pi)
+
+
 def neighbours_agree(
     pixels: Float[Tensor, "point 2"],
     points_cam: Float[Tensor, "point 3"],
@@ -150,8 +179,13 @@ def spread_to_number(
     """Choose about ``number`` well-spread points by bisecting their distance."""
     if number >= len(pixels):
         return torch.arange(len(pixels), device=pixels.device)
-    low, high = 0.0, float((pixels.amax(dim=0) - pixels.amin(dim=0)).norm())
+    extent = pixels.amax(dim=0) - pixels.amin(dim=0)
+    # Not from the whole image's size down: with such a distance all points are neighbours.
+    low, high = 0.0, float(torch.maximum((extent.prod() / number).sqrt(), extent.norm() / number))
     chosen = spread(pixels, quality, high)
+    while len(chosen) > number:
+        low, high = high, 2 * high
+        chosen = spread(pixels, quality, high)
     for _ in range(20):
         middle = (low + high) / 2
         chosen = spread(pixels, quality, middle)

@@ -9,6 +9,7 @@ from torch.nn.functional import grid_sample, normalize
 
 from pimper_torch.coarse.fill import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.coarse.select import (
+    behind_others,
     frontal_view,
     named_view,
     neighbours_agree,
@@ -49,6 +50,8 @@ class TriangulateConfig:
         max_reprojection_px: Mean reprojection error a point may have.
         min_angle_deg: Widest angle between rays a point must have.
         neighbours: Points around a point that must agree with it.
+        hiding_slope: Points all round that are nearer to the reference by more than this
+            times their lateral distance hide a point.
         max_slope: Depth over lateral distance between agreeing points.
         max_deviation: From the plane of the neighbours, in radii of the neighbourhood.
         max_isolation: Times further from its neighbours than they from theirs that a point
@@ -74,6 +77,7 @@ class TriangulateConfig:
     max_reprojection_px: float = 1.5
     min_angle_deg: float = 4.0
     neighbours: int = 12
+    hiding_slope: float = 3.0
     max_slope: float = 6.0
     max_deviation: float = 0.5
     max_isolation: float = 3.0
@@ -90,6 +94,7 @@ class TriangulateConfig:
         require(self.min_track_length >= 2, "min_track_length", self.min_track_length, "2 or more")
         require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
         require(self.neighbours >= 3, "neighbours", self.neighbours, "3 or more")
+        require(self.hiding_slope > 0, "hiding_slope", self.hiding_slope, "above 0")
         require(0 <= self.min_coverage <= 1, "min_coverage", self.min_coverage, "in [0, 1]")
         require(self.fill_smoothing >= 0, "fill_smoothing", self.fill_smoothing, "0 or more")
 
@@ -171,6 +176,15 @@ class Triangulate(nn.Module):
         }
         keep = torch.stack(list(tests.values())).all(dim=0)
         index = keep.nonzero()[:, 0]
+        for _ in range(2):  # a second look, without those that seemed to be in between
+            if len(index) >= 4:
+                hidden = behind_others(
+                    pixels[index],
+                    transform(cameras.cam_from_world[reference], scene.points_world[index]),
+                    neighbours=min(2 * config.neighbours, len(index) - 1),
+                    slope=config.hiding_slope,
+                )
+                index = index[~hidden]
         if len(index) >= 4:
             points_cam = transform(cameras.cam_from_world[reference], scene.points_world[index])
             agree = neighbours_agree(

@@ -3,6 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.coarse.select import (
+    behind_others,
     frontal_view,
     named_view,
     neighbours_agree,
@@ -73,6 +74,29 @@ def test_neighbours_across_a_depth_edge_agree_each_with_its_own_side():
     points_cam = torch.cat([lateral, depth[:, None]], dim=1)
     agree = neighbours_agree(lateral, points_cam, neighbours=8, max_slope=3.0, max_deviation=0.5)
     assert agree.float().mean() > 0.95
+
+
+def test_points_behind_a_layer_are_hidden_and_those_beside_its_contour_are_not():
+    # A disc of radius 1 at depth 4 in front of a wall at depth 7 that ran through behind it.
+    generator = torch.Generator().manual_seed(212)
+    lateral = 4 * torch.rand(1500, 2, generator=generator, dtype=torch.float64) - 2
+    radius = lateral.norm(dim=1)
+    on_wall = (radius > 1) | (torch.rand(1500, generator=generator) < 0.3)
+    depth = torch.where(on_wall, 7.0, 4.0).double()
+    points_cam = torch.cat([lateral, depth[:, None]], dim=1)
+    found = behind_others(lateral, points_cam, neighbours=24, slope=3.0)
+    assert found[on_wall & (radius < 0.85)].float().mean() > 0.95
+    assert not found[~on_wall].any()
+    assert not found[on_wall & (radius > 1.02)].any()
+
+
+def test_no_point_of_a_steep_dome_is_hidden():
+    generator = torch.Generator().manual_seed(213)
+    lateral = 2 * torch.rand(2000, 2, generator=generator, dtype=torch.float64) - 1
+    lateral = lateral[lateral.norm(dim=1) < 0.999]
+    depth = 5 - (1 - lateral.square().sum(dim=1)).sqrt()
+    points_cam = torch.cat([lateral, depth[:, None]], dim=1)
+    assert not behind_others(lateral, points_cam, neighbours=24, slope=3.0).any()
 
 
 def test_spread_keeps_its_distance_and_prefers_quality():
