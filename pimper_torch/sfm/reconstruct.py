@@ -198,7 +198,7 @@ class Reconstruct(nn.Module):
         known = {
             file: float(focal)
             for file, focal in zip(files, views.focals_px, strict=True)
-            if torch.isfinite(focal)
+            if torch.isfinite(focal) and focal > 0
         }
         colmap.set_focals(database, known)
         return files
@@ -247,6 +247,8 @@ def _most(models: Sequence[SparseModel]) -> tuple[int, int]:
 def _follow_resize(model: SparseModel, views: Views) -> SparseModel:
     sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
     lenses, scales = [], []
+    cameras: dict[tuple[int, int, int], int] = {}
+    fresh = 1 + max(lens.camera for lens in model.lenses)
     for name, lens in zip(model.names, model.lenses, strict=True):
         width, height = sizes[name]
         scale = width / lens.width, height / lens.height
@@ -257,7 +259,13 @@ def _follow_resize(model: SparseModel, views: Views) -> SparseModel:
                 f"{lens.width}x{lens.height}, which is another shape. Give the photographs the "
                 "model was made from, resized if you like, but neither cropped nor turned."
             )
-        lenses.append(colmap.rescale_lens(lens, width, height))
+        # Photographs of one camera that were resized differently no longer share it; the
+        # first of them keep its number.
+        known = {number for number, *_ in cameras}
+        if lens.camera not in known:
+            cameras[lens.camera, width, height] = lens.camera
+        camera = cameras.setdefault((lens.camera, width, height), fresh + len(cameras))
+        lenses.append(colmap.rescale_lens(lens, width, height).replace(camera=camera))
         scales.append(scale)
     factors = torch.tensor(scales, dtype=torch.float64)
     return model.replace(
@@ -278,7 +286,7 @@ def _require_one_size(views: Views) -> None:
         )
         raise InputError(
             f"One shared camera was asked for, but the photographs have {len(groups)} sizes "
-            f"({found}). Give each its own camera with `--no-reconstruct.shared-camera` "
+            f"({found}). Give each its own camera with `--reconstruct.no-shared-camera` "
             "(`shared_camera: false` in YAML), or photographs of one size."
         )
 
