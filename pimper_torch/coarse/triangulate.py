@@ -83,7 +83,7 @@ class TriangulateConfig:
     max_isolation: float = 3.0
     max_tilt_deg: float = 80.0
     max_stretch: float = 3.0
-    min_altitude: float = 0.15
+    min_altitude: float = 0.08
     min_coverage: float = 0.6
     dark_level: float = 0.01
     smoothing_rounds: int = 1

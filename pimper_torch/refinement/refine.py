@@ -34,7 +34,7 @@ class RefineConfig:
     """
 
     samples_per_vertex: float = 1.0
-    smoothing_radius_samples: float = 2.0
+    smoothing_radius_samples: float = 1.0
     hold_planes: bool = True
     outlier_samples: float = 4.0
 

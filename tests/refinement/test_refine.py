@@ -102,7 +102,7 @@ def test_steps_at_seams_are_smoothed_and_the_middle_of_facets_is_kept(builder):
     step = 3 * SPACING
     stepped = shifted(depths, [0, 2, 4], step)
     lattice, _, points = united(stepped)
-    surface = Refine()(stepped)
+    surface = Refine(RefineConfig(smoothing_radius_samples=2.0))(stepped)
     edges = torch.unique(
         lattice.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values, dim=0
     )
