@@ -59,11 +59,17 @@ class Extract(nn.Module):
     def forward(self, surface: Surface) -> Mesh:
         """Extract the mesh.
 
+        A surface without confidence anywhere, as under one light for all views, is kept
+        whole.
+
         Raises:
             ReconstructionError: Nothing is left.
         """
         vertices = surface.vertices_world.detach()
-        supported = surface.confidence.detach() > self.config.min_confidence
+        confidence = surface.confidence.detach()
+        supported = confidence > self.config.min_confidence
+        if not bool((confidence > 0).any()):  # nowhere better than elsewhere
+            supported = supported.new_ones(supported.shape)
         filled = small_holes(vertices, surface.faces, supported, self.config.max_hole)
         keep = (supported | filled)[surface.faces].all(dim=1)
         with_support = int(keep.sum())

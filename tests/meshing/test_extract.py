@@ -145,9 +145,16 @@ def test_normals_come_out_unit_and_faces_outward():
     assert ((mesh.normals_world[mesh.faces[:, 0]] * own).sum(-1) > 0).all()
 
 
-def test_a_surface_without_support_is_refused():
+def test_a_surface_without_confidence_anywhere_is_kept_whole():
+    surface = sheet(confidence=torch.zeros(SIDE**2).double())
+    assert len(Extract()(surface).faces) == len(surface.faces)
+
+
+def test_a_surface_without_enough_support_is_refused():
     with pytest.raises(ReconstructionError, match="0 have support"):
-        Extract()(sheet(confidence=torch.zeros(SIDE**2).double()))
+        Extract(ExtractConfig(min_confidence=0.5))(
+            sheet(confidence=torch.full((SIDE**2,), 0.1).double())
+        )
 
 
 @pytest.mark.parametrize(
