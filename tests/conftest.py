@@ -1,4 +1,5 @@
 import pytest
+import torch
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -128,3 +129,5 @@ def reconstruction():
             StageReport(name="extract", seconds=0.5, peak_memory_mb=310.0, figures={}),
         ),
     )
+    # Test scenes are tiny: threads would wait for one another longer than they compute.
+    torch.set_num_threads(1)
