@@ -18,7 +18,10 @@ Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 _MARGIN = 0.05
 _TURN_DEG = 40.0
 _DIMMED = 0.45
-_ACROSS, _DOWN = 4, 2
+_ACROSS = 4
+# Inches of the sheet: width of a panel, room round it, heights of its title and of the sheet's.
+_PANEL_IN, _GAP_IN, _TITLE_IN, _HEADLINE_IN = 3.9, 0.1, 0.35, 0.4
+_TALLEST = 1.6  # a panel that is higher for its width is shown narrower
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,12 +58,12 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
     from matplotlib.figure import Figure
 
     shown = panels(result, panel_px)
-    tallest = max(panel.picture.shape[0] / panel.picture.shape[1] for panel in shown)
-    figure = Figure(figsize=(16, _DOWN * (4 * min(tallest, 1.6) + 0.4) + 0.4))
+    boxes, size = _boxes(shown)
+    figure = Figure(figsize=size)
     FigureCanvasAgg(figure)
-    figure.suptitle(headline(result), fontsize=13)
-    for place, panel in enumerate(shown, start=1):
-        axes = figure.add_subplot(_DOWN, _ACROSS, place)
+    figure.suptitle(headline(result), fontsize=13, y=1 - 0.25 * _HEADLINE_IN / size[1])
+    for panel, box in zip(shown, boxes, strict=True):
+        axes = figure.add_axes(box)
         height, width = panel.picture.shape[:2]
         axes.imshow(panel.picture, extent=(0, width, height, 0), interpolation="antialiased")
         if panel.lines is not None:
@@ -72,8 +75,31 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
         axes.set_title(panel.title, fontsize=11)
         axes.set_axis_off()
         axes.set_anchor("N")
-    figure.tight_layout(pad=0.6)
     figure.savefig(path, dpi=100, facecolor="white")
+
+
+def _boxes(
+    shown: list[Panel],
+) -> tuple[list[tuple[float, float, float, float]], tuple[float, float]]:
+    """Lay panels out in rows as high as their highest.
+
+    Returns:
+        Left, bottom, width and height of every panel as shares of the sheet, and the
+        sheet's width and height in inches.
+    """
+    ratios = [min(panel.picture.shape[0] / panel.picture.shape[1], _TALLEST) for panel in shown]
+    rows = [ratios[first : first + _ACROSS] for first in range(0, len(ratios), _ACROSS)]
+    heights = [_PANEL_IN * max(row) for row in rows]
+    width = _ACROSS * (_PANEL_IN + _GAP_IN)
+    height = _HEADLINE_IN + sum(heights) + len(rows) * (_TITLE_IN + _GAP_IN)
+    boxes, bottom = [], height - _HEADLINE_IN
+    for row, tall in zip(rows, heights, strict=True):
+        bottom -= _TITLE_IN + tall
+        for column in range(len(row)):
+            left = _GAP_IN / 2 + column * (_PANEL_IN + _GAP_IN)
+            boxes.append((left / width, bottom / height, _PANEL_IN / width, tall / height))
+        bottom -= _GAP_IN
+    return boxes, (width, height)
 
 
 def panels(result: Reconstruction, panel_px: int) -> list[Panel]:

@@ -1,7 +1,9 @@
+import itertools
+
 import numpy as np
 from PIL import Image
 
-from pimper_torch.viz.overview import draw_overview, headline, panels
+from pimper_torch.viz.overview import Panel, _boxes, draw_overview, headline, panels
 
 
 def test_the_sheet_is_drawn(reconstruction, tmp_path):
@@ -44,3 +46,19 @@ def test_gradients_do_not_hinder_drawing(reconstruction, tmp_path):
 
 def test_the_headline_counts(reconstruction):
     assert headline(reconstruction) == "3 of 4 photographs, 2 facets, 225 vertices, 2 s"
+
+
+def test_panels_lie_on_the_sheet_without_touching():
+    shapes = [(90, 30), (20, 60), (40, 40), (50, 40), (30, 90)]
+    shown = [Panel(title="", picture=np.zeros((*shape, 3), np.float32)) for shape in shapes]
+    boxes, _ = _boxes(shown)
+    assert len(boxes) == 5
+    for left, bottom, width, height in boxes:
+        assert 0 <= left < left + width <= 1
+        assert 0 <= bottom < bottom + height <= 1
+    rows = {bottom: bottom + height for _, bottom, _, height in boxes}
+    (lower, lower_top), (upper, _) = sorted(rows.items())
+    assert lower_top < upper
+    assert lower >= 0
+    columns = sorted((left, left + width) for left, _, width, _ in boxes[:4])
+    assert all(right < left for (_, right), (left, _) in itertools.pairwise(columns))
