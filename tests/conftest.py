@@ -6,12 +6,13 @@ def pytest_configure(config: pytest.Config) -> None:
     # Not in pyproject.toml: pytest would import the package to resolve the category before
     # jaxtyping's hook is in place.
     config.addinivalue_line("filterwarnings", "error::pimper_torch.errors.PimperWarning")
+    # Test scenes are tiny: threads would wait for one another longer than they compute.
+    torch.set_num_threads(1)
 
 
 @pytest.fixture
 def reconstruction():
     """A bump on a square seen by three cameras: a small, complete result."""
-    import torch
     from torch.nn.functional import normalize
 
     from pimper_torch.geometry.frames import rigid
@@ -129,5 +130,3 @@ def reconstruction():
             StageReport(name="extract", seconds=0.5, peak_memory_mb=310.0, figures={}),
         ),
     )
-    # Test scenes are tiny: threads would wait for one another longer than they compute.
-    torch.set_num_threads(1)
