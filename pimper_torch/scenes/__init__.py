@@ -1,7 +1,7 @@
 """Scenes with known truth."""
 
 from pimper_torch.scenes.compositions import potato_on_table
-from pimper_torch.scenes.photographs import save_photographs
+from pimper_torch.scenes.photographs import save_masks, save_photographs
 from pimper_torch.scenes.render import Body, SensorConfig, render_bodies, render_shape
 from pimper_torch.scenes.rendered import RenderedScene
 from pimper_torch.scenes.sparse import sparse_scene
@@ -13,6 +13,7 @@ __all__ = [
     "potato_on_table",
     "render_bodies",
     "render_shape",
+    "save_masks",
     "save_photographs",
     "sparse_scene",
 ]

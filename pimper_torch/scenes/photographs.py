@@ -1,10 +1,13 @@
 """Rendered photographs as files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 from kornia.color import linear_rgb_to_rgb
 from PIL import Image
+from torch import Tensor
 
 from pimper_torch.records import Views
 
@@ -23,4 +26,16 @@ def save_photographs(views: Views, folder: Path) -> tuple[Path, ...]:
         bytes_ = (255 * linear_rgb_to_rgb(cropped)).round().movedim(0, -1).cpu().numpy()
         paths.append(folder / name)
         Image.fromarray(bytes_.astype(np.uint8)).save(paths[-1])
+    return tuple(paths)
+
+
+def save_masks(
+    masks: Bool[Tensor, "view height width"], names: Sequence[str], folder: Path
+) -> tuple[Path, ...]:
+    """Write one PNG file a view, white on the object, named as the views are."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for mask, name in zip(masks, names, strict=True):
+        paths.append((folder / name).with_suffix(".png"))
+        Image.fromarray(255 * mask.cpu().numpy().astype(np.uint8)).save(paths[-1])
     return tuple(paths)

@@ -13,7 +13,7 @@ from pimper_torch.scenes.compositions import potato_on_table
 from pimper_torch.scenes.lights import Lights, wandering_lights
 from pimper_torch.scenes.meshes import icosphere, join, potato, table
 from pimper_torch.scenes.noise import random_speckle
-from pimper_torch.scenes.photographs import save_photographs
+from pimper_torch.scenes.photographs import save_masks, save_photographs
 from pimper_torch.scenes.render import Body, SensorConfig, render_bodies, render_shape
 from pimper_torch.scenes.shapes import Sphere
 
@@ -249,6 +249,15 @@ def test_photographs_are_written_as_srgb_bytes(tmp_path):
         linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
         # Half a byte, where sRGB is steepest: 2.4 / 1.055 of it.
         assert np.abs(linear - image.movedim(0, -1).numpy()).max() < 0.5 / 255 * 2.4
+
+
+def test_masks_are_white_on_the_object(tmp_path):
+    masks = torch.zeros(2, 6, 8, dtype=torch.bool)
+    masks[1, 2:4, 5] = True
+    paths = save_masks(masks, ["a.png", "b.jpg"], tmp_path / "masks")
+    assert [path.name for path in paths] == ["a.png", "b.png"]
+    found = np.stack([np.asarray(Image.open(path)) for path in paths])
+    assert (found == 255 * masks.numpy()).all()
 
 
 def test_a_sensor_without_rays_is_refused():
