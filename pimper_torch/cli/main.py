@@ -4,6 +4,7 @@ What takes long to import is imported when a command needs it.
 """
 
 import difflib
+import os
 import signal
 import sys
 import types
@@ -56,6 +57,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(command: str, arguments: list[str]) -> int:
+    # Read when torch is loaded. Threads that spin while they wait take the processor from
+    # those they wait for when the machine is busy, and many small steps then take ten times
+    # as long.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from pimper_torch.cli.run import run
 
     try:
