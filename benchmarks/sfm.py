@@ -60,7 +60,7 @@ def variants() -> dict[str, ReconstructConfig]:
         "0.002, DSP": change(COLMAP, peak_threshold=0.002, domain_size_pooling=True),
         "0.002, affine, guided": change(ours, max_error_px=4.0, starts=1),
         "0.002, affine, guided, 2 px": change(ours, starts=1),
-        "ours: the same, 3 starts": ours,
+        "ours: the same, at most 3 starts": ours,
         "ours, edge 20": change(ours, edge_threshold=20.0),
         "ours, ratio 0.9": change(ours, max_ratio=0.9),
         "ours, DSP": change(ours, domain_size_pooling=True),

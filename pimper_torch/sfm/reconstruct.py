@@ -45,9 +45,9 @@ class ReconstructConfig:
         min_matches: Verified matches below which a pair of photographs does not count.
         min_registration_points: Points of the model that a view must see to be added, and
             to stay in it.
-        starts: Runs of the mapper, each with other random numbers; the one that registers
-            most views, then finds most points, is kept. Where it leaves views out, one more
-            run also counts points that only two views see.
+        starts: Most runs of the mapper, each with other random numbers; the first that
+            registers every view ends them. Else the one with most views, then most points,
+            is kept, after one more run that also counts points that only two views see.
         min_share: Of the photographs that the largest component must hold when the model
             splits.
         threads: 0 for all cores. With 1 the result is the same bit for bit.
@@ -216,11 +216,12 @@ class Reconstruct(nn.Module):
         colmap.match_features(place / "database.db", settings)
 
     def _map(self, place: Path, num_views: int) -> list[SparseModel]:
-        runs = [
-            self._map_once(place, start, pairs=False) for start in track(range(self.config.starts))
-        ]
-        best = max(runs, key=_most)
-        if _most(best)[0] < num_views:
+        best: list[SparseModel] = []
+        for start in track(range(self.config.starts)):
+            best = max(best, self._map_once(place, start, pairs=False), key=_most)
+            if _most(best)[0] == num_views:
+                break
+        else:
             # Points of two views make poses less exact where all views register without them:
             # median error 0.19 instead of 0.13 degrees on 24 photographs of a skull.
             tied = self._map_once(place, 0, pairs=True)
