@@ -63,7 +63,8 @@ class TriangulateConfig:
         min_altitude: Height over longest edge, in the image, below which a facet at the rim
             is dropped.
         min_coverage: Share of a facet at the rim that must show the object.
-        dark_level: Radiance in the reference view at or below which nothing is shown.
+        dark_share: Radiance in the reference view, over the median at the mesh's vertices, at
+            or below which a pixel shows background.
         smoothing_rounds: Of the vertex normals, over the mesh.
     """
 
@@ -85,7 +86,7 @@ class TriangulateConfig:
     max_stretch: float = 3.0
     min_altitude: float = 0.08
     min_coverage: float = 0.6
-    dark_level: float = 0.01
+    dark_share: float = 0.12
     smoothing_rounds: int = 1
 
     def __post_init__(self) -> None:
@@ -96,6 +97,7 @@ class TriangulateConfig:
         require(self.neighbours >= 3, "neighbours", self.neighbours, "3 or more")
         require(self.hiding_slope > 0, "hiding_slope", self.hiding_slope, "above 0")
         require(0 <= self.min_coverage <= 1, "min_coverage", self.min_coverage, "in [0, 1]")
+        require(0 <= self.dark_share < 1, "dark_share", self.dark_share, "in [0, 1)")
         require(self.fill_smoothing >= 0, "fill_smoothing", self.fill_smoothing, "0 or more")
 
 
@@ -247,7 +249,13 @@ class Triangulate(nn.Module):
         longest = _edges(vertices[faces]).amax(dim=1)
         far = longest > self.config.max_stretch * longest.median()
         faces = faces[(facing > steepest) & ~(far & (facing < 0.5))]  # 0.5: turned by 60 degrees
-        shown = _shown(pixels[faces], views, reference, self.config.dark_level)
+        gray = views.images[reference].mean(dim=0)
+        u, v = pixels.long().unbind(dim=1)
+        at_vertices = gray[v.clamp(0, gray.shape[0] - 1), u.clamp(0, gray.shape[1] - 1)]
+        shows_object = gray > self.config.dark_share * at_vertices.median()
+        if views.masks is not None:
+            shows_object = shows_object & views.masks[reference]
+        shown = _shown(pixels[faces], shows_object)
         thin = _altitude(pixels[faces]) < self.config.min_altitude
         return peel(faces, (shown < self.config.min_coverage) | thin)
 
@@ -306,19 +314,15 @@ def _edge_for(num_points: int, pixels: Float[Tensor, "point 2"]) -> float:
 
 
 def _shown(
-    corners_px: Float[Tensor, "face 3 2"], views: Views, view: int, dark_level: float
+    corners_px: Float[Tensor, "face 3 2"], shows_object: Bool[Tensor, "height width"]
 ) -> Float[Tensor, " face"]:
-    """Give the share of each triangle that is object: not masked out, not dark."""
+    """Give the share of each triangle's pixels that show the object."""
     steps = [(a, b, 9 - a - b) for a in range(10) for b in range(10 - a)]
     weights = corners_px.new_tensor(steps) * (1 - 3 / 27) / 9 + 1 / 27  # a little inside
-    pixels = weights @ corners_px
-    height, width = views.images.shape[-2:]
-    object_shown = views.images[view].mean(dim=0) > dark_level
-    if views.masks is not None:
-        object_shown = object_shown & views.masks[view]
+    height, width = shows_object.shape
     sampled = grid_sample(
-        object_shown[None, None].to(corners_px),
-        grid_from_pixels(pixels, width, height)[None],
+        shows_object[None, None].to(corners_px),
+        grid_from_pixels(weights @ corners_px, width, height)[None],
         mode="nearest",
         align_corners=False,
     )
