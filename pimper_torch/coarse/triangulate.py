@@ -62,6 +62,8 @@ class TriangulateConfig:
             turned by more than 60 degrees is such a bridge too.
         min_altitude: Height over longest edge, in the image, below which a facet at the rim
             is dropped.
+        min_tip_deg: A facet that alone reaches out to a vertex of the rim, with a smaller
+            angle there, is a spike and dropped.
         min_coverage: Share of a facet at the rim that must show the object.
         dark_share: Radiance in the reference view, over the median at the mesh's vertices, at
             or below which a pixel shows background.
@@ -85,6 +87,7 @@ class TriangulateConfig:
     max_tilt_deg: float = 80.0
     max_stretch: float = 3.0
     min_altitude: float = 0.08
+    min_tip_deg: float = 45.0
     min_coverage: float = 0.6
     dark_share: float = 0.12
     smoothing_rounds: int = 1
@@ -96,6 +99,7 @@ class TriangulateConfig:
         require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
         require(self.neighbours >= 3, "neighbours", self.neighbours, "3 or more")
         require(self.hiding_slope > 0, "hiding_slope", self.hiding_slope, "above 0")
+        require(0 <= self.min_tip_deg < 60, "min_tip_deg", self.min_tip_deg, "in [0, 60)")
         require(0 <= self.min_coverage <= 1, "min_coverage", self.min_coverage, "in [0, 1]")
         require(0 <= self.dark_share < 1, "dark_share", self.dark_share, "in [0, 1)")
         require(self.fill_smoothing >= 0, "fill_smoothing", self.fill_smoothing, "0 or more")
@@ -257,17 +261,32 @@ class Triangulate(nn.Module):
             shows_object = shows_object & views.masks[reference]
         shown = _shown(pixels[faces], shows_object)
         thin = _altitude(pixels[faces]) < self.config.min_altitude
-        return peel(faces, (shown < self.config.min_coverage) | thin)
+        spikes = _sharp(pixels[faces], self.config.min_tip_deg)
+        return peel(faces, (shown < self.config.min_coverage) | thin, spikes)
 
 
-def peel(faces: Int[Tensor, "face 3"], unwanted: Bool[Tensor, " face"]) -> Int[Tensor, "kept 3"]:
-    """Drop unwanted faces that touch the rim, again and again; inner ones stay, no holes."""
+def peel(
+    faces: Int[Tensor, "face 3"],
+    unwanted: Bool[Tensor, " face"],
+    sharp: Bool[Tensor, "face 3"] | None = None,
+) -> Int[Tensor, "kept 3"]:
+    """Drop unwanted faces that touch the rim, again and again; inner ones stay, no holes.
+
+    Args:
+        faces: Of a mesh with a rim.
+        unwanted: Dropped as soon as they touch it.
+        sharp: Marks corners; a face that reaches out to one with both its edges on the rim
+            is a spike, and dropped too.
+    """
+    if sharp is None:
+        sharp = torch.zeros_like(faces, dtype=torch.bool)
     while True:
-        rim_edges = _rim_faces(faces)
-        drop = rim_edges & unwanted
+        on_rim = _rim_edges(faces)
+        tips = on_rim & on_rim.roll(1, dims=1) & sharp  # corner i lies between edges i - 1 and i
+        drop = (on_rim.any(dim=1) & unwanted) | tips.any(dim=1)
         if not drop.any():
             return faces
-        faces, unwanted = faces[~drop], unwanted[~drop]
+        faces, unwanted, sharp = faces[~drop], unwanted[~drop], sharp[~drop]
 
 
 def largest_component(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
@@ -342,7 +361,16 @@ def _edges(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"]:
     return (corners - corners.roll(1, dims=1)).norm(dim=-1)
 
 
-def _rim_faces(faces: Int[Tensor, "face 3"]) -> Bool[Tensor, " face"]:
+def _sharp(corners_px: Float[Tensor, "face 3 2"], max_angle_deg: float) -> Bool[Tensor, "face 3"]:
+    """Mark corners with less than an angle between their edges, in the image."""
+    ahead = normalize(corners_px.roll(-1, dims=1) - corners_px, dim=-1)
+    back = normalize(corners_px.roll(1, dims=1) - corners_px, dim=-1)
+    cosine = (ahead * back).sum(dim=-1)
+    return cosine > torch.deg2rad(cosine.new_tensor(max_angle_deg)).cos()
+
+
+def _rim_edges(faces: Int[Tensor, "face 3"]) -> Bool[Tensor, "face 3"]:
+    """Mark edges, the first from the first corner to the second, that no other face has."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
     _, inverse, counts = torch.unique(edges, dim=0, return_inverse=True, return_counts=True)
-    return (counts[inverse] == 1).reshape(-1, 3).any(dim=1)
+    return (counts[inverse] == 1).reshape(-1, 3)

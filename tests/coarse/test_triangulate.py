@@ -95,6 +95,18 @@ def test_peeling_opens_no_hole():
     assert len(peel(faces, outer)) < len(faces)
 
 
+def test_spikes_are_dropped_and_blunt_ears_stay():
+    square = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    ear = torch.tensor([[2, 1, 4]])  # its tip is corner 2 of the face
+    both = torch.cat([square, ear])
+    tip = torch.zeros_like(both, dtype=torch.bool)
+    tip[2, 2] = True
+    assert peel(both, torch.zeros(3, dtype=torch.bool), tip).tolist() == square.tolist()
+    base = torch.zeros_like(tip)
+    base[2, 0] = True  # sharp at a corner that has a neighbour
+    assert len(peel(both, torch.zeros(3, dtype=torch.bool), base)) == 3
+
+
 def test_bridges_over_a_depth_discontinuity_are_dropped(dome_cloud):
     step = dome_cloud.points_world.clone()
     # Flatten the ball to two levels with a cliff at x = 0 that no facet may span.
