@@ -22,12 +22,12 @@ from pimper_torch.coarse.select import (
 )
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.surfaces import (
     face_normals,
-    face_pairs,
     vertex_normals,
 )
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
@@ -291,18 +291,10 @@ def peel(
 
 def largest_component(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
     """Keep the largest set of faces that hang together by edges."""
-    pairs, _ = face_pairs(faces)
-    label = torch.arange(len(faces), device=faces.device)
-    while len(pairs):
-        lowest = torch.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
-        spread_label = label.scatter_reduce(0, pairs[:, 0], lowest, "amin")
-        spread_label = spread_label.scatter_reduce(0, pairs[:, 1], lowest, "amin")
-        if torch.equal(spread_label, label):
-            break
-        label = spread_label
     if len(faces) == 0:
         return faces
-    return faces[label == label.mode().values]
+    label = face_components(faces)
+    return faces[label == label.bincount().argmax()]
 
 
 def smooth_over_mesh(

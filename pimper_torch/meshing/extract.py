@@ -8,8 +8,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.components import face_components, vertex_components, vertex_fans
 from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.meshing.components import face_components, vertex_components, vertex_fans
 from pimper_torch.records import Mesh, Surface
 
 

@@ -181,14 +181,6 @@ def match_features(database: Path, settings: MatchSettings) -> None:
         )
 
 
-def calibrate_focals(database: Path) -> None:
-    """Estimate unknown focal lengths from the fundamental matrices of all pairs."""
-    import pycolmap
-
-    with _quiet():
-        pycolmap.calibrate_view_graph(database)
-
-
 def map_views(database: Path, images: Path, settings: MapSettings) -> list[SparseModel]:
     """Grow models from the best pair of views on, until no view can be added.
 

@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.meshing.components import face_components, vertex_components, vertex_fans
+from pimper_torch.geometry.components import face_components, vertex_components, vertex_fans
 
 
 def test_faces_that_share_only_a_vertex_do_not_hang_together():
