@@ -14,11 +14,13 @@ PACKAGE = Path(pimper_torch.__file__).parent
 ROOT = Path(__file__).parents[1]
 
 # A room imports from rooms above it in this list. viz stands above io, which draws the
-# contact sheet of a result with it.
+# contact sheet of a result with it, and both above the evidence: scenes, datasets, metrics
+# and baselines read and write files too.
 ROOMS = [
     "errors",
     "config",
     "progress",
+    "radiometry",
     "records",
     "geometry",
     "linalg",
@@ -34,13 +36,14 @@ ROOMS = [
     "meshing",
     "reporting",
     "pipeline",
+    "viz",
+    "io",
     "photometric_stereo",
     "scenes",
     "datasets",
     "metrics",
     "baselines",
-    "viz",
-    "io",
+    "bench",
     "cli",
 ]
 
@@ -50,8 +53,8 @@ SOLE_IMPORTERS = {
     "kornia_rs": {"io/decode.py"},
     "tifffile": {"io/decode.py"},
     "yaml": {"config.py"},
-    "tyro": {"cli/options.py"},
-    "matplotlib": {"viz/overview.py"},
+    "tyro": {"cli/"},
+    "matplotlib": {"viz/"},
 }
 
 # Where a distribution's module has another name.
@@ -89,13 +92,15 @@ def test_imports_point_only_upward(path):
 
 
 @pytest.mark.parametrize("package", SOLE_IMPORTERS)
-def test_a_boundary_has_one_importer(package):
+def test_a_boundary_is_crossed_in_one_place(package):
+    owners = SOLE_IMPORTERS[package]
     found = {
         path.relative_to(PACKAGE).as_posix()
         for path in files()
         if any(module.split(".")[0] == package for module in imports(path))
     }
-    assert found == SOLE_IMPORTERS[package]
+    assert found
+    assert all(any(path.startswith(owner) for owner in owners) for path in found), found
 
 
 def test_whatever_is_imported_is_declared():

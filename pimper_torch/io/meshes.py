@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.photographs import to_bytes
 from pimper_torch.viz.maps import albedo_scale
 
 

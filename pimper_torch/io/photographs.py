@@ -11,8 +11,8 @@ from torch.nn.functional import interpolate
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header, turned
-from pimper_torch.io.srgb import linear_from_srgb
 from pimper_torch.progress import track
+from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.records import Views
 
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint

@@ -18,8 +18,8 @@ from pimper_torch.errors import OutputError
 from pimper_torch.io.accounts import lights_account, summary_account
 from pimper_torch.io.meshes import write_glb, write_ply
 from pimper_torch.io.photographs import some
+from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Reconstruction
-from pimper_torch.sfm.photographs import to_bytes
 from pimper_torch.sfm.scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.overview import draw_overview

@@ -3,25 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import torch
-from jaxtyping import Float, UInt8
 from PIL import Image
-from torch import Tensor
 
+from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
-
-
-def srgb_from_linear(radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Encode linear radiance in [0, 1] with the sRGB curve (IEC 61966-2-1)."""
-    light = radiance.clamp(0, 1)
-    return torch.where(
-        light <= 0.0031308, 12.92 * light, 1.055 * light.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
-    )
-
-
-def to_bytes(radiance: Float[Tensor, "*batch"]) -> UInt8[Tensor, "*batch"]:
-    """Encode linear radiance as 8-bit sRGB."""
-    return (255 * srgb_from_linear(radiance)).round().to(torch.uint8)
 
 
 def write_photographs(views: Views, images: Path, masks: Path) -> tuple[str, ...]:

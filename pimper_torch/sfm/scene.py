@@ -10,10 +10,10 @@ from torch.nn.functional import grid_sample
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
+from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.photographs import to_bytes
 from pimper_torch.sfm.undistort import undistort
 
 

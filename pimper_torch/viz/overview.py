@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.geometry.projection import project
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
-from pimper_torch.sfm.photographs import srgb_from_linear
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.render import bounding_box, frame, shade, single, turn
 

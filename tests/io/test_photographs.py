@@ -7,9 +7,8 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import load_views
-from pimper_torch.io.srgb import linear_from_srgb
 from pimper_torch.progress import listening
-from pimper_torch.sfm.photographs import srgb_from_linear
+from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear
 
 
 def save(path, array, **options):

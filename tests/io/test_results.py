@@ -17,7 +17,7 @@ from pimper_torch.io import results
 from pimper_torch.io.accounts import lights_account, summary_account, world_lights
 from pimper_torch.io.meshes import write_glb, write_ply
 from pimper_torch.io.results import RESULT_NAMES, prepare_output, write_result
-from pimper_torch.sfm.photographs import srgb_from_linear
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.viz.maps import albedo_scale
 
 

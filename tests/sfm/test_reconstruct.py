@@ -16,8 +16,9 @@ from pimper_torch.errors import (
     ReconstructionError,
 )
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Views
-from pimper_torch.sfm.photographs import srgb_from_linear, write_photographs
+from pimper_torch.sfm.photographs import write_photographs
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.sfm.scene import take_views, write_model
 
