@@ -12,7 +12,7 @@ from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.metrics import compare_in_view, pair_views, similarity_between_cameras
 from pimper_torch.metrics.relative import ViewComparison, angles_deg
-from pimper_torch.records import Cameras, Mesh, Reconstruction, SparseScene, Views
+from pimper_torch.records import Mesh, Reconstruction, SparseScene, Views
 from pimper_torch.scenes import (
     RenderedScene,
     potato_on_table,
@@ -118,19 +118,11 @@ def test_one_light_for_all_views_is_told_and_geometry_delivered(preset):
     assert fine < 1.5 * coarse
 
 
-def taken_by(cameras: Cameras, views: torch.Tensor) -> Cameras:
-    return cameras.replace(
-        intrinsics=cameras.intrinsics[views],
-        cam_from_world=cameras.cam_from_world[views],
-        sizes_px=cameras.sizes_px[views],
-    )
-
-
 def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene) -> ViewComparison:
     """Compare along the rays of the reference view, on the object without its table."""
     ours, theirs = pair_views(result.scene.views.names, truth.views.names)
     truth_from_world = similarity_between_cameras(
-        taken_by(result.cameras, ours), taken_by(truth.cameras, theirs)
+        result.cameras.take(ours.tolist()), truth.cameras.take(theirs.tolist())
     )
     name = result.scene.views.names[result.coarse.reference]
     view = truth.views.names.index(name)

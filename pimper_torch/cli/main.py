@@ -11,6 +11,7 @@ import types
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from typing import TextIO
 
 from pimper_torch.errors import PimperError, PimperWarning
@@ -18,6 +19,10 @@ from pimper_torch.errors import PimperError, PimperWarning
 _HELP = """\
 usage: pimper reconstruct PHOTOS -o OUT [options]
        pimper demo [-o OUT] [options]
+       pimper render SCENE -o OUT [options]
+       pimper evaluate RESULT TRUTH [options]
+       pimper bench [-o OUT] [options]
+       pimper convert DATA -o OUT --source KIND --target KIND [options]
        pimper --version
 
 Photographs from many places under many unknown lights, to a dense surface with normals,
@@ -25,10 +30,22 @@ albedo and light.
 
   reconstruct   a folder of photographs
   demo          the photographs of a skull that come with the package
+  render        photographs of a scene with known truth
+  evaluate      a result against the truth
+  bench         the table: scenes, presets and rivals
+  convert       a data set of another layout, or to one
 
-`pimper reconstruct --help` tells every option and every setting of every stage.
+`pimper COMMAND --help` tells every option, and every setting of every stage.
 """
-_COMMANDS = ("reconstruct", "demo")
+# Where each is carried out.
+_COMMANDS = {
+    "reconstruct": "pimper_torch.cli.run",
+    "demo": "pimper_torch.cli.run",
+    "render": "pimper_torch.cli.render",
+    "evaluate": "pimper_torch.cli.evaluate",
+    "bench": "pimper_torch.cli.bench",
+    "convert": "pimper_torch.cli.convert",
+}
 _FAILED, _INTERRUPTED = 2, 130
 
 
@@ -61,10 +78,9 @@ def _run(command: str, arguments: list[str]) -> int:
     # those they wait for when the machine is busy, and many small steps then take ten times
     # as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from pimper_torch.cli.run import run
-
+    module = import_module(_COMMANDS[command])
     try:
-        run(command, arguments)
+        module.run(command, arguments)
     except PimperError as error:
         _tell("error", str(error))
         return _FAILED

@@ -1,16 +1,22 @@
 """Meshes as files that other programs open."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import trimesh
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.radiometry import to_bytes
+from pimper_torch.radiometry import linear_from_srgb, to_bytes
 from pimper_torch.records import Mesh
 from pimper_torch.viz.maps import albedo_scale
 
@@ -24,6 +30,51 @@ def write_ply(mesh: Mesh, path: Path) -> None:
     plain = _trimesh(mesh, colors)
     plain.vertex_attributes.update(attributes)
     path.write_bytes(trimesh.exchange.ply.export_ply(plain, vertex_normal=True))
+
+
+def read_mesh(path: Path | str) -> Mesh:
+    """Read a triangle mesh or a point cloud: PLY, OBJ, STL, OFF, GLB and what trimesh reads.
+
+    Faces of more corners are split, the parts of a scene put together; vertices keep their
+    order and number. Vertex normals are kept if the file has some; colours are taken for
+    albedo (sRGB undone, except in glTF, whose colours are linear); a ``confidence`` of PLY
+    is kept too. A point cloud becomes a mesh without faces.
+
+    Args:
+        path: The file. Textures and materials beside it are not looked at.
+
+    Returns:
+        Float64 geometry on the CPU.
+
+    Raises:
+        InputError: No such file, not a mesh, no vertices, or values that are not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "nothing"
+        raise InputError(f"{path}: found {found}; needed: a mesh file such as .ply or .obj.")
+    try:
+        # Without a resolver nothing but the file itself is opened.
+        scene = trimesh.load_scene(
+            BytesIO(path.read_bytes()),
+            file_type=path.suffix.lower().lstrip("."),
+            process=False,
+            maintain_order=True,
+        )
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        raise InputError(
+            f"{path}: cannot be read as a mesh ({error}); needed: PLY, OBJ, STL, OFF or GLB."
+        ) from error
+    linear = path.suffix.lower() == ".glb"
+    placed = (scene.graph[node] for node in scene.graph.nodes_geometry)
+    parts = [_mesh(scene.geometry[name], pose, linear=linear) for pose, name in placed]
+    parts = [part for part in parts if len(part.vertices_world)]
+    if not parts:
+        raise InputError(f"{path}: holds no vertices; needed: a mesh or a point cloud.")
+    mesh = _joined(parts)
+    if not bool(mesh.vertices_world.isfinite().all()):
+        raise InputError(f"{path}: some vertices are not finite; needed: numbers throughout.")
+    return mesh
 
 
 def write_glb(mesh: Mesh, path: Path) -> None:
@@ -40,6 +91,63 @@ def write_glb(mesh: Mesh, path: Path) -> None:
         trimesh.exchange.gltf.export_glb(
             scene, include_normals=True, tree_postprocessor=postprocess
         )
+    )
+
+
+def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401 - untyped
+    """Take over one part of what trimesh loaded, put where the scene has it."""
+    scene_from_part = torch.tensor(np.asarray(pose), dtype=torch.float64)
+    faces = torch.tensor(np.asarray(getattr(part, "faces", ())).reshape(-1, 3)).long()
+    # Asked for normals that the file does not have, trimesh computes some; those of the file
+    # are in its cache.
+    normals = _rows(part._cache.cache.get("vertex_normals"))
+    colors = getattr(part, "colors", None)
+    if len(faces):
+        visual = part.visual
+        colors = visual.vertex_colors if visual.kind == "vertex" else None
+        colors = getattr(visual, "vertex_attributes", {}).get("color", colors)
+    encoded = _rows(colors)
+    if encoded is not None:
+        encoded = encoded[:, :3] / (255 if np.asarray(colors).dtype.kind in "ui" else 1)
+    raw = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    has_confidence = "confidence" in (getattr(getattr(raw, "dtype", None), "names", None) or raw)
+    confidence = _rows(raw["confidence"]) if has_confidence else None
+    return Mesh(
+        vertices_world=transform(scene_from_part, _some_rows(part.vertices)),
+        faces=faces,
+        normals_world=None
+        if normals is None
+        else normalize(rotate(scene_from_part, normals), dim=-1),
+        albedo=encoded if linear or encoded is None else linear_from_srgb(encoded),
+        confidence=None if confidence is None else confidence.reshape(-1),
+    )
+
+
+def _rows(values: Any) -> Tensor | None:  # noqa: ANN401 - untyped
+    return None if values is None or len(values) == 0 else torch.tensor(np.asarray(values)).double()
+
+
+def _some_rows(values: Any) -> Float[Tensor, "row 3"]:  # noqa: ANN401 - untyped
+    return torch.tensor(np.asarray(values, dtype=np.float64).reshape(-1, 3))
+
+
+def _joined(parts: Sequence[Mesh]) -> Mesh:
+    """Put parts in one mesh; what not every part has is dropped."""
+    if len(parts) == 1:
+        return parts[0]
+    starts = accumulate((len(part.vertices_world) for part in parts), initial=0)
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
+
+    def all_of(values: Sequence[Tensor | None]) -> Tensor | None:
+        there = [value for value in values if value is not None]
+        return torch.cat(there) if len(there) == len(values) else None
+
+    return Mesh(
+        vertices_world=torch.cat([part.vertices_world for part in parts]),
+        faces=torch.cat(faces),
+        normals_world=all_of([part.normals_world for part in parts]),
+        albedo=all_of([part.albedo for part in parts]),
+        confidence=all_of([part.confidence for part in parts]),
     )
 
 

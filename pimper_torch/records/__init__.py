@@ -15,14 +15,17 @@ from pimper_torch.records.patches import (
 from pimper_torch.records.reconstruction import Reconstruction, StageReport
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Lens, Mesh, SparseScene
+from pimper_torch.records.truth import Capture, Estimate, Truth
 from pimper_torch.records.views import Cameras, Views
 
 __all__ = [
     "Cameras",
+    "Capture",
     "CoarseMesh",
     "Convergence",
     "DepthPatches",
     "Depths",
+    "Estimate",
     "Lens",
     "Mesh",
     "PatchSet",
@@ -36,5 +39,6 @@ __all__ = [
     "StageReport",
     "Surface",
     "Templates",
+    "Truth",
     "Views",
 ]

@@ -29,7 +29,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
     """
     number = {name: index for index, name in enumerate(views.names)}
     undistorted, intrinsics = undistort(
-        take_views(views, [number[name] for name in model.names]), model.lenses
+        views.take([number[name] for name in model.names]), model.lenses
     )
     like = views.images
     return SparseScene(
@@ -74,18 +74,6 @@ def write_model(scene: SparseScene, folder: Path) -> None:
         observation_pixels=scene.observation_pixels.detach().cpu().double(),
     )
     colmap.write_binary(model, point_colors(scene), folder)
-
-
-def take_views(views: Views, chosen: list[int]) -> Views:
-    """Keep some views, in the order given."""
-    index = torch.tensor(chosen, dtype=torch.long, device=views.images.device)
-    return views.replace(
-        images=views.images[index],
-        sizes_px=views.sizes_px[index],
-        names=tuple(views.names[item] for item in chosen),
-        masks=None if views.masks is None else views.masks[index],
-        focals_px=views.focals_px[index],
-    )
 
 
 def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:

@@ -11,7 +11,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
-from pimper_torch.viz.render import bounding_box, frame, shade, single, turn
+from pimper_torch.viz.render import bounding_box, frame, shade, turn
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
@@ -105,7 +105,7 @@ def _boxes(
 def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     """Make the pictures of the contact sheet."""
     reference = result.coarse.reference
-    own = single(result.cameras, reference)
+    own = result.cameras.take([reference])
     vertices = result.mesh.vertices_world
     camera = frame(own, vertices, panel_px, _MARGIN)
     name = result.scene.views.names[reference]

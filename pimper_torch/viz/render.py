@@ -113,15 +113,6 @@ def bounding_box(
     return low - room, high + room
 
 
-def single(cameras: Cameras, view: int) -> Cameras:
-    """Take one view out of several."""
-    return Cameras(
-        intrinsics=cameras.intrinsics[view : view + 1],
-        cam_from_world=cameras.cam_from_world[view : view + 1],
-        sizes_px=cameras.sizes_px[view : view + 1],
-    )
-
-
 def _towards(camera: Cameras) -> Float[Tensor, "height width 3"]:
     """Give the viewing ray of every pixel, camera frame."""
     width, height = (int(side) for side in camera.sizes_px[0])

@@ -20,7 +20,7 @@ from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Views
 from pimper_torch.sfm.photographs import write_photographs
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
-from pimper_torch.sfm.scene import take_views, write_model
+from pimper_torch.sfm.scene import write_model
 
 
 def blank(sizes: list[tuple[int, int]]) -> Views:
@@ -44,7 +44,7 @@ def test_a_model_of_other_photographs_is_refused_with_both_sides_names(scene, vi
 
 def test_photographs_that_the_model_lacks_are_left_out_with_a_warning(scene, views, tmp_path):
     write_model(scene, tmp_path)
-    more = take_views(views, [4, 0, 1, 2, 3]).replace(
+    more = views.take([4, 0, 1, 2, 3]).replace(
         names=("ü.tif", "b.jpg", "new.jpg", "c 1.png", "d.jpg")
     )
     with pytest.warns(PimperWarning, match=r"4 of 5 photographs.*left out: new\.jpg"):
@@ -216,7 +216,7 @@ def test_eight_photographs_of_the_skull_register_and_their_points_reproject():
 
     views = load_views(str(files("pimper_torch").joinpath("data/skull")))
     chosen = [views.names.index(f"{number}.jpg") for number in (35, 36, 37, 38, 53, 54, 55, 56)]
-    scene = Reconstruct()(take_views(views, chosen))
+    scene = Reconstruct()(views.take(chosen))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert scene.unregistered == ()

@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Mesh
 from pimper_torch.scenes.cameras import look_at, pinholes
-from pimper_torch.viz.render import bounding_box, frame, shade, single, turn
+from pimper_torch.viz.render import bounding_box, frame, shade, turn
 
 
 @pytest.fixture
@@ -87,4 +87,4 @@ def test_a_frame_holds_the_points_at_the_size_asked_for(front):
 def test_single_takes_the_view_asked_for():
     eyes = torch.tensor([[0.0, 0, 5], [1, 0, 5]])
     both = pinholes(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1, 0])), 40.0, 32, 24)
-    assert_close(single(both, 1).centers_world, eyes[1:])
+    assert_close(both.take([1]).centers_world, eyes[1:])

@@ -1,0 +1,83 @@
+"""What is known about photographs beforehand, and what a method says about them."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.records.record import Record
+from pimper_torch.records.scene import Mesh
+from pimper_torch.records.views import Cameras, Views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Truth(Record):
+    """What is known of an object besides its photographs; ``None`` where nobody knows.
+
+    Maps hold what the ray through each pixel's centre meets first, one a view.
+
+    Attributes:
+        mesh: Surface, as scanned or as rendered; more than the object where there is more.
+        points_world: Scanned points, where no surface was made of them.
+        depth: Along the camera's z; infinite where the ray meets nothing or nobody knows.
+        normals_world: Unit, outward; zero where the ray meets nothing.
+        albedo: Linear; zero where the ray meets nothing.
+        foreground: True on the object, false on its table and the background.
+        lit: True where the lamp reaches the surface.
+        highlight: True where a highlight adds noticeably to the matte part.
+        lights_world: First-order light ``l`` at the object, radiance = albedo * l . (1, n),
+            up to one scale for all views.
+        lamps_world: Places of point lights.
+    """
+
+    mesh: Mesh | None = None
+    points_world: Float[Tensor, "point 3"] | None = None
+    depth: Float[Tensor, "view height width"] | None = None
+    normals_world: Float[Tensor, "view height width 3"] | None = None
+    albedo: Float[Tensor, "view height width channel"] | None = None
+    foreground: Bool[Tensor, "view height width"] | None = None
+    lit: Bool[Tensor, "view height width"] | None = None
+    highlight: Bool[Tensor, "view height width"] | None = None
+    lights_world: Float[Tensor, "view 4"] | None = None
+    lamps_world: Float[Tensor, "view 3"] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Capture(Record):
+    """Photographs of a data set with all that came along.
+
+    Views that share a number in ``position`` were taken by the same camera from the same
+    place; views that share one in ``light`` under the same light.
+
+    Attributes:
+        views: The photographs, linear radiance. Names are unique.
+        cameras: That took them, world frame and unit of the data set; ``None`` if unknown.
+        truth: In the same frame.
+        position: Number of the camera's place.
+        light: Number of the light.
+    """
+
+    views: Views
+    cameras: Cameras | None
+    truth: Truth
+    position: Int[Tensor, " view"]
+    light: Int[Tensor, " view"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Estimate(Record):
+    """What a method says about an object, in a frame of its own.
+
+    Attributes:
+        mesh: The surface; may have no faces if the method gives points only.
+        names: Of the views it found cameras for, as the photographs are called.
+        cameras: One a name, in the same order; ``None`` if the method gives none.
+        lights_world: First-order light of each view, up to one scale; ``None`` if unknown.
+        reference: Name of the view the surface was made in, if there is one.
+    """
+
+    mesh: Mesh
+    names: tuple[str, ...] = ()
+    cameras: Cameras | None = None
+    lights_world: Float[Tensor, "view 4"] | None = None
+    reference: str | None = None

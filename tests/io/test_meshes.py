@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
+from pimper_torch.records import Mesh
+from pimper_torch.viz.maps import albedo_scale
+
+
+@pytest.fixture
+def mesh():
+    generator = torch.Generator().manual_seed(31)
+    normals = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    return Mesh(
+        vertices_world=torch.rand(5, 3, generator=generator, dtype=torch.float64),
+        faces=torch.tensor([[0, 1, 2], [2, 3, 4]]),
+        normals_world=normalize(normals, dim=1),
+        albedo=torch.rand(5, 3, generator=generator, dtype=torch.float64),
+        confidence=torch.rand(5, generator=generator, dtype=torch.float64),
+    )
+
+
+@pytest.mark.parametrize(("write", "suffix"), [(write_ply, ".ply"), (write_glb, ".glb")])
+def test_a_mesh_comes_back_from_its_file(mesh, write, suffix, tmp_path):
+    write(mesh, tmp_path / f"mesh{suffix}")
+    read = read_mesh(tmp_path / f"mesh{suffix}")
+    assert_close(read.vertices_world, mesh.vertices_world, rtol=0, atol=1e-7)  # float32 files
+    assert torch.equal(read.faces, mesh.faces)
+    assert_close(read.normals_world, mesh.normals_world, rtol=0, atol=1e-6)
+    # 8 bits, in sRGB steepest in the light: 2.3 / 255 / 2.
+    assert_close(read.albedo, mesh.albedo * albedo_scale(mesh), rtol=0, atol=0.006)
+    if suffix == ".ply":
+        assert_close(read.confidence, mesh.confidence, rtol=0, atol=1e-7)
+
+
+def test_parts_of_a_scene_stand_where_the_scene_puts_them(tmp_path):
+    box = trimesh.creation.box()
+    moved = np.eye(4)
+    moved[:3, 3] = [5, 0, 0]
+    scene = trimesh.Scene()
+    scene.add_geometry(box)
+    scene.add_geometry(box, transform=moved)
+    scene.export(tmp_path / "two.glb")
+    read = read_mesh(tmp_path / "two.glb")
+    assert len(read.vertices_world) == 2 * len(box.vertices)
+    assert len(read.faces) == 2 * len(box.faces)
+    assert_close(read.vertices_world[:, 0].amax(), torch.tensor(5.5).double())
+    assert int(read.faces[12:].min()) == len(box.vertices)  # the second refers to its own
+
+
+def test_a_file_of_points_has_no_faces_and_no_made_up_normals(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 2\n"
+    fields = "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "points.ply").write_text(f"{head}{fields}end_header\n0 0 1\n1 1 1\n")
+    read = read_mesh(tmp_path / "points.ply")
+    assert read.faces.shape == (0, 3)
+    assert read.normals_world is None
+    assert_close(read.vertices_world, torch.tensor([[0.0, 0, 1], [1, 1, 1]]).double())
+
+
+def test_normals_that_the_file_lacks_are_not_invented(tmp_path):
+    (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    read = read_mesh(tmp_path / "one.obj")
+    assert (read.normals_world, read.albedo, read.confidence) == (None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("none.ply", None, "nothing"),
+        ("mesh.ply", b"not a mesh", "cannot be read"),
+        ("mesh.pkl", b"cos\nsystem\n", "cannot be read"),
+        ("mesh.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
+        ("mesh.obj", b"# empty\n", "vertices|cannot be read"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(name, content, told, tmp_path):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=told):
+        read_mesh(tmp_path / name)
