@@ -11,8 +11,9 @@ from rich.table import Table
 from pimper_torch.cli.bars import Bars
 from pimper_torch.cli.options import Job, parse
 from pimper_torch.errors import ConfigError
+from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.photographs import load_views
-from pimper_torch.io.results import prepare_output, write_result
+from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.pipeline import Pimper
 from pimper_torch.progress import listening
 from pimper_torch.records import Reconstruction, StageReport, Views
@@ -30,7 +31,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
     """
     job = parse(command, arguments)
     common = job.common
-    prepare_output(job.out, common.overwrite)
+    prepare_output(job.out, RESULT_NAMES, common.overwrite)
     _check_device(common.device)
     console = Console(stderr=True)
     with Bars(console) as bars:

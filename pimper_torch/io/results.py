@@ -1,10 +1,7 @@
-"""Results to a folder: all of them, or nothing."""
+"""Results to a folder."""
 
 import json
-import secrets
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +11,9 @@ from PIL import Image
 from torch import Tensor
 
 from pimper_torch.config import to_yaml
-from pimper_torch.errors import OutputError
 from pimper_torch.io.accounts import lights_account, summary_account
+from pimper_torch.io.folders import written_whole
 from pimper_torch.io.meshes import write_glb, write_ply
-from pimper_torch.io.photographs import some
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Reconstruction
 from pimper_torch.sfm.scene import write_model
@@ -37,44 +33,6 @@ RESULT_NAMES = (
     "summary.json",
     "overview.png",
 )
-
-
-def prepare_output(folder: Path, overwrite: bool = False) -> None:
-    """Check, before a run, that its result can be written; leaves no trace.
-
-    Raises:
-        OutputError: The folder already holds something, is a file, or cannot be made.
-    """
-    if folder.is_symlink() and not folder.exists():
-        raise OutputError(f"{folder}: is a link to nothing. Remove it, or write elsewhere.")
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; needed: a folder that is new or empty.")
-    try:
-        held = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be listed ({error.strerror}).") from error
-    foreign = [name for name in held if name not in RESULT_NAMES]
-    if held and not overwrite:
-        raise OutputError(
-            f"{folder}: already holds {some(held)}; needed: a folder that is new or empty. Write "
-            "elsewhere, or replace a former result by `--overwrite` (`overwrite=True`)."
-        )
-    if foreign:
-        raise OutputError(
-            f"{folder}: holds {some(foreign)}, which is no part of a result, so it is not "
-            "overwritten. Write elsewhere."
-        )
-    place = folder.resolve().parent
-    while not place.exists():
-        place = place.parent
-    trial = place / f".{folder.name}.trial-{secrets.token_hex(4)}"
-    try:
-        trial.mkdir()
-        trial.rmdir()
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot be written, for {place} refuses ({error.strerror}). Write elsewhere."
-        ) from error
 
 
 def write_result(
@@ -103,9 +61,7 @@ def write_result(
     `overview.png`   contact sheet
     ===============  ==============================================================
 
-    It is all written beside the folder first and moved there when complete: a folder that
-    is there is whole. A former result is replaced only then. (A folder that cannot be
-    renamed, as a mount point cannot, is filled file by file at the end.)
+    It is there whole or not at all; see :func:`pimper_torch.io.folders.written_whole`.
 
     Args:
         result: Of the run.
@@ -115,19 +71,11 @@ def write_result(
         about: More for ``summary.json``.
 
     Raises:
-        OutputError: As :func:`prepare_output`, or the disk refuses in the middle; then
-            nothing stays behind.
+        OutputError: The folder holds something else, or cannot be written.
     """
     folder = Path(folder)
-    prepare_output(folder, overwrite)
-    try:
-        with _staged(folder) as staging:
-            _write_all(result.to("cpu"), config, staging, about or {})
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: writing failed ({error}); nothing was left there. Make room or write "
-            "elsewhere."
-        ) from error
+    with written_whole(folder, RESULT_NAMES, overwrite=overwrite) as staging:
+        _write_all(result.to("cpu"), config, staging, about or {})
 
 
 def _write_all(
@@ -179,58 +127,3 @@ def _write_json(account: Mapping[str, object], path: Path, indent: int | None = 
 def _array(values: Float[Tensor, "*batch"]) -> np.ndarray:
     array: np.ndarray = values.detach().float().numpy()
     return array
-
-
-@contextmanager
-def _staged(folder: Path) -> Iterator[Path]:
-    """Give a folder to fill, which takes the place of ``folder`` when all went well."""
-    place = folder.resolve()
-    made = _make_parents(place.parent)
-    token = secrets.token_hex(4)
-    staging, former = (place.parent / f".{place.name}.{kind}-{token}" for kind in ("new", "old"))
-    try:
-        staging.mkdir()
-        yield staging
-        _move(staging, place, former)
-    except BaseException:
-        shutil.rmtree(staging, ignore_errors=True)
-        for parent in made:
-            parent.rmdir()
-        raise
-    shutil.rmtree(former, ignore_errors=True)
-
-
-def _move(staging: Path, place: Path, former: Path) -> None:
-    """Put the new result in its place, and what was there to ``former``."""
-    if not place.exists():
-        staging.rename(place)
-        return
-    try:
-        place.rename(former)
-    except OSError:
-        # The folder is a mount point, as OUT in a container is: fill it file by file.
-        _pour(staging, place)
-        return
-    try:
-        staging.rename(place)
-    except BaseException:
-        former.rename(place)
-        raise
-
-
-def _pour(staging: Path, place: Path) -> None:
-    for name in RESULT_NAMES:
-        old = place / name
-        if old.is_dir():
-            shutil.rmtree(old)
-        else:
-            old.unlink(missing_ok=True)
-        shutil.move(staging / name, old)
-    staging.rmdir()
-
-
-def _make_parents(folder: Path) -> list[Path]:
-    """Make a folder and those above it; gives those that were not there, deepest first."""
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    return missing

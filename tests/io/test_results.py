@@ -15,8 +15,9 @@ from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io import results
 from pimper_torch.io.accounts import lights_account, summary_account, world_lights
+from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.meshes import write_glb, write_ply
-from pimper_torch.io.results import RESULT_NAMES, prepare_output, write_result
+from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.viz.maps import albedo_scale
 
@@ -228,7 +229,7 @@ def test_a_failure_keeps_the_former_result(reconstruction, tmp_path, monkeypatch
 
 def test_an_empty_folder_is_filled(reconstruction, tmp_path):
     (tmp_path / "out").mkdir()
-    prepare_output(tmp_path / "out")
+    prepare_output(tmp_path / "out", RESULT_NAMES)
     write_result(reconstruction, Config(), tmp_path / "out")
     assert names(tmp_path / "out") == sorted(RESULT_NAMES)
 
@@ -250,7 +251,7 @@ def test_a_folder_that_cannot_be_renamed_is_filled(reconstruction, tmp_path, mon
 
 
 def test_preparing_leaves_no_trace(tmp_path):
-    prepare_output(tmp_path / "a" / "b" / "out")
+    prepare_output(tmp_path / "a" / "b" / "out", RESULT_NAMES)
     assert names(tmp_path) == []
 
 
@@ -258,27 +259,27 @@ def test_a_folder_with_other_things_is_never_overwritten(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputError, match=r"holds thesis\.tex, which is no part"):
-        prepare_output(tmp_path / "out", overwrite=True)
+        prepare_output(tmp_path / "out", RESULT_NAMES, overwrite=True)
     with pytest.raises(OutputError, match=r"already holds thesis\.tex"):
-        prepare_output(tmp_path / "out")
+        prepare_output(tmp_path / "out", RESULT_NAMES)
 
 
 def test_a_place_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file: is a file"):
-        prepare_output(tmp_path / "file")
+        prepare_output(tmp_path / "file", RESULT_NAMES)
     with pytest.raises(OutputError, match="out: cannot be written"):
-        prepare_output(tmp_path / "file" / "out")
+        prepare_output(tmp_path / "file" / "out", RESULT_NAMES)
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     with pytest.raises(OutputError, match="link: is a link to nothing"):
-        prepare_output(tmp_path / "link")
+        prepare_output(tmp_path / "link", RESULT_NAMES)
 
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "mkdir", refuse)  # root may write anywhere
     with pytest.raises(OutputError, match=r"cannot be written.*Permission denied"):
-        prepare_output(tmp_path / "out")
+        prepare_output(tmp_path / "out", RESULT_NAMES)
 
 
 def test_the_sparse_model_shares_the_meshs_frame(reconstruction, tmp_path):
