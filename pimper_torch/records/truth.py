@@ -17,7 +17,8 @@ class Truth(Record):
     Maps hold what the ray through each pixel's centre meets first, one a view.
 
     Attributes:
-        mesh: Surface, as scanned or as rendered; more than the object where there is more.
+        mesh: Surface of the object alone, as scanned or as rendered.
+        surroundings: What else stands in the scene, such as the table.
         points_world: Scanned points, where no surface was made of them.
         depth: Along the camera's z; infinite where the ray meets nothing or nobody knows.
         normals_world: Unit, outward; zero where the ray meets nothing.
@@ -31,6 +32,7 @@ class Truth(Record):
     """
 
     mesh: Mesh | None = None
+    surroundings: Mesh | None = None
     points_world: Float[Tensor, "point 3"] | None = None
     depth: Float[Tensor, "view height width"] | None = None
     normals_world: Float[Tensor, "view height width 3"] | None = None
