@@ -1,0 +1,1 @@
+"""The table: scenes, presets and rivals, measured alike."""
