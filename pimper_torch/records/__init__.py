@@ -15,7 +15,7 @@ from pimper_torch.records.patches import (
 from pimper_torch.records.reconstruction import Reconstruction, StageReport
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Lens, Mesh, SparseScene
-from pimper_torch.records.truth import Capture, Estimate, Truth
+from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
 from pimper_torch.records.views import Cameras, Views
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "Convergence",
     "DepthPatches",
     "Depths",
+    "DtuProtocol",
     "Estimate",
     "Lens",
     "Mesh",

@@ -67,6 +67,24 @@ class Capture(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class DtuProtocol(Record):
+    """Where a scan of the DTU 2014 set is judged, in the data set's frame and millimetres.
+
+    Attributes:
+        obs_mask: True in voxels that the structured light scanner could see. The middle of
+            voxel ``(i, j, k)`` is ``bounding_box[0] + resolution * (i, j, k)``.
+        bounding_box: Lower corner, upper corner.
+        resolution: Distance of neighbouring voxels.
+        plane: Of the table; points with ``plane . (x, y, z, 1) > 0`` stand on it.
+    """
+
+    obs_mask: Bool[Tensor, "x y z"]
+    bounding_box: Float[Tensor, "2 3"]
+    resolution: float
+    plane: Float[Tensor, " 4"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Estimate(Record):
     """What a method says about an object, in a frame of its own.
 
