@@ -62,17 +62,26 @@ def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[T
 def behind_others(
     pixels: Float[Tensor, "point 2"],
     points_cam: Float[Tensor, "point 3"],
+    observed: Bool[Tensor, " point"],
     *,
     neighbours: int,
     slope: float,
 ) -> Bool[Tensor, " point"]:
-    """Mark points that a nearer layer surrounds in the image, so that it must hide them.
+    """Mark points that a nearer layer hides in the image, or may well hide.
 
     Another view may see past the contour of what is in front, and tracks now and then hold
     a false match in the very view that cannot see the point. Of the nearest points in the
     image those count that are nearer to the camera by more than ``slope`` times their
     lateral distance; if three or more leave no open half-plane, the point is hidden. Where
-    a point is just beside a contour, or on a steep rim, they are all on one side.
+    a point is just beside a contour, or on a steep rim, they are all on one side; then it
+    is as likely just inside the contour, and only a point observed here is believed.
+
+    Args:
+        pixels: In the view.
+        points_cam: In its camera's frame.
+        observed: Whether the view has an observation of the point.
+        neighbours: How many nearest points in the image to look at.
+        slope: Depth over lateral distance.
     """
     nearest = nearest_in_image(pixels, neighbours)
     steps = points_cam[nearest] - points_cam[:, None]
@@ -85,7 +94,7 @@ def behind_others(
     widest = torch.where(gaps.isfinite(), gaps, 0).amax(dim=1)
     last = ordered.gather(1, (count - 1).clamp_min(0)[:, None])[:, 0]
     widest = torch.maximum(widest, ordered[:, 0] + 2 * torch.pi - last)
-    return (count >= 3) & (widest < torch.pi)
+    return (count >= 3) & ((widest < torch.pi) | ~observed)
 
 
 def neighbours_agree(

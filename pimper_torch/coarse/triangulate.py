@@ -187,6 +187,7 @@ class Triangulate(nn.Module):
                 hidden = behind_others(
                     pixels[index],
                     transform(cameras.cam_from_world[reference], scene.points_world[index]),
+                    observed[index, reference],
                     neighbours=min(2 * config.neighbours, len(index) - 1),
                     slope=config.hiding_slope,
                 )

@@ -84,10 +84,17 @@ def test_points_behind_a_layer_are_hidden_and_those_beside_its_contour_are_not()
     on_wall = (radius > 1) | (torch.rand(1500, generator=generator) < 0.3)
     depth = torch.where(on_wall, 7.0, 4.0).double()
     points_cam = torch.cat([lateral, depth[:, None]], dim=1)
-    found = behind_others(lateral, points_cam, neighbours=24, slope=3.0)
+    seen = torch.ones_like(on_wall)
+    found = behind_others(lateral, points_cam, seen, neighbours=24, slope=3.0)
     assert found[on_wall & (radius < 0.85)].float().mean() > 0.95
     assert not found[~on_wall].any()
     assert not found[on_wall & (radius > 1.02)].any()
+    # Just inside the contour they have the disc on one side only; unseen, they are doubted.
+    unseen = behind_others(lateral, points_cam, ~on_wall, neighbours=24, slope=3.0)
+    edge = on_wall & (radius > 0.85) & (radius < 0.99)
+    assert found[edge].float().mean() < 0.8 < 0.98 < unseen[edge].float().mean()
+    assert not unseen[~on_wall].any()
+    assert not unseen[on_wall & (radius > 1.3)].any()
 
 
 def test_no_point_of_a_steep_dome_is_hidden():
@@ -96,7 +103,11 @@ def test_no_point_of_a_steep_dome_is_hidden():
     lateral = lateral[lateral.norm(dim=1) < 0.999]
     depth = 5 - (1 - lateral.square().sum(dim=1)).sqrt()
     points_cam = torch.cat([lateral, depth[:, None]], dim=1)
-    assert not behind_others(lateral, points_cam, neighbours=24, slope=3.0).any()
+    unseen = torch.zeros(len(lateral), dtype=torch.bool)
+    found = behind_others(lateral, points_cam, ~unseen, neighbours=24, slope=3.0)
+    assert not found.any()
+    doubted = behind_others(lateral, points_cam, unseen, neighbours=24, slope=3.0)
+    assert not doubted[lateral.norm(dim=1) < 0.94].any()  # up to 70 degrees
 
 
 def test_spread_keeps_its_distance_and_prefers_quality():
