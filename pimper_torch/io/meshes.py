@@ -110,8 +110,10 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
     if encoded is not None:
         encoded = encoded[:, :3] / (255 if np.asarray(colors).dtype.kind in "ui" else 1)
     raw = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
-    has_confidence = "confidence" in (getattr(getattr(raw, "dtype", None), "names", None) or raw)
-    confidence = _rows(raw["confidence"]) if has_confidence else None
+    written = getattr(getattr(raw, "dtype", None), "names", None) or raw
+    confidence = _rows(raw["confidence"]) if "confidence" in written else None
+    if normals is None and {"nx", "ny", "nz"} <= set(written):  # of a cloud, trimesh drops them
+        normals = _rows(np.stack([np.ravel(raw[axis]) for axis in ("nx", "ny", "nz")], axis=1))
     return Mesh(
         vertices_world=transform(scene_from_part, _some_rows(part.vertices)),
         faces=faces,

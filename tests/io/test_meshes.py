@@ -83,3 +83,19 @@ def test_what_is_no_mesh_is_refused(name, content, told, tmp_path):
         (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=told):
         read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_a_point_clouds_normals_are_read(tmp_path, text):
+    rows = np.array([[0.5, -0.25, 1.5, 0, 0.6, 0.8], [1, 2, 3, 0, 0, 2]], dtype="<f4")
+    kind = "ascii" if text else "binary_little_endian"
+    names = ("x", "y", "z", "nx", "ny", "nz")
+    header = f"ply\nformat {kind} 1.0\nelement vertex 2\n"
+    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    lines = "".join(" ".join(str(value) for value in row) + "\n" for row in rows).encode()
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(header.encode() + (lines if text else rows.tobytes()))
+    cloud = read_mesh(path)
+    assert cloud.faces.shape == (0, 3)
+    wanted = torch.tensor([[0, 0.6, 0.8], [0, 0, 1]], dtype=torch.float64)
+    assert_close(cloud.normals_world, wanted, rtol=0, atol=1e-6)
