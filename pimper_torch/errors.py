@@ -24,5 +24,9 @@ class ReconstructionError(PimperError):
     """Structure from motion, or a stage after it, found too little to go on."""
 
 
+class MissingProgramError(ReconstructionError):
+    """A program that somebody else wrote is not installed here."""
+
+
 class PimperWarning(UserWarning):
     """The result is delivered, but something about it should be known."""

@@ -1,0 +1,187 @@
+"""COLMAP's dense stereo (Schönberger et al., ECCV 2016), if the user has the program.
+
+Its patch match needs an NVIDIA GPU. The Python package of COLMAP that SfM uses here is built
+without; what is run is the program ``colmap``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import nn
+
+from pimper_torch.baselines.exchange import (
+    estimate_of,
+    read_surface,
+    write_masks,
+    write_photographs,
+    write_pinhole_model,
+)
+from pimper_torch.baselines.external import Deadline, Program, all_cores, run_program, workspace
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.progress import report
+from pimper_torch.records import CoarseMesh, Estimate, SparseScene
+
+COLMAP = Program(
+    name="colmap",
+    variable="PIMPER_COLMAP",
+    source="https://colmap.github.io, built with CUDA",
+)
+
+_FUSED, _MESHED = "fused.ply", "meshed.ply"
+_PARTNERS = 20  # views that one is compared with; what COLMAP's own undistorter writes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColmapDenseConfig:
+    """COLMAP's settings under its defaults.
+
+    Attributes:
+        program: The executable or its folder; else PIMPER_COLMAP or the PATH say.
+        max_size_px: Longer side of the photographs that are compared; -1 for any.
+        mesher: What makes a mesh of the fused points; ``none`` gives the points themselves.
+        gpu: Number of the GPU, several with commas; -1 for all.
+        threads: 0 for all cores.
+        max_minutes: For all steps together; then it is stopped.
+        keep_in: Folder to leave its files in; else they are removed.
+    """
+
+    program: Path | None = None
+    max_size_px: int = -1
+    mesher: Literal["poisson", "delaunay", "none"] = "poisson"
+    gpu: str = "-1"
+    threads: int = 0
+    max_minutes: float = 120.0
+    keep_in: Path | None = None
+
+    def __post_init__(self) -> None:
+        require(
+            self.max_size_px == -1 or self.max_size_px > 0,
+            "max_size_px",
+            self.max_size_px,
+            "-1, or above 0",
+        )
+        require(self.threads >= 0, "threads", self.threads, "0 or more")
+        require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One of COLMAP's commands with its arguments."""
+
+    name: str
+    arguments: tuple[str, ...]
+
+
+class ColmapDense(nn.Module):
+    """Patch match with geometric consistency, fusion, and Poisson's or Delaunay's surface."""
+
+    def __init__(self, config: ColmapDenseConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or ColmapDenseConfig()
+
+    @torch.no_grad()
+    def forward(self, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
+        """Run COLMAP's dense stereo on the scene's photographs, cameras and cloud.
+
+        Depths off the masks are left out of the fusion if there are masks.
+
+        Args:
+            scene: Its cloud chooses pairs of views and ranges of depth.
+            coarse: Only names the reference view.
+
+        Returns:
+            A mesh in the scene's frame, or points with normals.
+
+        Raises:
+            MissingProgramError: There is no colmap here.
+            ReconstructionError: It has no CUDA, failed, took too long, or found nothing.
+            InputError: The scene has no cloud.
+        """
+        config = self.config
+        program = COLMAP.find(config.program)
+        threads = all_cores(config.threads)
+        deadline = Deadline(config.max_minutes)
+        with workspace("colmap", config.keep_in) as folder:
+            names = write_photographs(scene, folder / "images", ".png")
+            write_pinhole_model(scene, names, folder / "sparse")
+            write_stereo_folder(names, folder / "stereo")
+            masked = write_masks(scene, folder / "masks", ".png.png")
+            steps = steps_of(config, folder, threads=threads, masked=masked)
+            for done, step in enumerate(steps, start=1):
+                command: list[Path | str] = [program, step.name, *step.arguments]
+                try:
+                    printed = run_program(command, folder, deadline, threads=threads)
+                except ReconstructionError as error:
+                    raise _explained(step.name, error) from error
+                report(done, len(steps))
+            left = _FUSED if config.mesher == "none" else _MESHED
+            mesh = read_surface(folder / left, f"colmap {steps[-1].name}", printed)
+        return estimate_of(mesh, scene, coarse)
+
+
+def steps_of(
+    config: ColmapDenseConfig, folder: Path, *, threads: int, masked: bool
+) -> tuple[Step, ...]:
+    """List what is run, one after the other."""
+    here = ("--workspace_path", str(folder), "--workspace_format", "COLMAP")
+    size, fused, meshed = str(config.max_size_px), str(folder / _FUSED), str(folder / _MESHED)
+    match = Step(
+        "patch_match_stereo",
+        (
+            *here,
+            *("--PatchMatchStereo.max_image_size", size),
+            *("--PatchMatchStereo.geom_consistency", "true"),
+            *("--PatchMatchStereo.gpu_index", config.gpu),
+        ),
+    )
+    fuse = Step(
+        "stereo_fusion",
+        (
+            *(*here, "--input_type", "geometric", "--output_path", fused),
+            *("--StereoFusion.max_image_size", size),
+            *("--StereoFusion.num_threads", str(threads)),
+            *(("--StereoFusion.mask_path", str(folder / "masks")) if masked else ()),
+        ),
+    )
+    if config.mesher == "none":
+        return (match, fuse)
+    if config.mesher == "poisson":
+        wanted: tuple[str, ...] = ("--input_path", fused)
+        threaded = "--PoissonMeshing.num_threads"
+    else:
+        wanted = ("--input_path", str(folder), "--input_type", "dense")
+        threaded = "--DelaunayMeshing.num_threads"
+    mesh = Step(
+        f"{config.mesher}_mesher", (*wanted, "--output_path", meshed, threaded, str(threads))
+    )
+    return (match, fuse, mesh)
+
+
+def write_stereo_folder(names: Sequence[str], folder: Path) -> None:
+    """Write what COLMAP's undistorter would: which views to compare and to fuse, and folders.
+
+    The photographs have no lenses any more, so the undistorter itself is not run: it would
+    resample them once more.
+    """
+    for kind in ("depth_maps", "normal_maps", "consistency_graphs"):
+        (folder / kind).mkdir(parents=True)
+    pairs = "".join(f"{name}\n__auto__, {_PARTNERS}\n" for name in names)
+    (folder / "patch-match.cfg").write_text(pairs, encoding="ascii")
+    (folder / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="ascii")
+
+
+def _explained(step: str, error: ReconstructionError) -> ReconstructionError:
+    """Say what a failing step usually lacks."""
+    lines = f"colmap {step}: {error}"
+    if "requires CUDA" in str(error) or "CUDA error" in str(error):
+        lines = (
+            "COLMAP's dense stereo needs a build with CUDA and an NVIDIA GPU, and this one cannot "
+            f"use any. Install one from {COLMAP.source}, or leave this method out.\n{lines}"
+        )
+    elif "requires CGAL" in str(error):
+        lines = f"This COLMAP has no Delaunay mesher; use `mesher: poisson`.\n{lines}"
+    return ReconstructionError(lines)

@@ -1,0 +1,213 @@
+"""Programs that somebody else wrote: finding them, running them, saying what went wrong."""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
+
+_LAST_LINES = 15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Program:
+    """An executable that a user may have.
+
+    Attributes:
+        name: As it is called on the command line.
+        variable: Environment variable that may name it, or the folder it lies in.
+        source: Where to get it.
+        places: Folders that its installer uses and that are seldom on the PATH.
+    """
+
+    name: str
+    variable: str
+    source: str
+    places: tuple[Path, ...] = ()
+
+    def find(self, given: Path | None = None) -> Path:
+        """Find the executable: as given, as the variable says, on the PATH, in its places.
+
+        Args:
+            given: The executable itself, or the folder it lies in. If set, nowhere else is
+                looked.
+
+        Raises:
+            MissingProgramError: Says where it was looked for and where to get it.
+        """
+        named = given or (Path(os.environ[self.variable]) if self.variable in os.environ else None)
+        if named is not None:
+            found = _executable(named / self.name if named.is_dir() else named)
+            if found is None:
+                raise MissingProgramError(
+                    f"{self.name} is not installed at {named}, where "
+                    f"{'the settings say' if given else self.variable + ' says'}; needed: the "
+                    f"executable, or the folder it lies in. {self._advice}"
+                )
+            return found
+        on_path = shutil.which(self.name)
+        if on_path is not None:
+            return Path(on_path).absolute()
+        for place in self.places:
+            found = _executable(place / self.name)
+            if found is not None:
+                return found
+        raise MissingProgramError(
+            f"{self.name} is not installed: it is neither on the PATH nor named by "
+            f"{self.variable}. {self._advice}"
+        )
+
+    @property
+    def _advice(self) -> str:
+        return (
+            f"Get it from {self.source}, or point {self.variable} to it, or leave this method out."
+        )
+
+
+def _executable(path: Path) -> Path | None:
+    # Absolute, for it will run in another folder.
+    return path.absolute() if path.is_file() and os.access(path, os.X_OK) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Deadline:
+    """A limit of time that several programs share.
+
+    Attributes:
+        minutes: From now on.
+        began: Set by itself.
+    """
+
+    minutes: float
+    began: float = field(default_factory=time.monotonic)
+
+    @property
+    def seconds_left(self) -> float:
+        """Time until then; negative after it."""
+        return 60 * self.minutes - (time.monotonic() - self.began)
+
+
+@contextmanager
+def workspace(method: str, keep_in: Path | None) -> Iterator[Path]:
+    """Give an empty folder to exchange files in; it is removed at the end, come what may.
+
+    Args:
+        method: Begins the folder's name.
+        keep_in: Folder in which to make it, and to leave it for a look at its files.
+    """
+    if keep_in is None:
+        with tempfile.TemporaryDirectory(prefix=f"pimper-{method}-") as folder:
+            yield Path(folder).resolve()
+        return
+    try:
+        keep_in.mkdir(parents=True, exist_ok=True)
+        kept = Path(tempfile.mkdtemp(prefix=f"{method}-", dir=keep_in)).resolve()
+    except OSError as error:
+        raise InputError(
+            f"keep_in is {keep_in}, where no folder can be made ({error.strerror}). Choose a "
+            "folder that may be written, or leave it out."
+        ) from error
+    yield kept
+
+
+def run_program(
+    command: Sequence[Path | str], folder: Path, deadline: Deadline, *, threads: int
+) -> str:
+    """Run a program in a folder, without a shell, and wait for it.
+
+    It and all that it started are stopped at the deadline or when we are interrupted.
+
+    Args:
+        command: Executable and arguments.
+        folder: Working directory. What the program prints is kept there too.
+        deadline: When to stop it.
+        threads: For programs that ask OpenMP.
+
+    Returns:
+        What it printed.
+
+    Raises:
+        MissingProgramError: It cannot be started at all.
+        ReconstructionError: It failed or took too long; with its last lines.
+    """
+    name = Path(command[0]).name
+    began = time.monotonic()
+    with tempfile.NamedTemporaryFile(
+        prefix=f"{name}-", suffix=".log", dir=folder, delete=False
+    ) as log:
+        try:
+            process = subprocess.Popen(
+                [str(part) for part in command],
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                # COLMAP's Qt asks for a screen otherwise, which a server has not.
+                env=os.environ | {"OMP_NUM_THREADS": str(threads), "QT_QPA_PLATFORM": "offscreen"},
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise MissingProgramError(
+                f"{command[0]} cannot be started ({error.strerror}); needed: an executable for "
+                "this machine."
+            ) from error
+        try:
+            status = process.wait(timeout=max(0.0, deadline.seconds_left))
+        except subprocess.TimeoutExpired as error:
+            _stop(process)
+            raise ReconstructionError(
+                f"{name} was stopped: {deadline.minutes:g} minutes are over. Raise `max_minutes`, "
+                f"or work on smaller photographs.{last_lines(_text(Path(log.name)))}"
+            ) from error
+        except BaseException:
+            _stop(process)
+            raise
+    printed = _text(Path(log.name))
+    if status != 0:
+        raise ReconstructionError(
+            f"{name} failed after {time.monotonic() - began:.0f} s ({_ending(status)})."
+            f"{last_lines(printed)}"
+        )
+    return printed
+
+
+def last_lines(printed: str) -> str:
+    """Quote the end of what a program printed, ready to follow a message."""
+    lines = [line.rstrip() for line in printed.splitlines() if line.strip()][-_LAST_LINES:]
+    if not lines:
+        return " It printed nothing."
+    return "".join(["\nIts last lines:", *(f"\n  {line}" for line in lines)])
+
+
+def all_cores(threads: int) -> int:
+    """Read 0 threads as one for every core."""
+    return threads or os.cpu_count() or 1
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _ending(status: int) -> str:
+    if status >= 0:
+        return f"exit status {status}"
+    try:
+        name = signal.Signals(-status).name
+    except ValueError:
+        name = f"signal {-status}"
+    often = "; often because memory ran out" if name == "SIGKILL" else ""
+    return f"ended by {name}{often}"
