@@ -4,8 +4,10 @@ Its patch match needs an NVIDIA GPU. The Python package of COLMAP that SfM uses 
 without; what is run is the program ``colmap``.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -43,6 +45,8 @@ class ColmapDenseConfig:
         program: The executable or its folder; else PIMPER_COLMAP or the PATH say.
         max_size_px: Longer side of the photographs that are compared; -1 for any.
         mesher: What makes a mesh of the fused points; ``none`` gives the points themselves.
+        poisson_trim: Depth of the octree below which Poisson's surface is trimmed away; by the
+            number of points if not set, see :func:`trim_depth`.
         gpu: Number of the GPU, several with commas; -1 for all.
         threads: 0 for all cores.
         max_minutes: For all steps together; then it is stopped.
@@ -52,6 +56,7 @@ class ColmapDenseConfig:
     program: Path | None = None
     max_size_px: int = -1
     mesher: Literal["poisson", "delaunay", "none"] = "poisson"
+    poisson_trim: float | None = None
     gpu: str = "-1"
     threads: int = 0
     max_minutes: float = 120.0
@@ -64,6 +69,8 @@ class ColmapDenseConfig:
             self.max_size_px,
             "-1, or above 0",
         )
+        trim = self.poisson_trim
+        require(trim is None or trim >= 0, "poisson_trim", trim, "0 or more, or nothing")
         require(self.threads >= 0, "threads", self.threads, "0 or more")
         require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
 
@@ -104,61 +111,86 @@ class ColmapDense(nn.Module):
         config = self.config
         program = COLMAP.find(config.program)
         threads = all_cores(config.threads)
-        deadline = Deadline(config.max_minutes)
         with workspace("colmap", config.keep_in) as folder:
             names = write_photographs(scene, folder / "images", ".png")
             write_pinhole_model(scene, names, folder / "sparse")
             write_stereo_folder(names, folder / "stereo")
             masked = write_masks(scene, folder / "masks", ".png.png")
-            steps = steps_of(config, folder, threads=threads, masked=masked)
-            for done, step in enumerate(steps, start=1):
-                command: list[Path | str] = [program, step.name, *step.arguments]
-                try:
-                    printed = run_program(command, folder, deadline, threads=threads)
-                except ReconstructionError as error:
-                    raise _explained(step.name, error) from error
-                report(done, len(steps))
-            left = _FUSED if config.mesher == "none" else _MESHED
-            mesh = read_surface(folder / left, f"colmap {steps[-1].name}", printed)
+            run = partial(_run, program, folder, Deadline(config.max_minutes), threads)
+            run(match_step(config, folder))
+            report(1, 3)
+            printed = run(fuse_step(config, folder, threads=threads, masked=masked))
+            report(2, 3)
+            mesh = read_surface(folder / _FUSED, "colmap stereo_fusion", printed)
+            if config.mesher != "none":
+                num_points = len(mesh.vertices_world)
+                step = mesh_step(config, folder, num_points, threads=threads)
+                mesh = read_surface(folder / _MESHED, f"colmap {step.name}", run(step))
+            report(3, 3)
         return estimate_of(mesh, scene, coarse)
 
 
-def steps_of(
-    config: ColmapDenseConfig, folder: Path, *, threads: int, masked: bool
-) -> tuple[Step, ...]:
-    """List what is run, one after the other."""
-    here = ("--workspace_path", str(folder), "--workspace_format", "COLMAP")
-    size, fused, meshed = str(config.max_size_px), str(folder / _FUSED), str(folder / _MESHED)
-    match = Step(
+def match_step(config: ColmapDenseConfig, folder: Path) -> Step:
+    """Depth and normals of every view, first alone, then consistent with one another."""
+    return Step(
         "patch_match_stereo",
         (
-            *here,
-            *("--PatchMatchStereo.max_image_size", size),
+            *("--workspace_path", str(folder), "--workspace_format", "COLMAP"),
+            *("--PatchMatchStereo.max_image_size", str(config.max_size_px)),
             *("--PatchMatchStereo.geom_consistency", "true"),
             *("--PatchMatchStereo.gpu_index", config.gpu),
         ),
     )
-    fuse = Step(
+
+
+def fuse_step(config: ColmapDenseConfig, folder: Path, *, threads: int, masked: bool) -> Step:
+    """Points where the views' depths agree."""
+    masks = ("--StereoFusion.mask_path", str(folder / "masks")) if masked else ()
+    return Step(
         "stereo_fusion",
         (
-            *(*here, "--input_type", "geometric", "--output_path", fused),
-            *("--StereoFusion.max_image_size", size),
+            *("--workspace_path", str(folder), "--workspace_format", "COLMAP"),
+            *("--input_type", "geometric", "--output_path", str(folder / _FUSED)),
+            *("--StereoFusion.max_image_size", str(config.max_size_px)),
             *("--StereoFusion.num_threads", str(threads)),
-            *(("--StereoFusion.mask_path", str(folder / "masks")) if masked else ()),
+            *masks,
         ),
     )
-    if config.mesher == "none":
-        return (match, fuse)
-    if config.mesher == "poisson":
-        wanted: tuple[str, ...] = ("--input_path", fused)
-        threaded = "--PoissonMeshing.num_threads"
-    else:
-        wanted = ("--input_path", str(folder), "--input_type", "dense")
-        threaded = "--DelaunayMeshing.num_threads"
-    mesh = Step(
-        f"{config.mesher}_mesher", (*wanted, "--output_path", meshed, threaded, str(threads))
+
+
+def mesh_step(config: ColmapDenseConfig, folder: Path, num_points: int, *, threads: int) -> Step:
+    """A surface through the points."""
+    output = ("--output_path", str(folder / _MESHED))
+    if config.mesher == "delaunay":
+        return Step(
+            "delaunay_mesher",
+            (
+                *("--input_path", str(folder), "--input_type", "dense", *output),
+                *("--DelaunayMeshing.num_threads", str(threads)),
+            ),
+        )
+    trim = trim_depth(num_points) if config.poisson_trim is None else config.poisson_trim
+    return Step(
+        "poisson_mesher",
+        (
+            *("--input_path", str(folder / _FUSED), *output),
+            *("--PoissonMeshing.trim", f"{trim:.2f}"),
+            *("--PoissonMeshing.num_threads", str(threads)),
+        ),
     )
-    return (match, fuse, mesh)
+
+
+def trim_depth(num_points: int) -> float:
+    """Choose the depth of the octree below which Poisson's surface is no longer believed.
+
+    COLMAP's own default, 10, suits clouds of ten million points; of a small one it trims all
+    away. A surface has a quarter of the points on each level up, so that the same density, as
+    a share of the cloud's own, lies at 10 less the quaternary logarithm of what is missing.
+
+    >>> trim_depth(10_000_000)
+    10.0
+    """
+    return max(0.0, 10.0 - math.log(1e7 / max(1, num_points), 4))
 
 
 def write_stereo_folder(names: Sequence[str], folder: Path) -> None:
@@ -172,6 +204,14 @@ def write_stereo_folder(names: Sequence[str], folder: Path) -> None:
     pairs = "".join(f"{name}\n__auto__, {_PARTNERS}\n" for name in names)
     (folder / "patch-match.cfg").write_text(pairs, encoding="ascii")
     (folder / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="ascii")
+
+
+def _run(program: Path, folder: Path, deadline: Deadline, threads: int, step: Step) -> str:
+    """Run one step; give what it printed."""
+    try:
+        return run_program([program, step.name, *step.arguments], folder, deadline, threads=threads)
+    except ReconstructionError as error:
+        raise _explained(step.name, error) from error
 
 
 def _explained(step: str, error: ReconstructionError) -> ReconstructionError:

@@ -5,7 +5,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.baselines.colmap_dense import ColmapDense, ColmapDenseConfig
+from pimper_torch.baselines.colmap_dense import ColmapDense, ColmapDenseConfig, trim_depth
 from pimper_torch.errors import ConfigError, MissingProgramError, ReconstructionError
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
@@ -146,6 +146,21 @@ def test_settings_reach_the_commands(reconstruction, triangle, tmp_path):
     assert "'--StereoFusion.max_image_size': '777'" in printed
     assert "'--PatchMatchStereo.gpu_index': '1'" in printed
     assert "'--PoissonMeshing.num_threads': '5'" in printed
+
+
+def test_poissons_surface_is_trimmed_by_the_density_of_the_cloud(
+    reconstruction, triangle, tmp_path
+):
+    # COLMAP's 10 trims the whole surface away from a cloud of some thousand points.
+    assert trim_depth(10_000_000) == pytest.approx(10)
+    assert trim_depth(4 * 5000) == pytest.approx(trim_depth(5000) + 1)
+    assert trim_depth(0) == 0
+    install(tmp_path, triangle)
+    for trim, wanted in ((None, "0.00"), (7.0, "7.00")):  # one point; as set
+        config = ColmapDenseConfig(poisson_trim=trim, keep_in=tmp_path / wanted)
+        ColmapDense(config)(reconstruction.scene, reconstruction.coarse)
+        printed = "".join(path.read_text() for path in (tmp_path / wanted).rglob("colmap-*.log"))
+        assert f"'--PoissonMeshing.trim': '{wanted}'" in printed
 
 
 def test_a_colmap_without_cuda_is_told_from_one_that_found_nothing(
