@@ -25,8 +25,7 @@ def lights_account(result: Reconstruction) -> Account:
     """
     facets, lights_world, determined = world_lights(result)
     lit = (lights_world != 0).any(dim=-1)
-    counted = (lit & determined[:, None])[..., None]
-    mean = (lights_world * counted).sum(dim=0) / counted.sum(dim=0).clamp_min(1)
+    mean, counts = mean_lights(lights_world, determined)
     views = result.scene.views.names
     return {
         "reference": views[result.coarse.reference],
@@ -34,8 +33,8 @@ def lights_account(result: Reconstruction) -> Account:
         "views": [
             {
                 "name": name,
-                "light": _rounded(mean[index]) if bool(counted[:, index].any()) else None,
-                "patches": int(counted[:, index].sum()),
+                "light": _rounded(mean[index]) if counts[index] > 0 else None,
+                "patches": int(counts[index]),
             }
             for index, name in enumerate(views)
         ],
@@ -53,6 +52,20 @@ def lights_account(result: Reconstruction) -> Account:
             )
         ],
     }
+
+
+def mean_lights(
+    lights_world: Float[Tensor, "patch view 4"], determined: Bool[Tensor, " patch"]
+) -> tuple[Float[Tensor, "view 4"], Int[Tensor, " view"]]:
+    """Average the lights of every view over the patches that determine them.
+
+    Returns:
+        The averages, and over how many patches each is taken; zero where over none.
+    """
+    counted = (lights_world != 0).any(dim=-1) & determined[:, None]
+    counts = counted.sum(dim=0)
+    total = (lights_world * counted[..., None]).sum(dim=0)
+    return total / counts[:, None].clamp_min(1), counts
 
 
 def world_lights(
