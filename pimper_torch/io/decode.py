@@ -22,7 +22,7 @@ from pimper_torch.records import Record
 Result = TypeVar("Result")
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-_FORMATS = ("JPEG", "PNG", "TIFF")
+_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two hold published data sets
 # Diagonal of the 36 mm x 24 mm frame, to which CIPA DCG-001 relates the 35 mm equivalent.
 _FRAME_DIAGONAL_MM = math.hypot(36, 24)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's FocalPlaneResolutionUnit
@@ -118,6 +118,11 @@ def decode(path: Path) -> Decoded:
         alpha=planes[..., -1] if has_alpha else None,
         lossy=path.suffix.lower() in (".jpg", ".jpeg"),
     )
+
+
+def write_deep_png(samples: np.ndarray, path: Path) -> None:
+    """Write 16-bit colour, ``height width 3``, which Pillow would cut to 8 bits."""
+    kornia_rs.io.write_image_png_u16(str(path), samples, mode="rgb")
 
 
 def focal_from_exif(tags: Mapping[int, object], width: int, height: int) -> float:

@@ -2,12 +2,14 @@
 
 import torch
 
+from pimper_torch.scenes.bodies import Body
 from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.lights import wandering_lights
 from pimper_torch.scenes.meshes import potato, table
 from pimper_torch.scenes.noise import random_speckle
-from pimper_torch.scenes.render import Body, SensorConfig, render_bodies
+from pimper_torch.scenes.render import render_bodies
 from pimper_torch.scenes.rendered import RenderedScene
+from pimper_torch.scenes.sensor import SensorConfig
 
 
 def potato_on_table(
@@ -34,7 +36,7 @@ def potato_on_table(
         height: Pixels.
         span_deg: Of the arc.
         flash: Irradiance of a lamp on the camera itself.
-        gloss: Strength of the potato's highlight.
+        gloss: Share of light that the potato mirrors; 0.04 is varnish.
         contrast: Of the texture; see :func:`random_speckle`.
         sensor: ``None`` is the default one.
     """
@@ -43,13 +45,15 @@ def potato_on_table(
         Body(
             mesh=potato(generator),
             texture=random_speckle(generator, contrast=contrast),
-            gloss=gloss,
+            specular=gloss,
+            roughness=0.35,
         ),
         Body(
             mesh=table(),
             texture=random_speckle(
                 generator, cells=(0.53, 0.23, 0.097, 0.043, 0.019), contrast=contrast
             ),
+            surroundings=True,
         ),
     )
     middle = (0.0, 0.0, 0.7)

@@ -9,6 +9,35 @@ from torch.nn.functional import normalize
 
 from pimper_torch.records import Record
 
+# Farther by this factor, falloff over an object is below what float32 tells.
+_FAR = 1e5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Lamp(Record):
+    """The light of one photograph, in float32; see :class:`Lights`."""
+
+    position: Float[Tensor, " 3"]
+    target: Float[Tensor, " 3"]
+    irradiance: float
+    ambient: float
+    flash: float
+
+    def arriving(
+        self, points: Float[Tensor, "*batch 3"], place: Float[Tensor, " 3"], irradiance: float
+    ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
+        """Give the direction to a light, and the irradiance across it, at points.
+
+        Args:
+            points: World.
+            place: Of the light.
+            irradiance: Of the light at the target.
+        """
+        toward = place - points
+        distance = toward.norm(dim=-1)
+        falloff = ((place - self.target).norm() / distance) ** 2
+        return toward / distance[..., None], irradiance * falloff
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Lights(Record):
@@ -32,6 +61,16 @@ class Lights(Record):
     ambient: Float[Tensor, " view"]
     target_world: Float[Tensor, " 3"]
     flash: Float[Tensor, " view"]
+
+    def lamp(self, view: int) -> Lamp:
+        """Pick the light of one photograph."""
+        return Lamp(
+            position=self.positions_world[view].float(),
+            target=self.target_world.float(),
+            irradiance=float(self.irradiance[view]),
+            ambient=float(self.ambient[view]),
+            flash=float(self.flash[view]),
+        )
 
     def harmonics_world(
         self, eyes_world: Float[Tensor, "view 3"] | None = None
@@ -76,18 +115,9 @@ def wandering_lights(
         target: What is lit.
         toward: Axis of the cone the lamp moves in.
     """
-
-    def uniform(low: float, high: float) -> Float[Tensor, " view"]:
-        share = torch.rand(num_views, generator=generator, dtype=torch.float64)
-        return low + (high - low) * share
-
     axis = normalize(torch.tensor(toward, dtype=torch.float64), dim=0)
     aside = torch.linalg.svd(axis[None]).Vh[1:]
-    # The plastic number's sequence fills a square evenly however few its points are, so that
-    # a dozen photographs already have lights from all sides (Roberts, 2018).
-    steps = torch.arange(num_views, dtype=torch.float64)[:, None]
-    square = torch.rand(2, generator=generator, dtype=torch.float64)
-    square = torch.remainder(square + steps * square.new_tensor([0.7548776662, 0.5698402910]), 1)
+    square = _even_square(num_views, generator)
     turn = 2 * torch.pi * square[:, 0]
     lowest, highest = torch.deg2rad(torch.tensor([spread_deg, least_tilt_deg])).cos().tolist()
     cosine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
@@ -96,9 +126,71 @@ def wandering_lights(
     direction = cosine[:, None] * axis + sine[:, None] * across
     target_world = torch.tensor(target, dtype=torch.float64)
     return Lights(
-        positions_world=target_world + (distance * uniform(0.75, 1.25))[:, None] * direction,
-        irradiance=irradiance * uniform(0.75, 1.25),
-        ambient=ambient * uniform(0.75, 1.25),
+        positions_world=target_world
+        + (distance * _about_one(num_views, generator))[:, None] * direction,
+        irradiance=irradiance * _about_one(num_views, generator),
+        ambient=ambient * _about_one(num_views, generator),
         target_world=target_world,
         flash=torch.full((num_views,), flash, dtype=torch.float64),
     )
+
+
+def lights_round(
+    azimuths: Float[Tensor, " view"],
+    generator: torch.Generator,
+    *,
+    distance: float,
+    target: Float[Tensor, " 3"],
+    irradiance: float,
+    ambient: float,
+    flash: float = 0.0,
+    far: bool = False,
+    sweep_deg: float = 160.0,
+    elevations_deg: tuple[float, float] = (18.0, 72.0),
+) -> Lights:
+    """Carry a lamp round an object on a table, on the side that is photographed; float64.
+
+    Args:
+        azimuths: Radians about the world's z, counter-clockwise from -y: the middle of the
+            lamp's sweep in each photograph.
+        generator: Decides where the lamp goes, and how bright it is.
+        distance: From the target, scene units; drawn up to a quarter nearer or farther.
+        target: What is lit.
+        irradiance: Mean over the views; drawn up to a quarter less or more.
+        ambient: The same.
+        flash: The same for every view.
+        far: The lamp is so far away that its light comes from one direction and does not
+            fall off.
+        sweep_deg: How far round the object the lamp goes.
+        elevations_deg: Lowest and highest place of the lamp over the table's plane.
+    """
+    count = len(azimuths)
+    square = _even_square(count, generator)
+    turn = azimuths + torch.deg2rad(sweep_deg * (square[:, 0] - 0.5))
+    lowest, highest = torch.deg2rad(torch.tensor(elevations_deg)).sin().tolist()
+    sine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
+    cosine = (1 - sine**2).sqrt()
+    direction = torch.stack([cosine * turn.sin(), -cosine * turn.cos(), sine], dim=-1)
+    away = distance * _about_one(count, generator)
+    return Lights(
+        positions_world=target + (_FAR if far else 1) * away[:, None] * direction,
+        irradiance=irradiance * _about_one(count, generator),
+        ambient=ambient * _about_one(count, generator),
+        target_world=target,
+        flash=torch.full((count,), flash, dtype=torch.float64),
+    )
+
+
+def _about_one(count: int, generator: torch.Generator) -> Float[Tensor, " view"]:
+    return 0.75 + 0.5 * torch.rand(count, generator=generator, dtype=torch.float64)
+
+
+def _even_square(count: int, generator: torch.Generator) -> Float[Tensor, "view 2"]:
+    """Spread points over the unit square.
+
+    The plastic number's sequence fills it evenly however few its points are, so that a dozen
+    photographs already have lights from all sides (Roberts, 2018).
+    """
+    steps = torch.arange(count, dtype=torch.float64)[:, None]
+    start = torch.rand(2, generator=generator, dtype=torch.float64)
+    return torch.remainder(start + steps * start.new_tensor([0.7548776662, 0.5698402910]), 1)

@@ -1,5 +1,7 @@
 """Procedural triangle meshes for ray-traced scenes; the world's z points up."""
 
+import math
+
 import torch
 import trimesh
 from jaxtyping import Float, Int
@@ -35,14 +37,69 @@ def potato(generator: torch.Generator, *, subdivisions: int = 6, bumps: float = 
     return _mesh(body, faces)
 
 
-def table(half_side: float = 4.0) -> Mesh:
-    """Lay a square in the plane ``z = 0``, facing up."""
-    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64)
-    return _mesh(half_side * corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
+def table(half_side: float = 4.0, cells: int = 1) -> Mesh:
+    """Lay a square in the plane ``z = 0``, facing up.
+
+    Args:
+        half_side: Scene units.
+        cells: Along each side; light between bodies is known at their corners.
+    """
+    side = torch.linspace(-half_side, half_side, cells + 1, dtype=torch.float64)
+    y, x = torch.meshgrid(side, side, indexing="ij")
+    grid = torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3)
+    return _mesh(grid, _grid_faces(cells + 1, cells + 1))
+
+
+def lathe(profile: Float[Tensor, "level 2"], around: int = 192) -> Mesh:
+    """Turn a profile about the z axis to a closed solid.
+
+    Args:
+        profile: Radius and height of each level, upwards; the first and the last radius are
+            0, no other is.
+        around: Vertices on each ring.
+    """
+    turn = 2 * torch.pi * torch.arange(around, dtype=profile.dtype) / around
+    radius, height = profile[1:-1].unbind(dim=-1)
+    rings = torch.stack(
+        [
+            radius[:, None] * turn.cos(),
+            radius[:, None] * turn.sin(),
+            height[:, None].expand(-1, around),
+        ],
+        dim=-1,
+    ).reshape(-1, 3)
+    poles = torch.stack([profile.new_tensor([0, 0, profile[end, 1]]) for end in (0, -1)])
+    wall = _grid_faces(len(radius), around + 1)
+    wall = wall // (around + 1) * around + wall % (around + 1) % around  # the seam closes
+    ring = torch.arange(around)
+    after = (ring + 1) % around
+    bottom, top = len(rings), len(rings) + 1
+    last = len(rings) - around
+    below = torch.stack([torch.full_like(ring, bottom), after, ring], dim=1)
+    above = torch.stack([torch.full_like(ring, top), last + ring, last + after], dim=1)
+    return _mesh(torch.cat([rings, poles]), torch.cat([wall, below, above]))
+
+
+def moved(
+    mesh: Mesh,
+    *,
+    scale: float = 1.0,
+    turn_deg: float = 0.0,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Mesh:
+    """Scale a mesh, turn it about the z axis, then shift it."""
+    cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    vertices = mesh.vertices_world
+    rotation = vertices.new_tensor([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    normals = mesh.normals_world
+    return mesh.replace(
+        vertices_world=scale * vertices @ rotation.mT + vertices.new_tensor(shift),
+        normals_world=None if normals is None else normals @ rotation.mT,
+    )
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """Put meshes in one, their faces in the order given; only geometry is kept."""
+    """Put meshes in one, their faces in the order given; only vertices and faces are kept."""
     offsets, count = [], 0
     for mesh in meshes:
         offsets.append(mesh.faces + count)
@@ -51,6 +108,14 @@ def join(*meshes: Mesh) -> Mesh:
         vertices_world=torch.cat([mesh.vertices_world for mesh in meshes]),
         faces=torch.cat(offsets),
     )
+
+
+def _grid_faces(rows: int, columns: int) -> Int[Tensor, "face 3"]:
+    """Split the cells of a grid of vertices; with x along columns they face +z."""
+    first = (torch.arange(rows - 1)[:, None] * columns + torch.arange(columns - 1)).reshape(-1)
+    lower = torch.stack([first, first + 1, first + columns + 1], dim=1)
+    upper = torch.stack([first, first + columns + 1, first + columns], dim=1)
+    return torch.cat([lower, upper])
 
 
 def _mesh(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> Mesh:

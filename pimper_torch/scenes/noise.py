@@ -79,6 +79,9 @@ class Speckle:
         darkest: Lowest albedo.
         brightest: Highest albedo.
         contrast: Steepness of the push; the smaller, the less texture.
+        offset: Added before the push: far from 0, most is light (or dark) and only rare
+            spots are not.
+        tint: Multiplies each channel.
     """
 
     lattices: Float[Tensor, "octave channel side side side"]
@@ -87,6 +90,8 @@ class Speckle:
     darkest: float
     brightest: float
     contrast: float
+    offset: float = 0.0
+    tint: tuple[float, ...] = (1.0,)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
         """Give the albedo at points."""
@@ -100,9 +105,9 @@ class Speckle:
             wrapped = pad(lattice[None].to(rows), (0, 1, 0, 1, 0, 1), mode="circular")
             values = grid_sample(wrapped, grid[None, None, None], align_corners=True)
             total = total + weight * values[0, :, 0, 0]
-        share = torch.sigmoid(self.contrast * total)
+        share = torch.sigmoid(self.contrast * (total + self.offset))
         albedo = self.darkest + (self.brightest - self.darkest) * share
-        return albedo.mT.reshape(*points.shape[:-1], channels)
+        return (albedo.mT * rows.new_tensor(self.tint)).reshape(*points.shape[:-1], channels)
 
 
 def random_speckle(
@@ -114,6 +119,8 @@ def random_speckle(
     contrast: float = 2.5,
     colour: float = 0.35,
     channels: int = 3,
+    offset: float = 0.0,
+    tint: tuple[float, ...] = (1.0,),
 ) -> Speckle:
     """Draw a texture.
 
@@ -125,6 +132,9 @@ def random_speckle(
         contrast: 0 is uniform; 2.5 gives plenty of features to structure from motion.
         colour: 0 is gray; 1 gives the channels nothing in common.
         channels: Of the albedo.
+        offset: Positive leaves rare dark spots, negative rare light ones; the values it is
+            added to have a standard deviation of about half the root of the octaves.
+        tint: Multiplies the channels; one number, or one for each.
     """
     side = 64  # repeats after 64 cells; no two octaves repeat together
     shape = (len(cells), 1, side, side, side)
@@ -137,4 +147,6 @@ def random_speckle(
         darkest=darkest,
         brightest=brightest,
         contrast=contrast,
+        offset=offset,
+        tint=tint,
     )

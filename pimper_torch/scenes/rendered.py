@@ -25,6 +25,7 @@ class RenderedScene(Record):
         albedo: Linear; zero where the ray meets nothing.
         foreground: True on the object, false on the table and the background.
         lit: True where the point light reaches the surface.
+        highlight: True where a highlight adds noticeably to the matte part.
         mesh: What was ray traced; ``None`` for closed forms.
     """
 
@@ -36,4 +37,5 @@ class RenderedScene(Record):
     albedo: Float[Tensor, "view height width channel"]
     foreground: Bool[Tensor, "view height width"]
     lit: Bool[Tensor, "view height width"]
+    highlight: Bool[Tensor, "view height width"]
     mesh: Mesh | None = None

@@ -7,8 +7,9 @@ from torch import Tensor
 from pimper_torch.config import require
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
-from pimper_torch.records import Cameras, Lens, SparseScene
+from pimper_torch.records import Cameras, SparseScene
 from pimper_torch.scenes.rendered import RenderedScene
+from pimper_torch.scenes.tracks import pinhole_lenses
 
 
 def sparse_scene(
@@ -71,7 +72,7 @@ def sparse_scene(
         observation_point=point_index,
         observation_view=view_index,
         observation_pixels=pixels[seen].to(dtype),
-        lenses=_lenses(cameras),
+        lenses=pinhole_lenses(cameras),
     )
 
 
@@ -155,20 +156,3 @@ def _mislead(
     factor = 1 + (torch.rand(count, 1, generator=generator, dtype=torch.float64) - 0.5).to(points)
     moved = eyes + factor * (points[wrong] - eyes)
     return torch.cat([moved, points[count:]]), seen
-
-
-def _lenses(cameras: Cameras) -> tuple[Lens, ...]:
-    lenses = []
-    for K, (width, height) in zip(
-        cameras.intrinsics.tolist(), cameras.sizes_px.tolist(), strict=True
-    ):
-        lenses.append(
-            Lens(
-                camera=1,
-                model="PINHOLE",
-                params=(K[0][0], K[1][1], K[0][2], K[1][2]),
-                width=width,
-                height=height,
-            )
-        )
-    return tuple(lenses)

@@ -1,0 +1,183 @@
+"""A whole scene, ready to be photographed: bodies, cameras and lamps."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.records import Cameras, Mesh
+from pimper_torch.scenes.bodies import Body, albedo_at_vertices, normals_at_vertices
+from pimper_torch.scenes.cameras import (
+    UP,
+    aim_to_fit,
+    arc_directions,
+    handheld_directions,
+    look_at,
+    pinholes,
+    turntable_directions,
+)
+from pimper_torch.scenes.config import SceneConfig
+from pimper_torch.scenes.lights import Lights, lights_round
+from pimper_torch.scenes.meshes import join
+from pimper_torch.scenes.noise import random_speckle
+from pimper_torch.scenes.objects import RECIPES, cloth
+
+OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
+_FOCAL = 1.6  # widths of the picture: a normal to short telephoto lens
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """Everything that photographs are computed from.
+
+    Attributes:
+        name: Of the object, or the path of its mesh.
+        config: How it is photographed.
+        bodies: The object's first, then its surroundings.
+        cameras: One a photograph; float64.
+        lights: One a photograph.
+    """
+
+    name: str
+    config: SceneConfig
+    bodies: tuple[Body, ...]
+    cameras: Cameras
+    lights: Lights
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """File names of the photographs."""
+        return tuple(f"view_{view:03d}.png" for view in range(self.config.num_views))
+
+    @property
+    def object_mesh(self) -> Mesh:
+        """The object alone, with albedo and normals at the vertices."""
+        return _dressed([body for body in self.bodies if not body.surroundings])
+
+    @property
+    def surroundings_mesh(self) -> Mesh:
+        """The table."""
+        return _dressed([body for body in self.bodies if body.surroundings])
+
+    def noise(self, view: int) -> torch.Generator:
+        """Give the random numbers of one photograph, whoever renders it."""
+        seed = np.random.SeedSequence((self.config.seed, view)).generate_state(1, np.uint64)[0]
+        return torch.Generator().manual_seed(int(seed >> np.uint64(1)))
+
+
+def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
+    """Put an object on a table, and place cameras and lamps round it.
+
+    Args:
+        name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, or the path of a mesh file, which
+            is scaled to the size of the others. Its vertex colours are its texture; without
+            any it gets one.
+        config: How it is photographed.
+
+    Raises:
+        InputError: No such scene and no such file, or a mesh that has no surface.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    recipe = RECIPES.get(str(name_or_path))
+    bodies = recipe(generator) if recipe else (_read_body(name_or_path, config, generator),)
+    bodies = tuple(_finished(body, config) for body in bodies)
+    points = join(*(body.mesh for body in bodies)).vertices_world
+    lowest, highest = points.amin(dim=0), points.amax(dim=0)
+    toward = _toward(config, generator)
+    focal_px = _FOCAL * config.width
+    target, distance = aim_to_fit(
+        toward,
+        points,
+        focal_px=focal_px,
+        width=config.width,
+        height=config.height,
+        fill=config.fill,
+    )
+    eyes = target + distance * toward
+    poses = look_at(eyes, target, target.new_tensor(UP))
+    azimuths = torch.atan2(toward[:, 0], -toward[:, 1])
+    lights = lights_round(
+        torch.zeros_like(azimuths) if config.path == "arc" else azimuths,
+        generator,
+        distance=config.lamp_distance * float((highest - lowest).amax()),
+        target=(lowest + highest) / 2,
+        irradiance=config.irradiance,
+        ambient=config.ambient,
+        flash=config.flash,
+        far=config.light == "directional",
+    )
+    return Scene(
+        name=str(name_or_path),
+        config=config,
+        bodies=(*bodies, cloth(generator)),
+        cameras=pinholes(poses, focal_px, config.width, config.height),
+        lights=lights,
+    )
+
+
+def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "view 3"]:
+    if config.path == "turntable":
+        return turntable_directions(config.num_views, elevation_deg=config.elevation_deg)
+    if config.path == "handheld":
+        return handheld_directions(config.num_views, generator, elevation_deg=config.elevation_deg)
+    return arc_directions(
+        config.num_views,
+        span_deg=config.span_deg,
+        elevation_deg=config.elevation_deg,
+        sway_deg=config.sway_deg,
+    )
+
+
+def _finished(body: Body, config: SceneConfig) -> Body:
+    specular = body.specular if config.specular is None else config.specular
+    roughness = body.roughness if config.roughness is None else config.roughness
+    return Body(mesh=body.mesh, texture=body.texture, specular=specular, roughness=roughness)
+
+
+def _read_body(path: str | Path, config: SceneConfig, generator: torch.Generator) -> Body:
+    if not Path(path).exists() and isinstance(path, str) and Path(path).suffix == "":
+        raise InputError(
+            f"there is no scene {path!r} and no such file. Scenes: {', '.join(RECIPES)}; or give "
+            "the path of a mesh, such as bunny.ply."
+        )
+    mesh = read_mesh(path)
+    if len(mesh.faces) == 0:
+        raise InputError(f"{path}: holds points without faces; needed: a triangle mesh.")
+    mesh = _placed(mesh, config.up, path)
+    if mesh.albedo is not None:
+        return Body(mesh=mesh, roughness=0.3)
+    return Body(mesh=mesh, texture=random_speckle(generator, contrast=1.5), roughness=0.3)
+
+
+def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
+    """Turn the axis ``up`` to z, scale to the usual size and stand on the table's middle."""
+    first = {"x": 1, "y": 2, "z": 0}[up]  # a cyclic change of axes keeps it right-handed
+    order = [first, (first + 1) % 3, (first + 2) % 3]
+    vertices = mesh.vertices_world[:, order]
+    lowest, highest = vertices.amin(dim=0), vertices.amax(dim=0)
+    longest = float((highest - lowest).amax())
+    if longest <= 0 or not math.isfinite(longest):
+        raise InputError(f"{path}: all its vertices are in one place; needed: a surface.")
+    foot = torch.stack([*((lowest + highest) / 2)[:2], lowest[2]])
+    vertices = (vertices - foot) * (OBJECT_SIZE / longest)
+    normals = mesh.normals_world
+    return mesh.replace(
+        vertices_world=vertices,
+        normals_world=vertex_normals(vertices, mesh.faces)
+        if normals is None
+        else normals[:, order],
+    )
+
+
+def _dressed(bodies: list[Body]) -> Mesh:
+    return join(*(body.mesh for body in bodies)).replace(
+        normals_world=torch.cat([normals_at_vertices(body) for body in bodies]),
+        albedo=torch.cat([albedo_at_vertices(body) for body in bodies]),
+    )
