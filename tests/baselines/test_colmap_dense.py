@@ -29,7 +29,7 @@ print(command, options)
 if command == "patch_match_stereo":
     {match}
     here = pathlib.Path(options["--workspace_path"])
-    shutil.copytree(here, {copy!r})
+    shutil.copytree(here, {copy!r}, dirs_exist_ok=True)
     (here / "stereo/depth_maps/00000000.png.geometric.bin").touch()
 if command == "stereo_fusion":
     here = pathlib.Path(options["--workspace_path"])
