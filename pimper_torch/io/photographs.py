@@ -61,7 +61,7 @@ def load_views(
     _check_count(Path(folder), paths)
     headers = [read_header(path) for path in paths]
     mask_paths = _match_masks(paths, Path(masks)) if masks is not None else None
-    sizes = [_shrunk(header, max_size_px) for header in headers]
+    sizes = [shrunk_size(header, max_size_px) for header in headers]
     width, height = (max(sides) for sides in zip(*sizes, strict=True))
     channels = max(header.channels for header in headers)
     images = torch.zeros(len(paths), channels, height, width)
@@ -70,13 +70,13 @@ def load_views(
     for index in track(range(len(paths))):
         decoded, (wide, high) = decode(paths[index]), sizes[index]
         radiance = decoded.samples if linear else linear_from_srgb(decoded.samples)
-        images[index, :, :high, :wide] = _resized(radiance, wide, high)
+        images[index, :, :high, :wide] = resized(radiance, wide, high)
         opacity = decoded.alpha
         if mask_paths is not None:
             opacity = _read_mask(mask_paths[index], paths[index], headers[index])
         elif opacity is not None and bool((opacity < _OPAQUE).any()):
             has_masks = True
-        drawn[index, :high, :wide] = _resized_mask(opacity, wide, high)
+        drawn[index, :high, :wide] = resized_mask(opacity, wide, high)
     names = tuple(path.name for path in paths)
     _refuse_black(images, names, Path(folder))
     if has_masks:
@@ -158,7 +158,8 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [*key, (0, name)]
 
 
-def _shrunk(header: Header, max_size_px: int) -> tuple[int, int]:
+def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
+    """Give width and height after shrinking to a longest side; 0 shrinks nothing."""
     longer = max(header.width, header.height)
     if not 0 < max_size_px < longer:
         return header.width, header.height
@@ -166,7 +167,7 @@ def _shrunk(header: Header, max_size_px: int) -> tuple[int, int]:
     return max(1, round(header.width * factor)), max(1, round(header.height * factor))
 
 
-def _resized(
+def resized(
     planes: Float[Tensor, "channel height width"], width: int, height: int
 ) -> Float[Tensor, "channel {height} {width}"]:
     """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
@@ -177,12 +178,13 @@ def _resized(
     )[0]
 
 
-def _resized_mask(
+def resized_mask(
     opacity: Float[Tensor, "height_in width_in"] | None, width: int, height: int
 ) -> Bool[Tensor, "{height} {width}"]:
+    """Shrink opacity and call what is at least half opaque the object; ``None`` is all of it."""
     if opacity is None:
         return torch.ones(height, width, dtype=torch.bool)
-    return _resized(opacity[None], width, height)[0] >= _OPAQUE
+    return resized(opacity[None], width, height)[0] >= _OPAQUE
 
 
 def _match_masks(paths: list[Path], folder: Path) -> list[Path]:
