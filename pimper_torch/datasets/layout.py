@@ -1,6 +1,13 @@
-"""What a reader says when a folder is not laid out as it expects."""
+"""What a reader says when a folder is not laid out as it expects, and how it reads on."""
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import some
@@ -41,14 +48,108 @@ def inside(folder: Path, name: str, kind: str) -> Path:
     """Join a path that a data set's file names to its folder, refusing to leave the folder.
 
     Raises:
-        InputError: The path is absolute, or leads out by ``..`` or a link.
+        InputError: The path is absolute, leads out by ``..`` or a link, or is no path.
     """
     path = folder / name
+    try:
+        stays = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # a zero byte, a loop of links
+        stays = False
     expect(
-        path.resolve().is_relative_to(folder.resolve()),
+        stays,
         folder,
         kind,
         "paths that stay in this folder",
         f"{name!r}, which leads out of it",
     )
     return path
+
+
+def first_of(candidates: Sequence[Path]) -> Path | None:
+    """Give the first path that exists."""
+    return next((path for path in candidates if path.exists()), None)
+
+
+def read_text(path: Path, kind: str) -> str:
+    """Read a text file of a data set.
+
+    Raises:
+        InputError: There is no such file, or it is no UTF-8 text.
+    """
+    expect(path.is_file(), path, kind, "a text file", contents(path))
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path}: cannot be read as text ({error}); needed: the text file of {kind}, as UTF-8. "
+            "Copy it again."
+        ) from error
+
+
+def read_json(path: Path, kind: str) -> dict[str, object]:
+    """Read a JSON file that holds one object.
+
+    Raises:
+        InputError: There is no such file, or it holds something else.
+    """
+    try:
+        found = json.loads(read_text(path, kind))
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path}: is no valid JSON ({error}); needed: the JSON file of {kind}. Copy it again, "
+            "or write it anew."
+        ) from error
+    expect(isinstance(found, dict), path, kind, "a JSON object", f"a {type(found).__name__}")
+    return dict(found)
+
+
+def objects(value: object, what: str, place: Path, kind: str) -> list[dict[str, object]]:
+    """Check that a value of a file is a list of objects, and give it.
+
+    Raises:
+        InputError: It is something else, or empty.
+    """
+    entries = list(value) if isinstance(value, list) else []
+    expect(
+        bool(entries) and all(isinstance(entry, dict) for entry in entries),
+        place,
+        kind,
+        f"a list of objects as {what}",
+        _shown(value),
+    )
+    return entries
+
+
+def numbers(
+    value: object, count: int, what: str, place: Path, kind: str
+) -> Float[Tensor, " number"]:
+    """Check that a value of a file is so many numbers, and give them in float64.
+
+    Args:
+        value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.
+        count: How many are needed.
+        what: Their name in the file.
+        place: The file.
+        kind: The data set, as its users call it.
+
+    Raises:
+        InputError: They are more, fewer, not finite, or no numbers.
+    """
+    pieces = value.split() if isinstance(value, str) else value
+    try:
+        array = np.asarray(pieces, dtype=np.float64).reshape(-1)
+    except (ValueError, TypeError, OverflowError):
+        array = np.full(1, np.nan)
+    expect(
+        len(array) == count and bool(np.isfinite(array).all()),
+        place,
+        kind,
+        f"{count} finite number{'s' if count > 1 else ''} as {what}",
+        _shown(value),
+    )
+    return torch.from_numpy(array.copy())
+
+
+def _shown(value: object) -> str:
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
