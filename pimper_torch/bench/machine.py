@@ -1,0 +1,94 @@
+"""The machine that figures were measured on."""
+
+import os
+import platform
+import re
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+
+from pimper_torch.records import Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Machine(Record):
+    """A machine and what runs on it.
+
+    Attributes:
+        cpu: Name of the processor.
+        cores: That this process may use.
+        memory_gb: Of the machine.
+        gpu: Name of the first, or nothing.
+        system: Operating system.
+        python: Version.
+        versions: Of the packages that the figures depend on, as ``name version``.
+    """
+
+    cpu: str
+    cores: int
+    memory_gb: float
+    gpu: str
+    system: str
+    python: str
+    versions: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        """Say it in a line.
+
+        >>> this_machine().summary  # doctest: +SKIP
+        'AMD EPYC 7763, 2 cores, 23 GB; Linux; Python 3.11.7; pimper_torch 0.1.0, torch 2.13.0'
+        """
+        cores = f"{self.cores} core{'s' if self.cores != 1 else ''}"
+        hardware = [self.cpu, cores, f"{self.memory_gb:.0f} GB", *([self.gpu] if self.gpu else [])]
+        return (
+            f"{', '.join(hardware)}; {self.system}; Python {self.python}; "
+            f"{', '.join(self.versions)}"
+        )
+
+
+_PACKAGES = ("pimper_torch", "torch", "numpy", "scipy", "pycolmap", "embreex")
+
+
+def this_machine() -> Machine:
+    """Describe the machine that this runs on."""
+    return Machine(
+        cpu=_cpu(),
+        cores=_cores(),
+        memory_gb=round(_memory_bytes() / 2**30, 1),
+        gpu=torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
+        system=f"{platform.system()} {platform.machine()}",
+        python=platform.python_version(),
+        versions=tuple(f"{name} {_version(name)}" for name in _PACKAGES),
+    )
+
+
+def _cpu() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    named = re.search(r"^model name\s*:\s*(.+)$", text, flags=re.MULTILINE)
+    return named[1].strip() if named else platform.processor() or platform.machine()
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _memory_bytes() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError, AttributeError):
+        return 0
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
