@@ -1,1 +1,36 @@
 """Readers of public data sets, and their layouts as formats to write."""
+
+from pimper_torch.datasets.colmap import read_colmap, read_colmap_scene, write_colmap
+from pimper_torch.datasets.diligent import read_diligent, read_normal_map
+from pimper_torch.datasets.diligent_mv import read_diligent_mv
+from pimper_torch.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
+from pimper_torch.datasets.dtu_points import read_dtu_points
+from pimper_torch.datasets.idr import read_idr, read_scale_mats, write_idr
+from pimper_torch.datasets.llff import read_llff
+from pimper_torch.datasets.meshroom import read_meshroom
+from pimper_torch.datasets.metashape import read_metashape
+from pimper_torch.datasets.middlebury import read_middlebury
+from pimper_torch.datasets.sampling import one_light_per_position
+from pimper_torch.datasets.transforms import read_transforms, write_transforms
+
+__all__ = [
+    "one_light_per_position",
+    "read_colmap",
+    "read_colmap_scene",
+    "read_diligent",
+    "read_diligent_mv",
+    "read_dtu_mvs",
+    "read_dtu_points",
+    "read_dtu_protocol",
+    "read_idr",
+    "read_llff",
+    "read_meshroom",
+    "read_metashape",
+    "read_middlebury",
+    "read_normal_map",
+    "read_scale_mats",
+    "read_transforms",
+    "write_colmap",
+    "write_idr",
+    "write_transforms",
+]

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from pimper_torch.datasets.layout import expect, inside, numbers, read_text
 from pimper_torch.datasets.posed import (
     PosedPhotograph,
@@ -97,7 +95,8 @@ def _photograph(line: Sequence[str], path: Path) -> PosedPhotograph:
     )
     expect(image.is_file(), path.parent, _KIND, f"the photograph {name}")
     header = read_header(image)
-    K = torch.cat([torch.cat([K[:2, :2], pixels_from_indices(K[:2, 2:])], dim=1), K[2:]])
+    K = K.clone()
+    K[:2, 2] = pixels_from_indices(K[:2, 2])
     return PosedPhotograph(
         name=name,
         image=image,

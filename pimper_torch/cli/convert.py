@@ -1,0 +1,259 @@
+"""A data set of one layout to another."""
+
+import dataclasses
+import inspect
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+from torch import Tensor
+
+from pimper_torch import datasets
+from pimper_torch.cli.bars import Bars
+from pimper_torch.cli.options import Flag
+from pimper_torch.errors import InputError
+from pimper_torch.io.folders import prepare_output, written_whole
+from pimper_torch.progress import listening
+from pimper_torch.records import Cameras, Capture, StageReport, Truth, Views
+from pimper_torch.reporting import peak_memory_mb
+
+Source = Literal[
+    "colmap",
+    "llff",
+    "middlebury",
+    "idr",
+    "transforms",
+    "meshroom",
+    "metashape",
+    "dtu-points",
+    "dtu-mvs",
+    "diligent-mv",
+    "diligent",
+]
+Target = Literal["colmap", "idr", "transforms"]
+
+# What the three layouts consist of together: one may replace another.
+RESULT_NAMES = (
+    "images",
+    "masks",
+    "sparse",
+    "image",
+    "mask",
+    "cameras.npz",
+    "cameras_sphere.npz",
+    "transforms.json",
+    "sparse_pc.ply",
+)
+# Enough to start from or to see the object's extent, and no more than viewers like.
+_MOST_POINTS = 100_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadOptions:
+    """What a reader may be told; each goes with the layouts that know it.
+
+    Attributes:
+        scan: Number of the scene or scan; the DTU sets need one.
+        images: Folder of the photographs, if they do not lie where the layout has them.
+        masks: Folder with a mask for each photograph, of the same name; black off the object.
+        mesh: File of the true surface, in the data set's frame; the export's cloud or unit
+            sphere comes from it.
+        linear: The files hold linear radiance, not sRGB.
+        light_seed: Keep one light at each place, chosen by this seed.
+        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
+            leaves them.
+    """
+
+    scan: int | None = None
+    images: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    linear: Flag = False
+    light_seed: int | None = None
+    max_size_px: int = 0
+
+
+_OPTIONS = tuple(field.name for field in dataclasses.fields(ReadOptions))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """All that a conversion is told."""
+
+    data: Path
+    out: Path
+    source: Source
+    target: Target
+    overwrite: bool
+    options: ReadOptions
+
+
+def run(command: str, arguments: Sequence[str]) -> None:
+    """Carry out ``convert``: read, write whole or not at all, and say what came.
+
+    Raises:
+        PimperError: Before anything is written.
+    """
+    job = parse(arguments)
+    prepare_output(job.out, RESULT_NAMES, job.overwrite)
+    with Bars(Console(stderr=True)) as bars:
+        bars.started("read")
+        began = time.perf_counter()
+        with listening(bars.progressed):
+            capture = read(job)
+        bars.finished(_report(capture, time.perf_counter() - began))
+    with written_whole(job.out, RESULT_NAMES, overwrite=job.overwrite) as staging:
+        write(capture, job.target, staging)
+    Console().print(describe(capture, job), highlight=False, soft_wrap=True)
+
+
+def parse(arguments: Sequence[str]) -> Job:
+    """Read the arguments of ``convert``.
+
+    Raises:
+        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+    """
+
+    def convert(
+        data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")],
+        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],
+        source: Source,
+        target: Target,
+        overwrite: Flag = False,
+        options: Annotated[ReadOptions, tyro.conf.arg(name="")] = ReadOptions(),
+    ) -> Job:
+        """Read a data set of one layout and write its photographs and cameras in another.
+
+        Photographs are written as 8-bit sRGB, undistorted, with pinhole cameras.
+
+        Args:
+            data: The data set's folder; for some layouts its file of cameras.
+            out: Folder for the result; new or empty.
+            source: Layout of DATA.
+            target: Layout to write.
+            overwrite: Replace a former result in OUT.
+            options: What the reader is told.
+        """
+        return Job(
+            data=data,
+            out=out,
+            source=source,
+            target=target,
+            overwrite=overwrite,
+            options=options,
+        )
+
+    return tyro.cli(convert, prog="pimper convert", args=list(arguments))
+
+
+def readers() -> Mapping[Source, Callable[..., Capture]]:
+    """List the reader of each layout."""
+    return {
+        "colmap": datasets.read_colmap,
+        "llff": datasets.read_llff,
+        "middlebury": datasets.read_middlebury,
+        "idr": datasets.read_idr,
+        "transforms": datasets.read_transforms,
+        "meshroom": datasets.read_meshroom,
+        "metashape": datasets.read_metashape,
+        "dtu-points": datasets.read_dtu_points,
+        "dtu-mvs": datasets.read_dtu_mvs,
+        "diligent-mv": datasets.read_diligent_mv,
+        "diligent": datasets.read_diligent,
+    }
+
+
+def read(job: Job) -> Capture:
+    """Read the data set with the options that were given.
+
+    Raises:
+        InputError: An option that the reader does not know, or none where it needs one; and
+            whatever the reader refuses.
+    """
+    reader = readers()[job.source]
+    known = inspect.signature(reader).parameters
+    plain = ReadOptions()
+    given = {
+        name: getattr(job.options, name)
+        for name in _OPTIONS
+        if getattr(job.options, name) != getattr(plain, name)
+    }
+    strange = [_option(name) for name in given if name not in known]
+    if strange:
+        goes = [_option(name) for name in _OPTIONS if name in known]
+        raise InputError(
+            f"{', '.join(strange)}: the reader of {job.source} does not know it; needed: some of "
+            f"{', '.join(goes)}, or another --source."
+        )
+    if "scan" in known and "scan" not in given:
+        raise InputError(f"--source {job.source} holds many scans; needed: --scan with a number.")
+    return reader(job.data, **given)
+
+
+def write(capture: Capture, target: Target, folder: Path) -> None:
+    """Write a capture's photographs and cameras in a layout.
+
+    Raises:
+        InputError: Its cameras are not known, or are none that the layout can hold.
+    """
+    if capture.cameras is None:
+        raise InputError(
+            "this data set says nothing about its cameras; needed: cameras to export. Use its "
+            "photographs as they are."
+        )
+    writers: Mapping[str, Callable[[Views, Cameras, Path, Tensor | None], None]] = {
+        "colmap": lambda *given: datasets.write_colmap(*given[:3], points_world=given[3]),
+        "idr": lambda *given: datasets.write_idr(*given[:3], points_world=given[3]),
+        "transforms": lambda *given: datasets.write_transforms(*given[:3], points_world=given[3]),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    writers[target](capture.views, capture.cameras, folder, cloud(capture.truth))
+
+
+def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
+    """Give points of the true surface, at most a hundred thousand, or ``None``."""
+    points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
+    if points is None or len(points) <= _MOST_POINTS:
+        return points
+    chosen = torch.linspace(0, len(points) - 1, _MOST_POINTS, dtype=torch.float64)
+    return points[chosen.round().long().to(points.device)]
+
+
+def describe(capture: Capture, job: Job) -> str:
+    """Tell what was read and where it is now."""
+    sizes = {f"{width} x {height}" for width, height in capture.views.sizes_px.tolist()}
+    size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
+    count, places, lights = (
+        len(set(numbers.tolist()))
+        for numbers in (torch.arange(capture.views.num_views), capture.position, capture.light)
+    )
+    light = "each under a light of its own" if lights == count else f"under {lights} lights"
+    known = [
+        name.removesuffix("_world")
+        for name in ("mesh", "points_world", "depth", "normals_world", "albedo", "lights_world")
+        if getattr(capture.truth, name) is not None
+    ]
+    return (
+        f"{count} photographs of {size} from {places} places, {light}, "
+        f"{'with' if capture.views.masks is not None else 'without'} masks; truth: "
+        f"{', '.join(known) or 'none'}.\n{job.out} has them as {job.target}."
+    )
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _report(capture: Capture, seconds: float) -> StageReport:
+    return StageReport(
+        name="read",
+        seconds=seconds,
+        peak_memory_mb=peak_memory_mb(),
+        figures={"photographs": capture.views.num_views},
+    )
