@@ -81,8 +81,9 @@ def row_of_failure(scene: str, method: str, error: Exception, **known: int | flo
         error: What stopped it; a missing program is no failure.
         known: Fields that are known all the same, such as ``minutes``.
     """
-    missing = isinstance(error, MissingProgramError)
-    note = f"{'not installed' if missing else 'failed'}: {str(error) or type(error).__name__}"
+    said = str(error) or type(error).__name__
+    # The table shows the first line only.
+    note = f"not installed\n{said}" if isinstance(error, MissingProgramError) else f"failed: {said}"
     return Row(scene=scene, method=method, note=note, **known)  # type: ignore[arg-type]
 
 

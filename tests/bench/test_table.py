@@ -272,7 +272,7 @@ def test_files_that_cannot_be_read_or_written_are_refused(tmp_path):
 
 def test_a_missing_program_is_told_from_a_failure():
     missing = row_of_failure("mug", "pmvs", MissingProgramError("pmvs2 is not on the PATH"))
-    assert missing.note == "not installed: pmvs2 is not on the PATH"
+    assert missing.note == "not installed\npmvs2 is not on the PATH"
     failed = row_of_failure("mug", "lim", ReconstructionError("no facet"), minutes=0.5)
     assert failed.note == "failed: no facet"
     assert failed.minutes == 0.5
