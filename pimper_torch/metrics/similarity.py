@@ -4,7 +4,9 @@ They are 4x4 matrices ``truth_from_world`` whose upper left block is scale times
 :func:`pimper_torch.geometry.frames.transform` applies them.
 """
 
+from collections import Counter
 from collections.abc import Sequence
+from pathlib import PurePath
 
 import torch
 from jaxtyping import Float, Int
@@ -20,6 +22,10 @@ def pair_views(
 ) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
     """Find views of the same name, for results that miss some of the photographs.
 
+    Where a name is not among the true ones, the view whose name differs in folder and suffix
+    alone is the same: ``raw/07.tif`` and ``07.png``. A stem that two views of a set share
+    pairs nothing.
+
     Returns:
         Indices in ``names`` and in ``names_true``, in the order of the former.
 
@@ -27,7 +33,14 @@ def pair_views(
         InputError: No name is in both.
     """
     place = {name: index for index, name in enumerate(names_true)}
-    pairs = [(index, place[name]) for index, name in enumerate(names) if name in place]
+    by_stem, by_stem_true = _stems(names), _stems(names_true)
+    pairs: list[tuple[int, int]] = []
+    for index, name in enumerate(names):
+        stem = PurePath(name).stem
+        if name in place:
+            pairs.append((index, place[name]))
+        elif by_stem.get(stem) == index and by_stem_true.get(stem) is not None:
+            pairs.append((index, by_stem_true[stem]))
     if not pairs:
         raise InputError(
             f"no view is in both sets: found {', '.join(names[:3])}, ... and "
@@ -35,6 +48,13 @@ def pair_views(
         )
     ours, truth = torch.tensor(pairs).unbind(dim=1)
     return ours, truth
+
+
+def _stems(names: Sequence[str]) -> dict[str, int]:
+    """Give the place of every stem that one name alone has."""
+    stems = [PurePath(name).stem for name in names]
+    counts = Counter(stems)
+    return {stem: index for index, stem in enumerate(stems) if counts[stem] == 1}
 
 
 def similarity_between_points(
@@ -81,6 +101,31 @@ def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "
     return _similarity(source, target, correlation).to(ours.cam_from_world)
 
 
+def nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """Give the rotation ``R`` with the greatest ``trace(R^T matrix)``; never a reflection."""
+    U, _, Vh = torch.linalg.svd(matrix)
+    mirror = torch.ones(3).to(U)
+    mirror[2] = torch.linalg.det(U @ Vh).sign()
+    return U @ (mirror[:, None] * Vh)
+
+
+def split_similarity(
+    target_from_source: Float[Tensor, "4 4"],
+) -> tuple[float, Float[Tensor, "3 3"]]:
+    """Give the scale and the rotation of a similarity."""
+    linear = target_from_source[:3, :3]
+    scale = float(torch.linalg.det(linear)) ** (1 / 3)
+    return scale, linear / scale
+
+
+def rotation_angles_deg(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+    """Give the angle of rotations, accurate for the smallest too."""
+    skew = rotation - rotation.mT
+    sine = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1).norm(dim=-1)
+    cosine = rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1
+    return torch.rad2deg(torch.atan2(sine, cosine))
+
+
 def _similarity(
     source: Float[Tensor, "point 3"],
     target: Float[Tensor, "point 3"],
@@ -92,10 +137,7 @@ def _similarity(
             f"the {len(source)} points or camera centres to align by coincide, so that nothing "
             "tells the scale; needed: two different places at least."
         )
-    U, _, Vh = torch.linalg.svd(correlation)
-    mirror = torch.ones(3).to(U)
-    mirror[2] = torch.linalg.det(U @ Vh).sign()
-    rotation = U @ (mirror[:, None] * Vh)
+    rotation = nearest_rotation(correlation)
     scale = (rotation * _outer(target, source)).sum() / _spread(source)
     translation = target.mean(dim=0) - scale * rotation @ source.mean(dim=0)
     return rigid(scale * rotation, translation)

@@ -1,0 +1,97 @@
+"""Results to be judged: a folder that ``pimper reconstruct`` wrote, or a mesh of any method."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.records import Cameras, Estimate
+from pimper_torch.sfm.colmap import pinhole_of, read_model
+
+
+def read_estimate(path: Path | str) -> Estimate:
+    """Read what a method says about an object.
+
+    Args:
+        path: A mesh or point cloud; or a folder with ``mesh.ply`` and, as far as they are
+            there, ``sparse/`` (COLMAP model whose pinholes are the cameras), ``lights.json``
+            and ``depth.npz`` (whose ``name`` is the reference view), as
+            :func:`pimper_torch.io.results.write_result` writes them.
+
+    Raises:
+        InputError: Neither is there, or a file of it cannot be read.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return Estimate(mesh=read_mesh(path))
+    if not (path / "mesh.ply").is_file():
+        raise InputError(
+            f"{path}: holds no mesh.ply; needed: a folder written by `pimper reconstruct`, or the "
+            "path of a mesh file itself."
+        )
+    mesh = read_mesh(path / "mesh.ply")
+    names: tuple[str, ...] = ()
+    cameras = None
+    if (path / "sparse").is_dir():
+        names, cameras = read_cameras(path / "sparse")
+    lights = _read_lights(path / "lights.json", names)
+    return Estimate(
+        mesh=mesh,
+        names=names,
+        cameras=cameras,
+        lights_world=lights,
+        reference=_read_reference(path / "depth.npz"),
+    )
+
+
+def read_cameras(folder: Path) -> tuple[tuple[str, ...], Cameras]:
+    """Read the views of a COLMAP model as pinholes; a lens's distortion is left out.
+
+    Raises:
+        InputError: The folder holds no model that can be read.
+    """
+    model = read_model(folder)
+    intrinsics = [pinhole_of(lens) for lens in model.lenses]
+    sizes = [[lens.width, lens.height] for lens in model.lenses]
+    cameras = Cameras(
+        intrinsics=torch.stack(intrinsics) if intrinsics else torch.zeros(0, 3, 3).double(),
+        cam_from_world=model.cam_from_world,
+        sizes_px=torch.tensor(sizes).reshape(-1, 2).long(),
+    )
+    return model.names, cameras
+
+
+def _read_lights(path: Path, names: tuple[str, ...]) -> Float[Tensor, "view 4"] | None:
+    """Give the light of every named view; NaN where the file has none."""
+    if not path.is_file() or not names:
+        return None
+    try:
+        account = json.loads(path.read_text(encoding="utf-8"))
+        known = {view["name"]: view["light"] for view in account["views"]}
+        rows = [known.get(name) or [float("nan")] * 4 for name in names]
+        lights = torch.tensor(rows, dtype=torch.float64).reshape(len(names), 4)
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
+        raise InputError(
+            f"{path}: cannot be read as lights ({error}); needed: JSON with `views`, each with "
+            "`name` and `light`, four numbers or null. Remove the file to do without lights."
+        ) from error
+    return lights if bool(lights.isfinite().any()) else None
+
+
+def _read_reference(path: Path) -> str | None:
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return str(arrays["name"]) if "name" in arrays else None
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path}: cannot be read ({error}); needed: an .npz file with `name`, the reference "
+            "view. Remove the file to do without one."
+        ) from error
