@@ -23,7 +23,7 @@ from pimper_torch.baselines.exchange import (
 )
 from pimper_torch.baselines.external import Deadline, Program, all_cores, run_program, workspace
 from pimper_torch.config import require
-from pimper_torch.errors import ReconstructionError
+from pimper_torch.errors import MissingProgramError, ReconstructionError
 from pimper_torch.progress import report
 from pimper_torch.records import CoarseMesh, Estimate, SparseScene
 
@@ -39,7 +39,7 @@ _PARTNERS = 20  # views that one is compared with; what COLMAP's own undistorter
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColmapDenseConfig:
-    """COLMAP's settings under its defaults.
+    """COLMAP's settings under its defaults, but for the trim of Poisson's surface.
 
     Attributes:
         program: The executable or its folder; else PIMPER_COLMAP or the PATH say.
@@ -210,6 +210,8 @@ def _run(program: Path, folder: Path, deadline: Deadline, threads: int, step: St
     """Run one step; give what it printed."""
     try:
         return run_program([program, step.name, *step.arguments], folder, deadline, threads=threads)
+    except MissingProgramError:
+        raise
     except ReconstructionError as error:
         raise _explained(step.name, error) from error
 

@@ -181,8 +181,12 @@ def test_a_colmap_without_cuda_is_told_from_one_that_found_nothing(
     assert "no images" in str(caught.value)
 
 
-def test_a_missing_colmap_and_impossible_settings_are_refused(reconstruction):
+def test_a_missing_colmap_and_impossible_settings_are_refused(reconstruction, tmp_path):
     with pytest.raises(MissingProgramError, match="colmap is not installed"):
+        ColmapDense()(reconstruction.scene, reconstruction.coarse)
+    (tmp_path / "bin" / "colmap").write_bytes(b"\x7fELF of another machine")
+    (tmp_path / "bin" / "colmap").chmod(0o755)
+    with pytest.raises(MissingProgramError, match="cannot be started"):
         ColmapDense()(reconstruction.scene, reconstruction.coarse)
     for setting in ({"max_size_px": 0}, {"threads": -1}, {"max_minutes": -1.0}):
         with pytest.raises(ConfigError, match=next(iter(setting))):
