@@ -14,9 +14,24 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
-from pimper_torch import datasets
 from pimper_torch.cli.bars import Bars
 from pimper_torch.cli.options import Flag
+from pimper_torch.datasets import (
+    read_colmap,
+    read_diligent,
+    read_diligent_mv,
+    read_dtu_mvs,
+    read_dtu_points,
+    read_idr,
+    read_llff,
+    read_meshroom,
+    read_metashape,
+    read_middlebury,
+    read_transforms,
+    write_colmap,
+    write_idr,
+    write_transforms,
+)
 from pimper_torch.errors import InputError
 from pimper_torch.io.folders import prepare_output, written_whole
 from pimper_torch.progress import listening
@@ -155,17 +170,17 @@ def parse(arguments: Sequence[str]) -> Job:
 def readers() -> Mapping[Source, Callable[..., Capture]]:
     """List the reader of each layout."""
     return {
-        "colmap": datasets.read_colmap,
-        "llff": datasets.read_llff,
-        "middlebury": datasets.read_middlebury,
-        "idr": datasets.read_idr,
-        "transforms": datasets.read_transforms,
-        "meshroom": datasets.read_meshroom,
-        "metashape": datasets.read_metashape,
-        "dtu-points": datasets.read_dtu_points,
-        "dtu-mvs": datasets.read_dtu_mvs,
-        "diligent-mv": datasets.read_diligent_mv,
-        "diligent": datasets.read_diligent,
+        "colmap": read_colmap,
+        "llff": read_llff,
+        "middlebury": read_middlebury,
+        "idr": read_idr,
+        "transforms": read_transforms,
+        "meshroom": read_meshroom,
+        "metashape": read_metashape,
+        "dtu-points": read_dtu_points,
+        "dtu-mvs": read_dtu_mvs,
+        "diligent-mv": read_diligent_mv,
+        "diligent": read_diligent,
     }
 
 
@@ -208,9 +223,9 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
             "photographs as they are."
         )
     writers: Mapping[str, Callable[[Views, Cameras, Path, Tensor | None], None]] = {
-        "colmap": lambda *given: datasets.write_colmap(*given[:3], points_world=given[3]),
-        "idr": lambda *given: datasets.write_idr(*given[:3], points_world=given[3]),
-        "transforms": lambda *given: datasets.write_transforms(*given[:3], points_world=given[3]),
+        "colmap": lambda *given: write_colmap(*given[:3], points_world=given[3]),
+        "idr": lambda *given: write_idr(*given[:3], points_world=given[3]),
+        "transforms": lambda *given: write_transforms(*given[:3], points_world=given[3]),
     }
     folder.mkdir(parents=True, exist_ok=True)
     writers[target](capture.views, capture.cameras, folder, cloud(capture.truth))
@@ -233,17 +248,25 @@ def describe(capture: Capture, job: Job) -> str:
         len(set(numbers.tolist()))
         for numbers in (torch.arange(capture.views.num_views), capture.position, capture.light)
     )
-    light = "each under a light of its own" if lights == count else f"under {lights} lights"
+    light = (
+        "each taken to have its own light"
+        if lights == count
+        else f"under {_count(lights, 'light')}"
+    )
     known = [
         name.removesuffix("_world")
         for name in ("mesh", "points_world", "depth", "normals_world", "albedo", "lights_world")
         if getattr(capture.truth, name) is not None
     ]
     return (
-        f"{count} photographs of {size} from {places} places, {light}, "
+        f"{_count(count, 'photograph')} of {size} from {_count(places, 'place')}, {light}, "
         f"{'with' if capture.views.masks is not None else 'without'} masks; truth: "
         f"{', '.join(known) or 'none'}.\n{job.out} has them as {job.target}."
     )
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _option(name: str) -> str:

@@ -6,7 +6,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.datasets.layout import expect, first_of, numbers
@@ -20,6 +20,7 @@ from pimper_torch.datasets.posed import (
 from pimper_torch.datasets.projections import decompose_projections
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import indices_from_pixels, pixels_from_indices
+from pimper_torch.geometry.projection import project
 from pimper_torch.io.decode import read_header
 from pimper_torch.records import Cameras, Capture, Views
 
@@ -115,7 +116,10 @@ def write_idr(
         cameras: One a view.
         folder: Made if it is not there.
         points_world: On the object: ``scale_mat`` puts them into the unit sphere. Without
-            them the sphere is guessed from the cameras, see :func:`unit_sphere`.
+            them the sphere is guessed from masks and cameras, see :func:`unit_sphere`.
+
+    Raises:
+        InputError: There is nothing to guess the sphere from.
     """
     digits = max(3, len(str(views.num_views - 1)))
     for index in range(views.num_views):
@@ -126,7 +130,7 @@ def write_idr(
     pose = cameras.cam_from_world.detach().cpu().double()
     world_mat = pose.clone()
     world_mat[:, :3] = K @ pose[:, :3]
-    scale_mat = unit_sphere(cameras, points_world)
+    scale_mat = unit_sphere(cameras, points_world, views.masks)
     arrays: dict[str, np.ndarray] = {}
     for index, matrix in enumerate(world_mat):
         arrays[f"world_mat_{index}"] = matrix.numpy()
@@ -136,28 +140,36 @@ def write_idr(
 
 
 def unit_sphere(
-    cameras: Cameras, points_world: Float[Tensor, "point 3"] | None = None
+    cameras: Cameras,
+    points_world: Float[Tensor, "point 3"] | None = None,
+    masks: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "4 4"]:
     """Give ``world_from_unit`` of a sphere that holds the object.
 
     With points it is centred on their bounding box, and nine tenths of its radius reach the
     farthest. Without, it is centred where the optical axes come nearest to one another (in
-    the least-squares sense), and its radius is that of the widest circle there that every
-    view shows whole, by the median view.
+    the least-squares sense); there it reaches as far as the masks do in the view that shows
+    most, by nine tenths, or else as the corners of the median view.
 
     Args:
-        cameras: At least two, not all looking the same way, unless there are points.
+        cameras: Not all looking the same way, unless there are points.
         points_world: On the object; at least two different ones.
+        masks: True on the object.
 
     Raises:
-        InputError: The points are one and the same, or the axes are parallel.
+        InputError: The points are one and the same, the axes are parallel, or the cameras
+            look away from where they meet.
     """
     if points_world is not None:
         points = points_world.detach().cpu().double()
         center = (points.amin(dim=0) + points.amax(dim=0)) / 2
         radius = float((points - center).norm(dim=-1).max()) / _SHARE
     else:
-        center, radius = _seen_by_all(cameras)
+        center = _looked_at(cameras)
+        reaches = torch.tensor(
+            [_reach(cameras, center, masks, v) for v in range(len(cameras.sizes_px))]
+        )
+        radius = float(reaches.median() if masks is None else reaches.max() / _SHARE)
     if not radius > 0:
         raise InputError(
             "the sphere round the object has no size; needed: points on the object, or cameras "
@@ -169,9 +181,10 @@ def unit_sphere(
     return world_from_unit
 
 
-def _seen_by_all(cameras: Cameras) -> tuple[Float[Tensor, "3"], float]:
-    pose, K = cameras.cam_from_world.detach().cpu().double(), cameras.intrinsics.cpu().double()
-    axes, centers = pose[:, 2, :3], -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
+def _looked_at(cameras: Cameras) -> Float[Tensor, "3"]:
+    """Find the point nearest to all optical axes."""
+    axes = cameras.cam_from_world[:, 2, :3].detach().cpu().double()
+    centers = cameras.centers_world.detach().cpu().double()
     # A point's squared distance from an axis is |(I - a a^T) (x - c)|^2.
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
     system, right = across.sum(dim=0), (across @ centers[..., None]).sum(dim=0)[:, 0]
@@ -180,13 +193,28 @@ def _seen_by_all(cameras: Cameras) -> tuple[Float[Tensor, "3"], float]:
             "the cameras all look the same way, so nothing tells where the object is; needed: "
             "points on it (a mesh), or cameras that look at it from several sides."
         )
-    target = torch.linalg.solve(system, right)
-    depth = ((target - centers) * axes).sum(dim=-1)
-    size = cameras.sizes_px.cpu().double()
-    corner = torch.stack([K[:, 0, 2], K[:, 1, 2]], dim=-1)
-    margin = torch.minimum(corner, size - corner) / K.diagonal(dim1=1, dim2=2)[:, :2]
-    reach = (margin.amin(dim=-1) * depth).clamp_min(0)
-    return target, float(reach.median())
+    return torch.linalg.solve(system, right)
+
+
+def _reach(
+    cameras: Cameras,
+    center: Float[Tensor, "3"],
+    masks: Bool[Tensor, "view height width"] | None,
+    view: int,
+) -> float:
+    """Tell how far a view's mask, or image, reaches from a point, at the depth of the point."""
+    pose = cameras.cam_from_world[view].detach().cpu().double()
+    K = cameras.intrinsics[view].detach().cpu().double()
+    width, height = (float(side) for side in cameras.sizes_px[view])
+    if masks is None:
+        pixels = K.new_tensor([[0, 0], [width, 0], [0, height], [width, height]])
+    else:
+        pixels = torch.nonzero(masks[view].cpu()).flip(-1) + 0.5
+        pixels = pixels.to(K)
+    here, depth = project(center[None], pose, K)
+    if not len(pixels) or float(depth) <= 0:
+        return 0.0
+    return float(((pixels - here) / K.diagonal()[:2]).norm(dim=-1).max() * depth)
 
 
 def _camera_file(folder: Path, name: str | None) -> Path:

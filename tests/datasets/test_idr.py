@@ -6,7 +6,6 @@ from torch.testing import assert_close
 from pimper_torch.datasets.idr import read_idr, read_scale_mats, unit_sphere, write_idr
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import transform
-from pimper_torch.geometry.projection import project
 from pimper_torch.scenes.cameras import arc_cameras
 
 # K [R t] of `hand_camera`, K = [[20, 5, 6.5], [0, 30, 4.5], [0, 0, 1]], worked out by hand:
@@ -133,11 +132,16 @@ def test_without_points_the_sphere_lies_where_the_cameras_look():
     cameras = arc_cameras(5, width=160, height=120, focal_px=200.0, distance=4.0)
     world_from_unit = unit_sphere(cameras)
     assert_close(world_from_unit[:3, 3], torch.zeros(3).double(), rtol=0, atol=1e-9)
-    assert_close(float(world_from_unit[0, 0]), 4 * 60 / 200)
-    # Its outline stays in the image: points of the sphere, seen across the axis.
-    pole = cameras.cam_from_world[0, 1, :3] * world_from_unit[0, 0]
-    pixel, _ = project(pole[None], cameras.cam_from_world[0], cameras.intrinsics[0])
-    assert_close(float(pixel[0, 1]), 120.0)
+    assert_close(float(world_from_unit[0, 0]), 4 * 100 / 200)  # to the corner, at (80, 60)
+
+
+def test_masks_tell_the_size_of_the_sphere():
+    cameras = arc_cameras(3, width=160, height=120, focal_px=200.0, distance=4.0)
+    row, column = torch.meshgrid(torch.arange(120) + 0.5, torch.arange(160) + 0.5, indexing="ij")
+    radius_px = torch.tensor([10.0, 20.0, 15.0])[:, None, None]
+    masks = (column - 80).square() + (row - 60).square() < radius_px.square()
+    reach = float(unit_sphere(cameras, masks=masks)[0, 0])
+    assert abs(reach * 0.9 * 200 / 4 - 20) < 0.71  # the farthest pixel's centre
 
 
 def test_cameras_that_look_the_same_way_do_not_tell_where_the_object_is(capture):
