@@ -12,6 +12,8 @@ from pimper_torch.geometry.frames import rigid
 from pimper_torch.records import Cameras
 
 # Of scenes on a table, whose world has z up.
+# Of two aims that are as good, the one nearer to the object's middle is taken.
+_STAY = 0.01
 FRONT, UP = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
 
 
@@ -187,20 +189,30 @@ def aim_to_fit(
     """
     hull = points_world[torch.from_numpy(ConvexHull(points_world.numpy()).vertices).long()]
 
-    def distance(target: np.ndarray) -> float:
+    middle = (hull.amin(dim=0) + hull.amax(dim=0)) / 2
+    mean_toward = toward_world.mean(dim=0)
+
+    def distance(target: Float[Tensor, " 3"]) -> float:
         return distance_to_fit(
             toward_world,
             hull,
-            torch.from_numpy(target),
+            target,
             focal_px=focal_px,
             width=width,
             height=height,
             fill=fill,
         )
 
-    middle = (hull.amin(dim=0) + hull.amax(dim=0)) / 2
-    found = minimize(distance, middle.numpy(), method="Nelder-Mead", options={"xatol": 1e-3})
-    return torch.from_numpy(found.x), float(found.fun)
+    def farness(values: np.ndarray) -> float:
+        # How far the cameras are from the object's middle: their distance from the target
+        # alone is less the nearer the target itself is to them. Convex.
+        target = torch.from_numpy(values)
+        off = target - middle
+        return distance(target) + float(off @ mean_toward) + _STAY * float(off @ off)
+
+    found = minimize(farness, middle.numpy(), method="Nelder-Mead", options={"xatol": 1e-3})
+    target = torch.from_numpy(found.x)
+    return target, distance(target)
 
 
 def _directions(

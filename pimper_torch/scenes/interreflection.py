@@ -26,8 +26,8 @@ class Interreflection:
     Args:
         stage: The bodies; they do not move.
         bounces: How many surfaces light may touch before the one that is seen.
-        num_rays: From each vertex. More rays less noise: the error of what a vertex gets is
-            about a third of it over the square root of this.
+        num_rays: From each vertex; the more, the less its light differs from its neighbours'
+            by chance.
         seed: Turns the fan of rays of each vertex.
 
     Highlights are not passed on, and neither is the ambient light, which stands for all that
@@ -37,7 +37,7 @@ class Interreflection:
 
     def __init__(self, stage: Stage, bounces: int, *, num_rays: int = 64, seed: int = 0) -> None:
         self.bounces = bounces
-        self._share = _transfer(stage, num_rays, seed)
+        self._share = transfer(stage, num_rays, seed)
         self._albedo = stage.vertex_albedo()[stage.mesh.faces].mean(dim=1)
         self._faces = stage.mesh.faces
 
@@ -52,8 +52,11 @@ class Interreflection:
         return total
 
 
-def _transfer(stage: Stage, num_rays: int, seed: int) -> csr_array:
-    """Give the share of each vertex' light that comes from each face, ``vertex face``."""
+def transfer(stage: Stage, num_rays: int, seed: int) -> csr_array:
+    """Give the share of each vertex' light that comes from each face, ``vertex face``.
+
+    Where all faces have radiance 1, a row's sum is the irradiance of its vertex.
+    """
     vertices = stage.mesh.vertices_world.float()
     normals = stage.vertex_normals
     generator = torch.Generator().manual_seed(seed)

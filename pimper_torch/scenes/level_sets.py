@@ -45,7 +45,7 @@ def mesh_level_set(
             counts.tolist()
         )
     found, faces, _, _ = marching_cubes(
-        values.numpy(), level=0.0, spacing=(cell, cell, cell), gradient_direction="ascent"
+        values.numpy(), level=0.0, spacing=(cell, cell, cell), gradient_direction="descent"
     )
     vertices = start + torch.from_numpy(found.astype("float64"))
     for _ in range(_NEWTON_STEPS):

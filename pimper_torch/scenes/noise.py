@@ -73,7 +73,7 @@ class Speckle:
     edges. The same point has the same colour in every view.
 
     Attributes:
-        lattices: One an octave, periodic.
+        lattices: One an octave, periodic: along each axis the last value repeats the first.
         cells: Scene units between lattice points, one an octave.
         weights: One an octave.
         darkest: Lowest albedo.
@@ -96,14 +96,12 @@ class Speckle:
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
         """Give the albedo at points."""
         rows = points.reshape(-1, 3)
-        side = self.lattices.shape[-1]
+        side = self.lattices.shape[-1] - 1
         channels = self.lattices.shape[1]
         total = rows.new_zeros(channels, len(rows))
         for lattice, cell, weight in zip(self.lattices, self.cells, self.weights, strict=True):
-            # The wrapped lattice has side + 1 points and spans [-1, 1] between its outermost.
             grid = torch.remainder(rows / cell, side) * (2 / side) - 1
-            wrapped = pad(lattice[None].to(rows), (0, 1, 0, 1, 0, 1), mode="circular")
-            values = grid_sample(wrapped, grid[None, None, None], align_corners=True)
+            values = grid_sample(lattice[None].to(rows), grid[None, None, None], align_corners=True)
             total = total + weight * values[0, :, 0, 0]
         share = torch.sigmoid(self.contrast * (total + self.offset))
         albedo = self.darkest + (self.brightest - self.darkest) * share
@@ -141,7 +139,7 @@ def random_speckle(
     shared = torch.randn(shape, generator=generator)
     own = torch.randn((len(cells), channels, side, side, side), generator=generator)
     return Speckle(
-        lattices=(1 - colour) * shared + colour * own,
+        lattices=pad((1 - colour) * shared + colour * own, (0, 1, 0, 1, 0, 1), mode="circular"),
         cells=cells,
         weights=tuple(1.0 for _ in cells),
         darkest=darkest,

@@ -79,7 +79,7 @@ def mug(generator: torch.Generator) -> tuple[Body, ...]:
     """Throw a glazed mug with a handle and a bold pattern outside."""
     decor = random_speckle(
         generator,
-        cells=(0.33, 0.15, 0.067, 0.03, 0.014),
+        cells=(0.33, 0.15, 0.067, 0.03),
         darkest=0.07,
         brightest=0.82,
         contrast=3.0,
@@ -115,26 +115,26 @@ def jar(generator: torch.Generator) -> tuple[Body, ...]:
     glaze = random_speckle(
         generator,
         cells=(0.9, 0.4),
-        darkest=0.62,
-        brightest=0.78,
+        darkest=0.74,
+        brightest=0.9,
         contrast=0.5,
         colour=0.1,
         tint=(1.0, 0.96, 0.88),
     )
     blemishes = random_speckle(
         generator,
-        cells=(0.11, 0.05),
-        darkest=0.45,
+        cells=(0.11, 0.05, 0.024),
+        darkest=0.5,
         contrast=7.0,
-        offset=1.9,
-        colour=0.1,
+        offset=2.0,
+        colour=0.0,
         brightest=1.0,
     )
     label = random_speckle(
         generator,
         cells=(0.12, 0.045),
-        darkest=0.60,
-        brightest=0.72,
+        darkest=0.66,
+        brightest=0.84,
         contrast=2.0,
         colour=0.15,
         tint=(0.94, 0.98, 1.0),
@@ -165,7 +165,7 @@ def balls(generator: torch.Generator) -> tuple[Body, ...]:
     for (center, radius), tint in zip(_BALLS, _BALL_TINTS, strict=True):
         texture = random_speckle(
             generator,
-            cells=(0.23, 0.1, 0.045, 0.02),
+            cells=(0.23, 0.1, 0.045),
             darkest=0.12,
             brightest=0.8,
             contrast=1.6,
@@ -212,7 +212,7 @@ def cloth(generator: torch.Generator, half_side: float = 4.0) -> Body:
     """Lay a matte cloth of modest texture on the table."""
     weave = random_speckle(
         generator,
-        cells=(0.61, 0.21, 0.083, 0.037, 0.017),
+        cells=(0.61, 0.23, 0.09),
         darkest=0.16,
         brightest=0.44,
         contrast=0.7,

@@ -25,7 +25,7 @@ def fresnel(
     """Give the share of light that is mirrored.
 
     Args:
-        cosine: Between the light and the mirroring facet.
+        cosine: Between the light and what it falls on.
         specular: The share at a cosine of 1; 0 mirrors nothing at any angle.
     """
     grazing = (specular / _LEAST_SPECULAR).clamp_max(1)
@@ -73,8 +73,9 @@ def reflect(
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Split light of irradiance 1 into what the matte part sends and what is mirrored.
 
-    The matte part gets what the facets do not mirror, so that no more leaves the surface
-    than arrives; with ``specular`` 0 it is the cosine alone.
+    The matte part lies under the glaze: it gets what is not mirrored on the way in, and sends
+    what is not mirrored on the way out, so that no more leaves the surface than arrives. With
+    ``specular`` 0 it is the cosine alone.
 
     Args:
         normals: Unit.
@@ -94,6 +95,7 @@ def reflect(
     half = normalize(to_light + to_eye, dim=-1)
     mirrored = fresnel((half * to_light).sum(dim=-1), specular)
     alpha = roughness**2
+    passed = (1 - fresnel(cosine, specular)) * (1 - fresnel(seen, specular))
     density = facet_density((normals * half).sum(dim=-1).clamp(0, 1), alpha)
     lobe = torch.pi * mirrored * density * masking(cosine.clamp_min(1e-6), seen, alpha) * cosine
-    return torch.where(above, cosine * (1 - mirrored), 0), torch.where(above, lobe, 0)
+    return torch.where(above, cosine * passed, 0), torch.where(above, lobe, 0)

@@ -158,6 +158,8 @@ class Stage:
         albedo = points.new_zeros(len(points), 3)
         for index, one in enumerate(self.bodies):
             (own,) = torch.nonzero(body == index, as_tuple=True)
+            if len(own) == 0:
+                continue
             if one.texture is not None:
                 found = one.texture(points[own])
             else:

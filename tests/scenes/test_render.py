@@ -131,7 +131,7 @@ def test_gloss_adds_a_highlight_where_the_mirror_direction_is():
         scene = render_bodies([body], above(), lamp([2.0, 0.0, 5.0], **dim), generator, QUIET)
         difference.append(scene.views.images[0, 0])
     extra = difference[1] - difference[0]
-    assert (extra >= -0.005).all()  # what is mirrored is taken from the matte part
+    assert (extra >= -0.012).all()  # what is mirrored is taken from the matte part
     # Camera and lamp stand 5 above x = 0 and x = 2: they mirror at x = 1, 12 pixels aside.
     row, column = divmod(int(extra.argmax()), 31)
     assert row == 15

@@ -1,0 +1,54 @@
+import json
+
+import pytest
+
+from pimper_torch.cli.main import main
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.records import Mesh
+from pimper_torch.scenes.meshes import icosphere
+
+
+@pytest.fixture
+def ball(tmp_path):
+    vertices, faces = icosphere(2)
+    write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "ball.ply")
+    return tmp_path / "ball.ply"
+
+
+def render(scene, out, *options):
+    small = ["--num-views", "2", "--width", "32", "--height", "24", "--processes", "1"]
+    return main(["render", str(scene), "-o", str(out), *small, *options])
+
+
+def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
+    options = ("--path", "turntable", "--bits", "16", "--encoding", "linear", "--seed", "4")
+    assert render(ball, tmp_path / "out", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert settings["path"] == "turntable"
+    assert settings["bits"] == 16
+    assert settings["seed"] == 4
+    assert settings["lamp_distance"] == 2.5
+    told = capsys.readouterr()
+    assert f"{tmp_path}/out/photos" in told.out
+    assert "--linear" in told.out
+    assert "photographs 2" in told.err
+
+
+def test_a_former_rendering_is_replaced_only_on_demand(ball, tmp_path, capsys):
+    assert render(ball, tmp_path / "out") == 0
+    assert render(ball, tmp_path / "out") == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert render(ball, tmp_path / "out", "--overwrite", "--seed", "9") == 0
+    account = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())
+    assert account["settings"]["seed"] == 9
+
+
+def test_a_scene_that_does_not_exist_is_told_in_a_sentence(tmp_path, capsys):
+    assert render("teapot", tmp_path / "out") == 2
+    assert "no scene 'teapot'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_impossible_setting_is_told_in_a_sentence(ball, tmp_path, capsys):
+    assert render(ball, tmp_path / "out", "--exposure", "0") == 2
+    assert "exposure is 0.0" in capsys.readouterr().err
