@@ -27,11 +27,13 @@ from pimper_torch.datasets import (
     read_meshroom,
     read_metashape,
     read_middlebury,
+    read_rendered,
     read_transforms,
     write_colmap,
     write_idr,
     write_transforms,
 )
+from pimper_torch.datasets.posed import shrink
 from pimper_torch.errors import InputError
 from pimper_torch.io.folders import prepare_output, written_whole
 from pimper_torch.progress import listening
@@ -50,6 +52,7 @@ Source = Literal[
     "dtu-mvs",
     "diligent-mv",
     "diligent",
+    "rendered",
 ]
 Target = Literal["colmap", "idr", "transforms"]
 
@@ -181,7 +184,22 @@ def readers() -> Mapping[Source, Callable[..., Capture]]:
         "dtu-mvs": read_dtu_mvs,
         "diligent-mv": read_diligent_mv,
         "diligent": read_diligent,
+        "rendered": read_scene,
     }
+
+
+def read_scene(folder: Path, *, max_size_px: int = 0) -> Capture:
+    """Read a rendered scene without its maps, which no layout has a place for.
+
+    Raises:
+        InputError: As :func:`pimper_torch.datasets.read_rendered`.
+    """
+    if max_size_px < 0:
+        raise InputError(f"--max-size-px is {max_size_px}; needed: 0, or the longest side.")
+    capture = read_rendered(folder, maps=False)
+    assert capture.cameras is not None
+    views, cameras = shrink(capture.views, capture.cameras, max_size_px)
+    return capture.replace(views=views, cameras=cameras)
 
 
 def read(job: Job) -> Capture:

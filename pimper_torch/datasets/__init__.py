@@ -10,6 +10,7 @@ from pimper_torch.datasets.llff import read_llff
 from pimper_torch.datasets.meshroom import read_meshroom
 from pimper_torch.datasets.metashape import read_metashape
 from pimper_torch.datasets.middlebury import read_middlebury
+from pimper_torch.datasets.rendered import read_rendered
 from pimper_torch.datasets.sampling import one_light_per_position
 from pimper_torch.datasets.transforms import read_transforms, write_transforms
 
@@ -28,6 +29,7 @@ __all__ = [
     "read_metashape",
     "read_middlebury",
     "read_normal_map",
+    "read_rendered",
     "read_scale_mats",
     "read_transforms",
     "write_colmap",

@@ -10,6 +10,7 @@ from pimper_torch.datasets.posed import (
     image_files,
     mask_finder,
     rigid_or_refuse,
+    shrink,
 )
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.projection import project
@@ -236,3 +237,17 @@ def test_two_masks_for_one_photograph_are_refused(tmp_path, paint):
         paint(tmp_path / "m" / name, 100)
     with pytest.raises(InputError, match=r"1-a\.png, 1-b\.png"):
         mask_finder(tmp_path / "m", "a toy")(tmp_path / "1.jpg")
+
+
+def test_shrinking_a_capture_is_reading_it_smaller(shot, tmp_path):
+    shots = [shot(skew_px=2.0), shot("b.png", 6, 4, lens=LENS.replace(width=6, height=4))]
+    whole = assemble(shots, tmp_path, "a toy")
+    small = assemble(shots, tmp_path, "a toy", max_size_px=8)
+    views, cameras = shrink(whole.views, whole.cameras, 8)
+    assert views.images.shape == (2, 3, 6, 8)
+    assert_close(views.images, small.views.images)
+    assert_close(cameras.intrinsics, small.cameras.intrinsics)
+    assert torch.equal(cameras.sizes_px, small.cameras.sizes_px)
+    again, same = shrink(whole.views, whole.cameras, 0)
+    assert torch.equal(again.images, whole.views.images)
+    assert torch.equal(same.intrinsics, whole.cameras.intrinsics)
