@@ -1,4 +1,5 @@
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -6,7 +7,8 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.cli.convert import cloud
+from pimper_torch.cli import convert
+from pimper_torch.cli.convert import Source, cloud, read_scene, readers
 from pimper_torch.cli.main import main
 from pimper_torch.datasets import read_colmap, read_idr, read_scale_mats, read_transforms
 from pimper_torch.geometry.frames import transform
@@ -106,3 +108,47 @@ def test_a_large_cloud_is_thinned_from_end_to_end():
     mesh = Mesh(vertices_world=points[:5], faces=torch.zeros(0, 3, dtype=torch.long))
     assert torch.equal(cloud(Truth(points_world=points, mesh=mesh)), points[:5])
     assert cloud(Truth()) is None
+
+
+def test_every_layout_that_is_offered_has_a_reader():
+    assert set(readers()) == set(get_args(Source))
+
+
+def test_one_light_a_place_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
+    photographs = tmp_path / "Rectified" / "scan9"
+    calibration = tmp_path / "Calibration" / "cal18"
+    photographs.mkdir(parents=True)
+    calibration.mkdir(parents=True)
+    for place in (1, 2, 3):
+        for lamp in (0, 3):
+            level = Image.new("RGB", (16, 12), (60 * place, 20, 90 + lamp))
+            level.save(photographs / f"rect_{place:03d}_{lamp}_r5000.png")
+        matrix = np.array([[2000.0, 0, 800, place], [0, 2000, 600, 2], [0, 0, 1, 700]])
+        np.savetxt(calibration / f"pos_{place:03d}.txt", matrix)
+    arguments = ["convert", str(tmp_path), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]
+    assert main([*arguments, "--scan", "9", "--light-seed", "0", "--target", "colmap"]) == 0
+    assert "3 photographs of 16 x 12 from 3 places, under 2 lights" in capsys.readouterr().out
+    assert read_colmap(tmp_path / "out").views.num_views == 3
+
+
+def test_a_rendered_scene_is_read_without_maps_and_shrunk(data, monkeypatch):
+    asked = {}
+
+    def stand_in(folder, **options):
+        asked.update(options)
+        return read_transforms(folder)
+
+    monkeypatch.setattr(convert, "read_rendered", stand_in)
+    capture = read_scene(data, max_size_px=6)
+    assert asked == {"maps": False}
+    assert capture.views.sizes_px.tolist() == [[6, 4]] * 3
+    assert_close(float(capture.cameras.intrinsics[0, 0, 2]), 3.25)
+
+
+def test_a_set_without_cameras_is_not_exported(data, tmp_path, monkeypatch, capsys):
+    bare = read_transforms(data).replace(cameras=None)
+    monkeypatch.setattr(convert, "read_llff", lambda folder: bare)
+    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "llff"]
+    assert main([*arguments, "--target", "idr"]) == 2
+    assert "says nothing about its cameras" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
