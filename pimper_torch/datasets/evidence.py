@@ -297,10 +297,10 @@ def _within(pixels: Float[Tensor, "point 2"], width: int, height: int) -> Bool[T
 
 
 def _neighbours(num_views: int) -> list[tuple[int, int]]:
-    """Pair each view with the next, and in small sets all with all."""
+    """Pair every other view with the next, and in small sets all with all."""
     if num_views <= 4:
         return list(combinations(range(num_views), 2))
-    return [(view, view + 1) for view in range(num_views - 1)]
+    return [(view, view + 1) for view in range(0, num_views - 1, 2)]
 
 
 def shrunk_cameras(cameras: Cameras, longer_px: int) -> Cameras:

@@ -21,9 +21,10 @@ from pimper_torch.records import Cameras, Mesh, Truth, Views
 _LOOKED_AT = 4  # views
 _SMALL_PX = 160
 _SATURATED = 0.99
-# Mean cosines of right normals are above 0.9, of mirrored ones of a curved surface below 0.8.
-_BETTER_COSINE = 0.1
-_BETTER_CORRELATION = 0.15
+# Right normals agree with those of depth or mesh to a mean cosine above 0.95, and no turn of
+# them can halve what is left; mirrored ones reach 0.9 where a surface is rather flat.
+_LEFT, _BETTER_COSINE = 0.5, 0.03
+_BETTER_CORRELATION = 0.1
 _FACING = 0.75
 
 
@@ -98,7 +99,8 @@ def check_normals(
     values = [score(None), *(score(mistake) for mistake in mistakes)]
     best = int(np.argmax(values))
     if geometric:
-        wrong = values[best] > values[0] + _BETTER_COSINE
+        halved = 1 - values[best] < _LEFT * (1 - values[0])
+        wrong = halved and values[best] > values[0] + _BETTER_COSINE
     else:
         # Several turns may face the camera; which of them, the shading tells.
         shaded = [_shading_score(views, truth, cameras, one, None) for one in (None, *mistakes)]
