@@ -1,5 +1,6 @@
 """Readers of public data sets, and their layouts as formats to write."""
 
+from pimper_torch.datasets.check import check_capture, require_consistent
 from pimper_torch.datasets.colmap import read_colmap, read_colmap_scene, write_colmap
 from pimper_torch.datasets.diligent import read_diligent, read_normal_map
 from pimper_torch.datasets.diligent_mv import read_diligent_mv
@@ -10,11 +11,13 @@ from pimper_torch.datasets.llff import read_llff
 from pimper_torch.datasets.meshroom import read_meshroom
 from pimper_torch.datasets.metashape import read_metashape
 from pimper_torch.datasets.middlebury import read_middlebury
+from pimper_torch.datasets.one_viewpoint import read_uw_ps, read_yale_b
 from pimper_torch.datasets.rendered import read_rendered
 from pimper_torch.datasets.sampling import one_light_per_position
 from pimper_torch.datasets.transforms import read_transforms, write_transforms
 
 __all__ = [
+    "check_capture",
     "one_light_per_position",
     "read_colmap",
     "read_colmap_scene",
@@ -32,6 +35,9 @@ __all__ = [
     "read_rendered",
     "read_scale_mats",
     "read_transforms",
+    "read_uw_ps",
+    "read_yale_b",
+    "require_consistent",
     "write_colmap",
     "write_idr",
     "write_transforms",

@@ -43,10 +43,11 @@ def read_dtu_points(
         CleanRecon_2009_11_16/Clean_Reconstruction_01.mat    also under reconstructions/
 
     The world is the calibration's, in metres. The truth is the structured-light scan,
-    where its file is there. The set gives no positions of its LEDs, so lights are unknown;
-    its authors add photographs up as linear radiance, and so they are read. Pixels of the
-    calibration count from the centre of the first one; lens distortion is neglected, as in
-    the set's own evaluation (a few tenths of a pixel matter there, 5 pixels are allowed).
+    where its file is there. The set gives no positions of its LEDs, so lights are unknown.
+    It states no transfer curve either; experiments with it relight scenes by adding
+    photographs up as linear radiance, and so they are read. The calibration counts pixels
+    from the centre of the first one; its lens distortion is neglected, as in the set's own
+    evaluation.
 
     Args:
         folder: With ``SET001`` and so on.

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from pimper_torch.errors import InputError
@@ -89,11 +89,6 @@ def intrinsics_from_indices(
     moved = intrinsics.clone()
     moved[..., :2, 2] = pixels_from_indices(moved[..., :2, 2])
     return moved
-
-
-def repeated_sizes(width: int, height: int, num_views: int) -> Int[Tensor, "view 2"]:
-    """Give the size of views that all have the same."""
-    return torch.tensor([[width, height]]).repeat(num_views, 1)
 
 
 def _read_masks(
