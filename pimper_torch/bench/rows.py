@@ -38,11 +38,12 @@ class Row(Record):
         median_normal_deg: The same.
         mean_shape_normal_deg: Error of the normals of the surface's own shape.
         median_shape_normal_deg: The same.
-        chamfer: Mean of accuracy and completeness.
+        chamfer: Mean of accuracy and completeness of what three views or more see.
         accuracy: Mean distance from the surface to the truth.
         completeness: Mean distance from the truth to the surface.
         completeness_seen: The same from the truth that three views or more see.
-        f_scores: Pairs of a threshold, a length, and the F-score there, per cent.
+        f_scores: Pairs of a threshold, a length, and the F-score there, per cent, over the
+            truth that three views or more see.
         peak_memory_mb: Highest resident memory while the method ran.
         note: Why figures are missing, such as ``not installed``.
         published: Printed in a paper, on photographs that are not these.

@@ -59,8 +59,7 @@ _RAYS = (
 _SURFACE = (
     Column(heading="Chamfer, %", value=lambda row: row.chamfer, decimals=3),
     Column(heading="accuracy, %", value=lambda row: row.accuracy, decimals=3),
-    Column(heading="complete, %", value=lambda row: row.completeness, decimals=3),
-    Column(heading="complete ≥3, %", value=lambda row: row.completeness_seen, decimals=3),
+    Column(heading="complete, %", value=lambda row: row.completeness_seen, decimals=3),
 )
 
 
@@ -178,8 +177,9 @@ def legend(table: Table) -> list[str]:
         "is `100 ||S - S_hat|| / ||S - mean S||` along the rays of the reference view, over the "
         "share of the true pixels that is covered. Normals are those that the vertices carry; "
         "shape is the surface's own. Chamfer (the mean of accuracy and completeness), accuracy, "
-        "completeness (≥3: of what three views see) and the thresholds of F are in % of the "
-        f"diagonal of the true bounding box. {MISSING}: not measured, or not applicable.",
+        "completeness and the thresholds of F are in % of the diagonal of the true bounding box, "
+        "over the part of the true surface that three views or more see. "
+        f"{MISSING}: not measured, or not applicable.",
     ]
     if any(row.published for row in table.rows):
         sentences.append(

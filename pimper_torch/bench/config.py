@@ -1,0 +1,60 @@
+"""What the table is made of."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pimper_torch.config import require
+from pimper_torch.scenes.config import SceneConfig
+
+SCENES = ("mug", "jar", "balls", "potatoes")
+METHODS = (
+    "default",
+    "paper",
+    "smoothed",
+    "global-stereo",
+    "lim",
+    "pmvs",
+    "openmvs",
+    "colmap-dense",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BenchConfig:
+    """Which methods run on which scenes, and how large the scenes are.
+
+    Attributes:
+        scale: quick: 16 photographs of 640x480 a scene; full: 30 of 1600x1200.
+        scenes: Names of rendered scenes, or folders that `pimper render` wrote.
+        methods: Presets, YAML files of settings, and rivals.
+        masks: Give the methods the true masks of the object; without, they see the table too.
+        cameras: found by structure from motion, once a scene and the same for all methods; or
+            the true ones with a true cloud.
+        seed: Of scenes and samples.
+        processes: That render at the same time.
+    """
+
+    scale: Literal["quick", "full"] = "quick"
+    scenes: tuple[str, ...] = SCENES
+    methods: tuple[str, ...] = METHODS
+    masks: bool = False
+    cameras: Literal["found", "true"] = "found"
+    seed: int = 0
+    processes: int = 2
+
+    def __post_init__(self) -> None:
+        """Refuse a table without rows."""
+        require(len(self.scenes) > 0, "scenes", self.scenes, "one scene or more")
+        require(len(self.methods) > 0, "methods", self.methods, "one method or more")
+        for name in ("scenes", "methods"):
+            given = getattr(self, name)
+            require(len(set(given)) == len(given), name, given, "each only once")
+        require(self.seed >= 0, "seed", self.seed, "0 or more")
+        require(self.processes >= 1, "processes", self.processes, "1 or more")
+
+    @property
+    def scene(self) -> SceneConfig:
+        """How the scenes are photographed at this scale."""
+        if self.scale == "full":
+            return SceneConfig(seed=self.seed)
+        return SceneConfig(seed=self.seed, num_views=16, width=640, height=480)

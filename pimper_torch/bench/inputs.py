@@ -1,0 +1,66 @@
+"""What every method of the table is given: the same cameras, cloud and photographs."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from pimper_torch.bench.config import BenchConfig
+from pimper_torch.coarse.triangulate import Triangulate
+from pimper_torch.datasets.rendered import read_rendered
+from pimper_torch.io.photographs import load_views
+from pimper_torch.records import Capture, CoarseMesh, Record, SparseScene
+from pimper_torch.scenes.write import render_scene
+from pimper_torch.sfm.reconstruct import Reconstruct
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Inputs(Record):
+    """A scene of the table, ready for the methods.
+
+    Attributes:
+        scene: Cameras and cloud, found or true, and the photographs.
+        coarse: Facets for the rivals that start from some; of the default preset.
+        capture: The truth, without the photographs.
+        sfm_seconds: Wall clock of structure from motion; 0 with true cameras.
+    """
+
+    scene: SparseScene
+    coarse: CoarseMesh
+    capture: Capture
+    sfm_seconds: float
+
+
+def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
+    """Render a scene, or give the folder that `pimper render` wrote.
+
+    Args:
+        name: Of a rendered scene, or a folder with ``truth`` in it.
+        config: Of the bench.
+        workspace: Where a rendering goes.
+
+    Raises:
+        InputError: No scene, mesh or folder has that name.
+    """
+    if (Path(name) / "truth").is_dir():
+        return Path(name)
+    folder = workspace / Path(name).stem
+    return render_scene(name, folder, config.scene, processes=config.processes)
+
+
+def prepare(folder: Path, config: BenchConfig) -> Inputs:
+    """Read a rendered scene and find its cameras, from the files as a user would.
+
+    Raises:
+        PimperError: Not such a folder, or structure from motion fails.
+    """
+    views = load_views(folder / "photos", masks=folder / "masks" if config.masks else None)
+    model = folder / "truth" / "sparse" if config.cameras == "true" else None
+    began = time.perf_counter()
+    scene = Reconstruct()(views, model)
+    seconds = 0.0 if model else time.perf_counter() - began
+    return Inputs(
+        scene=scene,
+        coarse=Triangulate()(scene),
+        capture=read_rendered(folder, photographs=False),
+        sfm_seconds=seconds,
+    )

@@ -1,0 +1,133 @@
+"""Presets and rivals under one signature: a sparse scene and a coarse mesh in, an estimate out."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import nn
+
+from pimper_torch.baselines.colmap_dense import ColmapDense
+from pimper_torch.baselines.global_stereo import GlobalStereo
+from pimper_torch.baselines.lim import Lim
+from pimper_torch.baselines.openmvs import OpenMvs
+from pimper_torch.baselines.pmvs import Pmvs
+from pimper_torch.baselines.smoothed import Smoothed
+from pimper_torch.errors import ConfigError
+from pimper_torch.io.accounts import mean_lights, world_lights
+from pimper_torch.pipeline import Pimper, load_config
+from pimper_torch.records import (
+    CoarseMesh,
+    Estimate,
+    Reconstruction,
+    Record,
+    SparseScene,
+    Views,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Outcome(Record):
+    """What a method gave, and what it cost.
+
+    Attributes:
+        estimate: Surface, cameras, lights.
+        seconds: Wall clock without structure from motion.
+        mesh_points: Vertices of the coarse mesh; ``None`` for methods that use none.
+        triangles: Its facets.
+        samples: Samples of all templates times views, missing ones included.
+        missing_share: Of the samples.
+        external: A program of its own did the work, whose memory is not this process's.
+    """
+
+    estimate: Estimate
+    seconds: float
+    mesh_points: int | None = None
+    triangles: int | None = None
+    samples: int | None = None
+    missing_share: float | None = None
+    external: bool = False
+
+
+Method = Callable[[SparseScene, CoarseMesh], Outcome]
+
+_RIVALS: dict[str, Callable[[], nn.Module]] = {
+    "smoothed": Smoothed,
+    "global-stereo": GlobalStereo,
+    "lim": Lim,
+    "pmvs": Pmvs,
+    "openmvs": OpenMvs,
+    "colmap-dense": ColmapDense,
+}
+
+
+def method_named(name: str) -> Method:
+    """Find a rival by name, or a preset, or a YAML file of settings.
+
+    Raises:
+        ConfigError: Nothing has that name.
+    """
+    if name in _RIVALS:
+        return _rival(_RIVALS[name]())
+    try:
+        return _preset(name)
+    except ConfigError as error:
+        raise ConfigError(f"method {name!r}: {error} Rivals are {', '.join(_RIVALS)}.") from error
+
+
+class Given(nn.Module):
+    """Stands in for structure from motion that has run already."""
+
+    def __init__(self, scene: SparseScene) -> None:
+        super().__init__()
+        self.scene = scene
+
+    def forward(self, views: Views, sparse_model: object = None) -> SparseScene:
+        """Give the scene, whatever the views."""
+        return self.scene
+
+
+def _preset(name: str) -> Method:
+    config = load_config(name)
+
+    def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
+        pimper = Pimper(config)
+        pimper.reconstruct = Given(scene)
+        began = time.perf_counter()
+        result = pimper(scene.views)
+        seconds = time.perf_counter() - began
+        found = {key: value for report in result.report for key, value in report.figures.items()}
+        return Outcome(
+            estimate=_estimate_of(result),
+            seconds=seconds,
+            mesh_points=int(found["mesh_points"]),
+            triangles=int(found["triangles"]),
+            samples=int(found["samples"]),
+            missing_share=float(found["missing_share"]),
+        )
+
+    return run
+
+
+def _rival(module: nn.Module) -> Method:
+    def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
+        began = time.perf_counter()
+        estimate = module(scene, coarse)
+        return Outcome(
+            estimate=estimate,
+            seconds=time.perf_counter() - began,
+            external=isinstance(module, Pmvs | OpenMvs | ColmapDense),
+        )
+
+    return run
+
+
+def _estimate_of(result: Reconstruction) -> Estimate:
+    _, lights_world, determined = world_lights(result)
+    names = result.scene.views.names
+    return Estimate(
+        mesh=result.mesh,
+        names=names,
+        cameras=result.cameras,
+        lights_world=mean_lights(lights_world, determined)[0],
+        reference=names[result.coarse.reference],
+    )

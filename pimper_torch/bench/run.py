@@ -1,0 +1,331 @@
+"""Scenes by methods, measured alike."""
+
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.bench.config import BenchConfig
+from pimper_torch.bench.inputs import Inputs, prepare, scene_folder
+from pimper_torch.bench.machine import this_machine
+from pimper_torch.bench.memory import peak_memory
+from pimper_torch.bench.methods import Method, Outcome, method_named
+from pimper_torch.bench.rows import Row, Table, row_of_failure, with_published, write_json
+from pimper_torch.bench.table import markdown
+from pimper_torch.errors import PimperError, PimperWarning
+from pimper_torch.geometry.frames import rotate, transform
+from pimper_torch.io.folders import written_whole
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.metrics.distances import bounding_diagonal
+from pimper_torch.metrics.evaluate import EvaluateConfig, Evaluation, evaluate
+from pimper_torch.metrics.relative import meet_in_view
+from pimper_torch.metrics.similarity import pair_views, split_similarity
+from pimper_torch.progress import listening
+from pimper_torch.records import Capture, Mesh, Record, StageReport
+from pimper_torch.reporting import Observer, Silent, peak_memory_mb
+from pimper_torch.viz.heatmap import (
+    ErrorScale,
+    MethodPanels,
+    SceneRow,
+    crop_to,
+    draw_heatmap,
+    draw_sheet,
+    error_picture,
+    normals_picture,
+    photograph_picture,
+    shading_in_view,
+    surface_picture,
+)
+
+BENCH_NAMES = ("table.md", "table.json", "sheet.png", "heatmaps", "meshes")
+# Per cent of the diagonal: twice what the facets alone are off by, so that methods differ.
+_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Measured(Record):
+    """One cell of the bench: a method on a scene.
+
+    Attributes:
+        row: Its figures.
+        panels: Its pictures.
+    """
+
+    row: Row
+    panels: MethodPanels
+
+
+def run_bench(
+    config: BenchConfig,
+    folder: Path | str,
+    *,
+    observer: Observer | None = None,
+    overwrite: bool = False,
+) -> Table:
+    """Run methods on scenes, and write the table, its figures and all surfaces to a folder.
+
+    ==================  ===========================================================
+    file                what
+    ==================  ===========================================================
+    `table.md`          the table, beside the published figures
+    `table.json`        the same with all digits, and why figures are missing
+    `sheet.png`         photograph, true normals, each method's normals and errors
+    `heatmaps/`         errors on the surface, one picture a scene and method
+    `meshes/`           every surface, in the frame of the truth, as PLY
+    ==================  ===========================================================
+
+    A method that fails, or is not installed, has a row that says so. Interrupted after the
+    first scene, the scenes that are complete are written.
+
+    Args:
+        config: Scenes and methods.
+        folder: New or empty.
+        observer: Hears of every scene and method.
+        overwrite: Replace a former result.
+
+    Raises:
+        ConfigError: No such method.
+        InputError: No such scene.
+        OutputError: The folder holds something else, or cannot be written.
+    """
+    observer = observer or Silent()
+    methods = {name: method_named(name) for name in config.methods}
+    folder = Path(folder)
+    rows: list[Row] = []
+    sheet: list[SceneRow] = []
+    with (
+        written_whole(folder, BENCH_NAMES, overwrite=overwrite) as staging,
+        tempfile.TemporaryDirectory(prefix="pimper_bench_") as workspace,
+    ):
+        for part in ("heatmaps", "meshes"):
+            (staging / part).mkdir()
+        for scene in config.scenes:
+            try:
+                measured, pictures = _scene(
+                    scene, methods, config, Path(workspace), staging, observer
+                )
+            except KeyboardInterrupt:
+                if not rows:
+                    raise
+                warnings.warn(
+                    f"interrupted in scene {scene}; what was complete is in {folder}.",
+                    PimperWarning,
+                    stacklevel=2,
+                )
+                break
+            rows += measured
+            sheet += pictures
+        table = Table(
+            rows=with_published(rows),
+            machine=this_machine(),
+            date=datetime.now(UTC).strftime("%Y-%m-%d"),
+            scale=config.scale,
+            settings={"masks": config.masks, "cameras": config.cameras, "seed": config.seed},
+        )
+        write_json(table, staging / "table.json")
+        (staging / "table.md").write_text(markdown(table) + "\n", encoding="utf-8")
+        if sheet:
+            draw_sheet(sheet, _SCALE, staging / "sheet.png")
+    return table
+
+
+def _scene(
+    scene: str,
+    methods: dict[str, Method],
+    config: BenchConfig,
+    workspace: Path,
+    staging: Path,
+    observer: Observer,
+) -> tuple[list[Row], list[SceneRow]]:
+    """Run all methods on a scene; a scene without cameras has rows that say why."""
+    name = Path(scene).stem
+    with _shown(observer, f"{name} render"):
+        rendered = scene_folder(scene, config, workspace)
+    try:
+        with _shown(observer, f"{name} sfm"):
+            inputs = prepare(rendered, config)
+    except PimperError as error:
+        return [row_of_failure(name, method, error) for method in methods], []
+    cells = []
+    for method, run in methods.items():
+        with _shown(observer, f"{name} {method}"):
+            cells.append(_cell(name, method, run, inputs, config, staging))
+    return [cell.row for cell in cells], [_pictures(name, inputs, cells)]
+
+
+def _cell(
+    scene: str, method: str, run: Method, inputs: Inputs, config: BenchConfig, staging: Path
+) -> Measured:
+    """Run a method and measure what it gives."""
+    began = time.perf_counter()
+    file = f"{scene}_{Path(method).stem}"
+    sfm_minutes = inputs.sfm_seconds / 60 or None
+    try:
+        with peak_memory() as peak:
+            outcome = run(inputs.scene, inputs.coarse)
+            memory = None if outcome.external else peak()
+        evaluation = evaluate(outcome.estimate, inputs.capture, EvaluateConfig(seed=config.seed))
+    except (PimperError, MemoryError) as error:
+        minutes = (time.perf_counter() - began) / 60
+        row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
+        return Measured(row=row, panels=MethodPanels(method=method, note=row.note))
+    mesh = _carried(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
+    write_ply(mesh, staging / "meshes" / f"{file}.ply")
+    row = row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes)
+    view = reference_view(inputs)
+    errors = error_along_rays(mesh, inputs.capture, view)
+    cameras = inputs.capture.cameras
+    if errors is None or cameras is None:
+        return Measured(row=row, panels=MethodPanels(method=method, note="points only"))
+    path = staging / "heatmaps" / f"{file}.png"
+    draw_heatmap(mesh, cameras, view, errors, _SCALE, path, title=f"{scene}, {method}")
+    crop = _crop(inputs.capture, view)
+    shading = shading_in_view(mesh, cameras, view)
+    panels = MethodPanels(
+        method=method,
+        surface=surface_picture(mesh, cameras, view)[crop],
+        error=error_picture(errors, _SCALE, shading=shading)[crop],
+    )
+    return Measured(row=row, panels=panels)
+
+
+def row_of(
+    scene: str,
+    method: str,
+    outcome: Outcome,
+    evaluation: Evaluation,
+    *,
+    memory: float | None = None,
+    sfm_minutes: float | None = None,
+) -> Row:
+    """Take a row's figures from an outcome and its evaluation."""
+    view = evaluation.views[0] if evaluation.views else None
+    surface = evaluation.surface
+    seen = surface.seen if surface else None
+    return Row(
+        scene=scene,
+        method=method,
+        mesh_points=outcome.mesh_points,
+        triangles=outcome.triangles,
+        samples=outcome.samples,
+        missing_percent=_times(100, outcome.missing_share),
+        minutes=outcome.seconds / 60,
+        sfm_minutes=sfm_minutes,
+        relative_error=view.relative_error if view else None,
+        coverage_percent=100 * view.coverage if view else None,
+        mean_normal_deg=view.carried_normals.mean_deg if view and view.carried_normals else None,
+        median_normal_deg=(
+            view.carried_normals.median_deg if view and view.carried_normals else None
+        ),
+        mean_shape_normal_deg=view.shape_normals.mean_deg if view and view.shape_normals else None,
+        median_shape_normal_deg=(
+            view.shape_normals.median_deg if view and view.shape_normals else None
+        ),
+        chamfer=seen.chamfer_mean_percent if seen else None,
+        accuracy=surface.accuracy.mean_percent if surface and surface.accuracy else None,
+        completeness=surface.whole.completeness.mean_percent if surface and surface.whole else None,
+        completeness_seen=seen.completeness.mean_percent if seen else None,
+        f_scores=tuple((one.threshold_percent, 100 * one.f_score) for one in seen.thresholds)
+        if seen
+        else (),
+        peak_memory_mb=memory,
+    )
+
+
+def error_along_rays(
+    mesh: Mesh, capture: Capture, view: int
+) -> Float[Tensor, "height width"] | None:
+    """Give the distance of a surface from the truth along the rays of a view.
+
+    Args:
+        mesh: In the frame of the truth.
+        capture: With depth maps and the object's foreground.
+        view: One of its views.
+
+    Returns:
+        Per cent of the diagonal of the true bounding box; infinite on the object where the
+        surface is missed, NaN off the object. ``None`` for points without faces, and where no
+        ray meets both.
+    """
+    truth = capture.truth
+    if not len(mesh.faces) or truth.depth is None or truth.mesh is None or capture.cameras is None:
+        return None
+    where = None if truth.foreground is None else truth.foreground[view]
+    try:
+        met = meet_in_view(
+            mesh, torch.eye(4).double(), capture.cameras, view, truth.depth[view], where
+        )
+    except PimperError:
+        return None
+    error = torch.full(met.valid.shape, torch.nan, dtype=torch.float64)
+    error[met.valid] = torch.inf
+    distance = (met.points - met.points_true).norm(dim=-1).double()
+    error[met.both] = 100 * distance / bounding_diagonal(truth.mesh)
+    return error
+
+
+def reference_view(inputs: Inputs) -> int:
+    """Find the reference view of the methods among the views of the truth."""
+    name = inputs.scene.views.names[inputs.coarse.reference]
+    return int(pair_views([name], inputs.capture.views.names)[1][0])
+
+
+def _pictures(scene: str, inputs: Inputs, cells: list[Measured]) -> SceneRow:
+    capture, view = inputs.capture, reference_view(inputs)
+    assert capture.cameras is not None
+    assert capture.truth.normals_world is not None
+    crop = _crop(capture, view)
+    taken = inputs.scene.views.images[inputs.coarse.reference]
+    return SceneRow(
+        scene=scene,
+        photograph=photograph_picture(taken)[crop],
+        truth=normals_picture(capture.truth.normals_world[view], capture.cameras, view)[crop],
+        methods=tuple(cell.panels for cell in cells),
+    )
+
+
+def _crop(capture: Capture, view: int) -> tuple[slice, slice]:
+    assert capture.truth.foreground is not None
+    return crop_to(capture.truth.foreground[view])
+
+
+def _carried(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
+    """Put a mesh in the frame of the truth."""
+    _, rotation = split_similarity(truth_from_world)
+    turn = torch.eye(4).double()
+    turn[:3, :3] = rotation
+    normals = mesh.normals_world
+    return mesh.replace(
+        vertices_world=transform(truth_from_world.double(), mesh.vertices_world.double()),
+        normals_world=None if normals is None else rotate(turn, normals.double()),
+    )
+
+
+def _times(factor: float, value: float | None) -> float | None:
+    return None if value is None else factor * value
+
+
+@contextmanager
+def _shown(observer: Observer, name: str) -> Iterator[None]:
+    """Tell the observer of a piece of work as if it were a stage."""
+    began = time.perf_counter()
+    observer.started(name)
+    progressed: Callable[[int, int], None] = observer.progressed
+    with listening(progressed):
+        yield
+    observer.finished(
+        StageReport(
+            name=name,
+            seconds=time.perf_counter() - began,
+            peak_memory_mb=peak_memory_mb(),
+            figures={},
+        )
+    )
