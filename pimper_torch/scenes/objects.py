@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from pimper_torch.records import Mesh
@@ -28,7 +28,6 @@ Recipe = Callable[[torch.Generator], tuple[Body, ...]]
 _MUG_RADIUS, _MUG_HEIGHT, _MUG_WALL = 0.85, 1.95, 0.09
 # Of the jar: foot, belly, shoulder, neck, the lid's rim, its dome and knob.
 _JAR_PROFILE = (
-    (0.0, 0.0),
     (0.52, 0.0),
     (0.575, 0.02),
     (0.60, 0.07),
@@ -126,7 +125,7 @@ def jar(generator: torch.Generator) -> tuple[Body, ...]:
         cells=(0.11, 0.05, 0.024),
         darkest=0.5,
         contrast=7.0,
-        offset=2.0,
+        offset=2.2,
         colour=0.0,
         brightest=1.0,
     )
@@ -153,9 +152,13 @@ def jar_mesh(levels: int = 280, around: int = 224) -> Mesh:
     """
     corners = torch.tensor(_JAR_PROFILE, dtype=torch.float64)
     along = torch.cat([corners.new_zeros(1), corners.diff(dim=0).norm(dim=1).cumsum(dim=0)])
-    smooth = PchipInterpolator(along.numpy(), corners.numpy())
-    steps = torch.linspace(0, float(along[-1]), levels, dtype=torch.float64)
-    return lathe(torch.from_numpy(smooth(steps.numpy())), around)
+    # Highlights show where curvature jumps, so the curve is twice differentiable.
+    smooth = CubicSpline(along.numpy(), corners.numpy())
+    steps = torch.linspace(0, float(along[-1]), levels - 1, dtype=torch.float64)
+    wall = torch.from_numpy(smooth(steps.numpy()))
+    wall[:, 1].clamp_(min=0)  # between its first corners the curve dips by a hair
+    middle_of_foot, top = corners.new_tensor([[0.0, 0.0]]), corners[-1:]
+    return lathe(torch.cat([middle_of_foot, wall[:-1], top]), around)
 
 
 def balls(generator: torch.Generator) -> tuple[Body, ...]:
