@@ -31,6 +31,7 @@ class BenchConfig:
         cameras: found by structure from motion, once a scene and the same for all methods; or
             the true ones with a true cloud.
         seed: Of scenes and samples.
+        samples: On each surface, for distances between surfaces.
         processes: That render at the same time.
     """
 
@@ -40,6 +41,7 @@ class BenchConfig:
     masks: bool = False
     cameras: Literal["found", "true"] = "found"
     seed: int = 0
+    samples: int = 200_000
     processes: int = 2
 
     def __post_init__(self) -> None:
@@ -50,6 +52,7 @@ class BenchConfig:
             given = getattr(self, name)
             require(len(set(given)) == len(given), name, given, "each only once")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
+        require(self.samples >= 1, "samples", self.samples, "1 or more")
         require(self.processes >= 1, "processes", self.processes, "1 or more")
 
     @property

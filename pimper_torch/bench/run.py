@@ -172,7 +172,8 @@ def _cell(
         with peak_memory() as peak:
             outcome = run(inputs.scene, inputs.coarse)
             memory = None if outcome.external else peak()
-        evaluation = evaluate(outcome.estimate, inputs.capture, EvaluateConfig(seed=config.seed))
+        settings = EvaluateConfig(seed=config.seed, samples=config.samples)
+        evaluation = evaluate(outcome.estimate, inputs.capture, settings)
     except (PimperError, MemoryError) as error:
         minutes = (time.perf_counter() - began) / 60
         row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
@@ -216,7 +217,7 @@ def row_of(
         mesh_points=outcome.mesh_points,
         triangles=outcome.triangles,
         samples=outcome.samples,
-        missing_percent=_times(100, outcome.missing_share),
+        missing_percent=_percent(outcome.missing_share),
         minutes=outcome.seconds / 60,
         sfm_minutes=sfm_minutes,
         relative_error=view.relative_error if view else None,
@@ -309,8 +310,8 @@ def _carried(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
     )
 
 
-def _times(factor: float, value: float | None) -> float | None:
-    return None if value is None else factor * value
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
 
 
 @contextmanager

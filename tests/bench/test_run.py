@@ -1,0 +1,208 @@
+import warnings
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.bench import run as runner
+from pimper_torch.bench.config import BenchConfig
+from pimper_torch.bench.inputs import Inputs
+from pimper_torch.bench.methods import Outcome, method_named
+from pimper_torch.bench.rows import read_json
+from pimper_torch.bench.run import BENCH_NAMES, error_along_rays, run_bench
+from pimper_torch.errors import (
+    ConfigError,
+    MissingProgramError,
+    PimperWarning,
+    ReconstructionError,
+)
+from pimper_torch.geometry.frames import transform
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
+from pimper_torch.scenes import Body, render_bodies, sparse_scene
+from pimper_torch.scenes.cameras import arc_cameras
+from pimper_torch.scenes.lights import wandering_lights
+from pimper_torch.scenes.meshes import icosphere
+from pimper_torch.scenes.noise import random_speckle
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A ball before five cameras: its truth, and what structure from motion would give."""
+    generator = torch.Generator().manual_seed(91)
+    vertices, faces = icosphere(4)
+    mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertices)
+    cameras = arc_cameras(5, width=60, height=45, focal_px=80.0, distance=4.0)
+    lights = wandering_lights(5, generator, distance=5.0)
+    texture = random_speckle(generator, cells=(0.3,))
+    scene = render_bodies([Body(mesh=mesh, texture=texture)], cameras, lights, generator)
+    truth = Truth(
+        mesh=mesh,
+        depth=scene.depth,
+        normals_world=scene.normals_world,
+        albedo=scene.albedo,
+        foreground=scene.foreground,
+    )
+    numbers = torch.arange(5)
+    capture = Capture(
+        views=scene.views, cameras=cameras, truth=truth, position=numbers, light=numbers
+    )
+
+    return Inputs(
+        scene=sparse_scene(scene, 60, generator),
+        coarse=CoarseMesh(
+            mesh=mesh, reference=2, is_point=torch.ones(len(vertices), dtype=torch.bool)
+        ),
+        capture=capture,
+        sfm_seconds=30.0,
+    )
+
+
+def of_radius(radius):
+    """Give a method whose surface is a ball of a radius where the truth has 1."""
+
+    def method(scene, coarse):
+        mesh = coarse.mesh.replace(vertices_world=radius * coarse.mesh.vertices_world)
+        estimate = Estimate(
+            mesh=mesh,
+            names=scene.views.names,
+            cameras=scene.cameras,
+            reference=scene.views.names[coarse.reference],
+        )
+        return Outcome(estimate=estimate, seconds=6.0, samples=1000, missing_share=0.25)
+
+    return method
+
+
+def failing(error):
+    def method(scene, coarse):
+        raise error
+
+    return method
+
+
+@pytest.fixture
+def staged(monkeypatch, ball):
+    """Stand in for rendering and structure from motion, and for the methods' names."""
+    methods = {
+        "exact": of_radius(1.0),
+        "larger": of_radius(1.02),
+        "lost": failing(ReconstructionError("nothing was found")),
+        "absent": failing(MissingProgramError("get it somewhere")),
+    }
+    monkeypatch.setattr(runner, "scene_folder", lambda scene, config, workspace: workspace)
+    monkeypatch.setattr(runner, "prepare", lambda folder, config: ball)
+    monkeypatch.setattr(runner, "method_named", methods.__getitem__)
+    return methods
+
+
+def test_methods_are_measured_alike_and_failures_have_rows(staged, tmp_path):
+    config = BenchConfig(
+        samples=3000, scenes=("ball",), methods=("exact", "larger", "lost", "absent")
+    )
+    table = run_bench(config, tmp_path / "out")
+    exact, larger, lost, absent = table.rows
+    assert exact.relative_error < 0.02  # float32 of the rays
+    assert exact.mean_normal_deg < 0.5  # the truth's are blended between vertices
+    assert (exact.minutes, exact.sfm_minutes) == (0.1, 0.5)
+    assert (exact.samples, exact.missing_percent) == (1000, 25.0)
+    assert_close(exact.coverage_percent, 100.0)
+    # Radially off by 0.02 everywhere, in per cent of the bounding cube's diagonal.
+    diagonal = 2 * 3**0.5
+    assert_close(larger.accuracy, 100 * 0.02 / diagonal, rtol=0.02, atol=0)
+    assert_close(larger.completeness_seen, 100 * 0.02 / diagonal, rtol=0.02, atol=0)
+    assert_close(larger.chamfer, 100 * 0.02 / diagonal, rtol=0.02, atol=0)
+    assert dict(larger.f_scores)[0.5] == 0.0
+    assert dict(larger.f_scores)[1.0] == 100.0
+    assert "nothing was found" in lost.note
+    assert absent.note.startswith("not installed")
+    assert lost.relative_error is None
+
+
+def test_the_folder_holds_table_sheet_heat_maps_and_surfaces(staged, tmp_path):
+    config = BenchConfig(samples=3000, scenes=("ball",), methods=("larger", "lost"))
+    table = run_bench(config, tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(BENCH_NAMES)
+    assert read_json(tmp_path / "out" / "table.json") == table
+    assert "larger" in (tmp_path / "out" / "table.md").read_text()
+    assert [path.name for path in (tmp_path / "out" / "heatmaps").iterdir()] == ["ball_larger.png"]
+    mesh = read_mesh(tmp_path / "out" / "meshes" / "ball_larger.ply")
+    radii = mesh.vertices_world.norm(dim=1)
+    assert_close(radii, torch.full_like(radii, 1.02), rtol=0, atol=1e-4)
+
+
+def test_what_was_complete_before_an_interruption_is_kept(staged, tmp_path, monkeypatch):
+    usual = runner.prepare
+    calls = []
+
+    def prepare(folder, config):
+        calls.append(folder)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return usual(folder, config)
+
+    monkeypatch.setattr(runner, "prepare", prepare)
+    config = BenchConfig(samples=3000, scenes=("one", "two"), methods=("exact",))
+    with pytest.warns(PimperWarning, match="two"):
+        table = run_bench(config, tmp_path / "out")
+    assert [row.scene for row in table.rows] == ["one"]
+    assert (tmp_path / "out" / "table.md").is_file()
+
+
+def test_an_interruption_in_the_first_scene_leaves_nothing(staged, tmp_path, monkeypatch):
+    def prepare(folder, config):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runner, "prepare", prepare)
+    with pytest.raises(KeyboardInterrupt):
+        run_bench(BenchConfig(samples=3000, scenes=("one",), methods=("exact",)), tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_without_cameras_has_a_row_for_every_method(staged, tmp_path, monkeypatch):
+    def prepare(folder, config):
+        raise ReconstructionError("no view was registered")
+
+    monkeypatch.setattr(runner, "prepare", prepare)
+    table = run_bench(
+        BenchConfig(samples=3000, scenes=("one",), methods=("exact", "larger")), tmp_path / "out"
+    )
+    assert [row.method for row in table.rows] == ["exact", "larger"]
+    assert all("no view" in row.note for row in table.rows)
+
+
+def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball):
+    view = 2
+    shift = torch.eye(4).double()
+    camera = ball.capture.cameras.cam_from_world[view]
+    shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
+    mesh = ball.capture.truth.mesh
+    moved = mesh.replace(vertices_world=transform(shift, mesh.vertices_world))
+    error = error_along_rays(moved, ball.capture, view)
+    foreground = ball.capture.truth.foreground[view]
+    assert torch.equal(error.isnan(), ~foreground)
+    middle = error[22, 30]
+    assert_close(middle, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
+    half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
+    missed = error_along_rays(half, ball.capture, view).isinf()
+    assert 0.3 < missed[foreground].float().mean() < 0.7
+
+
+def test_names_that_are_no_method_are_refused():
+    with pytest.raises(ConfigError, match="smoothed"):
+        method_named("defautl")
+
+
+def test_presets_and_rivals_have_names():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in BenchConfig().methods:
+            assert callable(method_named(name))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"scenes": ()}, {"methods": ("lim", "lim")}, {"processes": 0}, {"seed": -1}]
+)
+def test_a_table_that_makes_no_sense_is_refused(wrong):
+    with pytest.raises(ConfigError):
+        BenchConfig(**wrong)
