@@ -41,7 +41,7 @@ class BenchConfig:
     masks: bool = False
     cameras: Literal["found", "true"] = "found"
     seed: int = 0
-    samples: int = 200_000
+    samples: int = 50_000
     processes: int = 2
 
     def __post_init__(self) -> None:
