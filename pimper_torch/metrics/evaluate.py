@@ -87,6 +87,7 @@ def evaluate(
     capture: Capture,
     config: EvaluateConfig | None = None,
     *,
+    maps: Capture | None = None,
     dtu: DtuProtocol | None = None,
 ) -> Evaluation:
     """Measure a result by everything the truth tells.
@@ -97,6 +98,8 @@ def evaluate(
         estimate: In a frame of its own.
         capture: The truth; its views may be a part of those the estimate was made from.
         config: Settings.
+        maps: The same data set with the maps of the views to compare in, where ``capture``
+            was read without any to save memory.
         dtu: Where the scan is judged, if it is one of the DTU set; needs the scan's points.
 
     Raises:
@@ -118,9 +121,10 @@ def evaluate(
             samples=config.samples,
             generator=generator,
         )
+    maps = maps or capture
     compared = (
-        compare_along_rays(moved, torch.eye(4).double(), capture, view)
-        for view in chosen_views(estimate, capture, config)
+        compare_along_rays(moved, torch.eye(4).double(), maps, view)
+        for view in chosen_views(estimate, maps, config)
     )
     figures = None
     if dtu is not None and capture.truth.points_world is not None:

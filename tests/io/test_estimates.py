@@ -1,0 +1,91 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.io import results
+from pimper_torch.io.estimates import read_estimate
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.pipeline import PimperConfig
+
+
+@pytest.fixture
+def folder(reconstruction, tmp_path, monkeypatch):
+    draw = results.draw_overview
+    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+    results.write_result(reconstruction, PimperConfig(), tmp_path / "out")
+    return tmp_path / "out"
+
+
+def test_a_result_is_read_back_as_it_was_written(folder, reconstruction):
+    found = read_estimate(folder)
+    assert_close(found.mesh.vertices_world, reconstruction.mesh.vertices_world.double())
+    assert torch.equal(found.mesh.faces, reconstruction.mesh.faces)
+    assert_close(found.mesh.confidence, reconstruction.mesh.confidence.double())
+    assert found.names == ("a.png", "b.png", "c.png")
+    assert found.reference == "b.png"
+    cameras = reconstruction.cameras
+    assert_close(found.cameras.intrinsics, cameras.intrinsics.double())
+    assert_close(found.cameras.cam_from_world, cameras.cam_from_world.double())
+    assert torch.equal(found.cameras.sizes_px, cameras.sizes_px)
+
+
+def test_lights_are_paired_by_name_and_unknown_ones_are_nan(folder):
+    account = json.loads((folder / "lights.json").read_text())
+    told = {view["name"]: view["light"] for view in account["views"]}
+    assert None in told.values()  # or this test saw nothing
+    account["views"].reverse()
+    (folder / "lights.json").write_text(json.dumps(account))
+    found = read_estimate(folder)
+    for name, light in zip(found.names, found.lights_world, strict=True):
+        if told[name] is None:
+            assert light.isnan().all()
+        else:
+            assert_close(light, torch.tensor(told[name], dtype=torch.float64))
+
+
+def test_a_mesh_alone_is_an_estimate(reconstruction, tmp_path):
+    write_ply(reconstruction.mesh, tmp_path / "any.ply")
+    found = read_estimate(tmp_path / "any.ply")
+    assert len(found.mesh.vertices_world) == len(reconstruction.mesh.vertices_world)
+    assert found.names == ()
+    assert found.cameras is None
+    assert found.lights_world is None
+    assert found.reference is None
+
+
+def test_a_folder_with_a_mesh_alone_is_one_too(folder):
+    for name in ("lights.json", "depth.npz"):
+        (folder / name).unlink()
+    found = read_estimate(folder)
+    assert found.lights_world is None
+    assert found.reference is None
+    assert found.cameras.num_views == 3
+
+
+def test_a_folder_without_a_mesh_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"holds no mesh\.ply"):
+        read_estimate(tmp_path)
+    with pytest.raises(InputError, match="found nothing"):
+        read_estimate(tmp_path / "away.ply")
+
+
+@pytest.mark.parametrize(
+    "text", ["nonsense", "[1, 2]", '{"views": [{"name": "a.png", "light": [1, 2]}]}', "[" * 9999]
+)
+def test_lights_that_are_none_are_refused(folder, text):
+    (folder / "lights.json").write_text(text)
+    with pytest.raises(InputError, match=r"lights\.json: cannot be read as lights"):
+        read_estimate(folder)
+
+
+def test_a_damaged_or_pickled_depth_file_is_refused(folder):
+    (folder / "depth.npz").write_bytes(b"PK nothing")
+    with pytest.raises(InputError, match=r"depth\.npz: cannot be read"):
+        read_estimate(folder)
+    np.savez(folder / "depth.npz", name=np.array([{"harm": 1}], dtype=object))
+    with pytest.raises(InputError, match=r"depth\.npz: cannot be read"):
+        read_estimate(folder)
