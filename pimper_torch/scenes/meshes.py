@@ -1,13 +1,15 @@
 """Procedural triangle meshes for ray-traced scenes; the world's z points up."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh
 from pimper_torch.scenes.noise import random_waves
 
@@ -96,6 +98,43 @@ def moved(
         vertices_world=scale * vertices @ rotation.mT + vertices.new_tensor(shift),
         normals_world=None if normals is None else normals @ rotation.mT,
     )
+
+
+def push_clear(
+    mesh: Mesh, others: Sequence[Mesh], place: tuple[float, float], step: float = 0.02
+) -> Mesh:
+    """Shift a solid to a place on the table, and on away from the middle until it is free.
+
+    Args:
+        mesh: Closed.
+        others: Closed solids that it must not cut.
+        place: Where it would best be; not the middle.
+        step: Scene units.
+    """
+    own, rest = _Solid(mesh), [_Solid(one) for one in others]
+    x, y = place
+    shift = own.points.new_tensor([x, y, 0.0])
+    onward = step * shift / shift.norm()
+    while any(one.holds(own.points + shift) or own.holds(one.points - shift) for one in rest):
+        shift = shift + onward
+    return moved(mesh, shift=(float(shift[0]), float(shift[1]), 0.0))
+
+
+class _Solid:
+    """A closed mesh that can tell what is inside it."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.points = mesh.vertices_world.float()
+        self._caster = RayCaster(mesh.vertices_world, mesh.faces)
+        self._upward = face_normals(mesh.vertices_world, mesh.faces)[:, 2] > 0
+
+    def holds(self, points: Float[Tensor, "point 3"]) -> bool:
+        """Tell whether any of the points is inside."""
+        low, high = self.points.amin(dim=0), self.points.amax(dim=0)
+        near = points[((points > low) & (points < high)).all(dim=1)]
+        face = self._caster.cast(near, near.new_tensor([0.0, 0.0, 1.0]).expand_as(near)).face
+        # A ray from inside leaves by a face that looks the same way.
+        return bool(((face >= 0) & self._upward[face]).any())
 
 
 def join(*meshes: Mesh) -> Mesh:

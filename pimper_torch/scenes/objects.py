@@ -19,7 +19,7 @@ from pimper_torch.scenes.level_sets import (
     smooth_difference,
     smooth_union,
 )
-from pimper_torch.scenes.meshes import icosphere, lathe, moved, potato, table
+from pimper_torch.scenes.meshes import icosphere, lathe, moved, potato, push_clear, table
 from pimper_torch.scenes.noise import random_speckle
 from pimper_torch.scenes.textures import CylinderRegion, Marked, Painted
 
@@ -66,11 +66,11 @@ _BALL_TINTS = (
     (0.9, 0.75, 1.0),
     (1.0, 0.85, 0.8),
 )
-_POTATOES = (  # place, length, turn
-    ((-0.62, -0.10), 0.62, 25.0),
-    ((0.62, -0.22), 0.52, -50.0),
-    ((0.12, 0.78), 0.66, 80.0),
-    ((0.02, -0.92), 0.36, 10.0),
+_POTATOES = (  # place before they are pushed apart, size, turn
+    ((-0.50, -0.05), 0.62, 25.0),
+    ((0.50, -0.15), 0.52, -50.0),
+    ((0.12, 0.55), 0.66, 80.0),
+    ((0.02, -0.70), 0.36, 10.0),
 )
 
 
@@ -206,7 +206,8 @@ def potatoes(generator: torch.Generator) -> tuple[Body, ...]:
             offset=1.6,
             colour=0.0,
         )
-        mesh = moved(grown, scale=size, turn_deg=turn_deg, shift=(x, y, 0.0))
+        mesh = moved(grown, scale=size, turn_deg=turn_deg)
+        mesh = push_clear(mesh, [body.mesh for body in bodies], (x, y))
         bodies.append(Body(mesh=mesh, texture=Marked(ground=skin, marks=eyes)))
     return tuple(bodies)
 

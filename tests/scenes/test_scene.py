@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scipy.spatial import KDTree
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError
@@ -218,3 +219,17 @@ def test_no_ball_cuts_another():
         for second in range(first):
             distance = float((middles[first] - middles[second]).norm())
             assert distance > radii[first] + radii[second] - 1e-3
+
+
+def test_no_potato_cuts_another():
+    meshes = [body.mesh for body in objects.potatoes(torch.Generator().manual_seed(0))]
+    nearest = []
+    for first in range(4):
+        for second in range(first):
+            one, other = (meshes[index].vertices_world for index in (first, second))
+            near, which = KDTree(other.numpy()).query(one.numpy()[::10])
+            outward = meshes[second].normals_world[which]
+            beyond = ((one[::10] - other[which]) * outward).sum(dim=1)
+            assert beyond[near < 0.05].numel() == 0 or beyond[near < 0.05].min() > -0.02
+            nearest.append(near.min())
+    assert len([gap for gap in nearest if gap < 0.05]) >= 3  # a heap, not a row
