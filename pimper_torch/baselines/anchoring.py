@@ -20,9 +20,9 @@ from pimper_torch.photometry.lights import CAUCHY_TUNING
 from pimper_torch.photometry.robust import cauchy_weights, spread
 from pimper_torch.records import CoarseMesh
 
-# A point of the cloud further than this from the coarse mesh, in its median edges, along z
-# belongs to something else, or is wrong: chords of an edge's length leave a smooth surface by
-# about an eighth of their length over the radius, in lengths.
+# A point of the cloud further than this from the coarse mesh along z, in the mesh's median
+# edges, belongs to something else or is wrong. A chord leaves a sphere of radius r by an eighth
+# of its length squared over r: edges may be as long as 2 r.
 BESIDE = 0.25
 
 # Least squares re-weighted this often; the weights have settled long before.

@@ -166,7 +166,9 @@ def _laplacian(lattice: Lattice) -> tuple[Entries, Float[Tensor, " vertex"]]:
     return (rows, cols, blocks.flatten()), mass
 
 
-def _gram(entries: Entries, num_rows: int, num_columns: int) -> Entries:
+def _gram(
+    entries: Entries, num_rows: int, num_columns: int
+) -> tuple[Int[Tensor, " product"], Int[Tensor, " product"], Float[Tensor, " product"]]:
     """Give ``B^T B`` of a sparse matrix; entries named twice add up."""
     rows, cols, values = (part.cpu().numpy() for part in entries)
     matrix = coo_array((values, (rows, cols)), shape=(num_rows, num_columns)).tocsr()
