@@ -185,7 +185,7 @@ def balls(generator: torch.Generator) -> tuple[Body, ...]:
 
 def potatoes(generator: torch.Generator) -> tuple[Body, ...]:
     """Heap matte, bumpy potatoes with weak texture and a few eyes."""
-    bodies = []
+    bodies: list[Body] = []
     for (x, y), size, turn_deg in _POTATOES:
         grown = potato(generator, bumps=0.009)
         skin = random_speckle(
