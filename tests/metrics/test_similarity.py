@@ -93,3 +93,17 @@ def test_views_are_paired_by_name():
     assert truth.tolist() == [2, 0]
     with pytest.raises(InputError, match="Name the photographs alike"):
         pair_views(["p"], ["q"])
+
+
+def test_folder_and_suffix_do_not_part_views_of_one_name():
+    ours, truth = pair_views(["raw/07.tif", "08.png", "9.jpg"], ["08.png", "07.png", "9.png"])
+    assert ours.tolist() == [0, 1, 2]
+    assert truth.tolist() == [1, 0, 2]
+
+
+def test_a_stem_that_two_views_share_pairs_nothing():
+    ours, truth = pair_views(["a/1.png", "b/1.png", "c.png"], ["1.jpg", "c.png"])
+    assert ours.tolist() == [2]
+    assert truth.tolist() == [1]
+    ours, truth = pair_views(["1.tif", "1.png"], ["1.png"])  # the same name comes first
+    assert ours.tolist() == [1]
