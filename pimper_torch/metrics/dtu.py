@@ -16,6 +16,8 @@ from pimper_torch.records import DtuProtocol, Mesh, Record
 # Of the published code, in millimetres: the density of points, the distance past which a point
 # is an outlier, and the side of the cells by which it searches for neighbours.
 THINNING_MM, CAP_MM, _CELL_MM = 0.2, 20.0, 60.0
+# The sets' objects have some ten million points 0.2 mm apart; a hundred million take gigabytes.
+_MOST_POINTS = 2e8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,6 +123,9 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
     The lattice is the published one: with edges ``v1, v2`` of twice-area ``A``, it has
     ``n_i = floor(|v_i| / (distance sqrt(|v1||v2| / A)))`` steps along ``v_i``, its points at
     half steps. A face too small for a step has its vertices only.
+
+    Raises:
+        InputError: There would be more points than memory holds.
     """
     vertices = mesh.vertices_world.detach().cpu().double()
     faces = mesh.faces.cpu()
@@ -134,6 +139,13 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
     usable = ((area > 0) & (n1 > 0) & (n2 > 0)).nonzero()[:, 0]
     n1, n2 = n1[usable].long(), n2[usable].long()
     counts = (n1 + 1) * (n2 + 1)
+    total = float(counts.double().sum())
+    if total > _MOST_POINTS:
+        raise InputError(
+            f"points {distance:g} apart on the faces would be about {total / 2:.1g}; needed: at most "
+            f"{_MOST_POINTS / 2:.0g}. Is the result in the millimetres of the set? Align it by its "
+            "cameras first."
+        )
     face = torch.arange(len(usable)).repeat_interleave(counts)
     within = torch.arange(len(face)) - (counts.cumsum(0) - counts)[face]
     k1 = (within // (n2[face] + 1) + 0.5) / n1[face]

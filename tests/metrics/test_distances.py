@@ -9,7 +9,7 @@ from pimper_torch.records import Truth
 
 
 def compared(mesh, capture, generator, **more):
-    return compare_surfaces(mesh, capture, samples=20_000, generator=generator, **more)
+    return compare_surfaces(mesh, capture, samples=8_000, generator=generator, **more)
 
 
 def test_a_raised_square_is_off_by_its_height_both_ways(generator, make):
@@ -42,20 +42,20 @@ def test_a_larger_square_is_inaccurate_and_complete(generator, make):
     # Outside the unit square: two strips, 1/2 off on average, and a corner whose mean
     # distance to its vertex is (sqrt 2 + asinh 1) / 3.
     expected = (1 * 0.5 + 1 * 0.5 + (2**0.5 + math.asinh(1)) / 3) / 4
-    assert found.accuracy.mean == pytest.approx(expected, rel=0.01)  # 20 000 samples
+    assert found.accuracy.mean == pytest.approx(expected, rel=0.02)  # 8000 samples
     # Its largest threshold is 1 % of sqrt 2 round a square of 1 in 4.
     at = found.whole.thresholds[-1]
-    assert at.precision == pytest.approx((1 + 2 * at.threshold) / 4, abs=0.003)
+    assert at.precision == pytest.approx((1 + 2 * at.threshold) / 4, abs=0.01)
     assert at.recall == 1
     harmonic = 2 * at.precision / (1 + at.precision)
     assert at.f_score == pytest.approx(harmonic)
 
 
 def test_a_sphere_of_another_radius_is_off_by_the_difference(generator, make):
-    found = compared(make.sphere(1.1), make.capture_of(make.sphere()), generator)
+    found = compared(make.sphere(1.1, level=4), make.capture_of(make.sphere(level=4)), generator)
     assert found.accuracy.mean == pytest.approx(0.1, rel=0.01)  # facets
     assert found.whole.completeness.mean == pytest.approx(0.1, rel=0.01)
-    assert found.diagonal == pytest.approx(2 * 3**0.5, rel=1e-3)
+    assert found.diagonal == pytest.approx(2 * 3**0.5, rel=5e-3)
 
 
 def test_half_a_sphere_is_accurate_and_half_complete(generator, make):
@@ -90,9 +90,9 @@ def test_what_lies_on_the_table_is_left_out_of_accuracy_and_told(generator, make
         faces=torch.cat([estimate.faces, both.faces + 4]),
     )
     found = compared(joined, make.capture(truth), generator)
-    assert found.surroundings_share == pytest.approx(0.5, abs=1e-3)
+    assert found.surroundings_share == pytest.approx(0.5, abs=5e-3)
     assert found.accuracy.mean == pytest.approx(0.1)
-    assert found.accuracy.samples == pytest.approx(10_000, abs=20)
+    assert found.accuracy.samples == pytest.approx(4_000, abs=20)
     only = compared(estimate, make.capture(truth), generator)
     assert only.accuracy is None
     assert only.whole is None

@@ -114,3 +114,10 @@ def test_a_mesh_and_its_dense_points_are_judged_alike(generator):
 def test_a_result_in_another_frame_is_refused(generator):
     with pytest.raises(InputError, match="frame and the millimetres"):
         dtu_figures(cloud(grid() + 1000), grid(), protocol_of(), generator)
+
+
+def test_a_result_far_too_large_is_refused_before_memory_is_gone():
+    corners = 1e5 * torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+    mesh = Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2]]))
+    with pytest.raises(InputError, match="millimetres of the set"):
+        supersample(mesh, 0.2)

@@ -60,7 +60,7 @@ def test_distances_to_tiny_and_huge_triangles_are_those_of_brute_force(generator
 
 
 def test_a_smooth_surface_of_many_triangles_is_searched_without_a_miss(generator, make):
-    mesh = make.potato(level=3)
+    mesh = make.potato(level=2)
     points = 1.5 * torch.randn(60, 3, generator=generator, dtype=torch.float64)
     expected = brute_force(points, mesh)
     assert_close(NearestSurface(mesh).query(points).distance, expected, rtol=1e-9, atol=1e-9)
