@@ -142,9 +142,9 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
     total = float(counts.double().sum())
     if total > _MOST_POINTS:
         raise InputError(
-            f"points {distance:g} apart on the faces would be about {total / 2:.1g}; needed: at most "
-            f"{_MOST_POINTS / 2:.0g}. Is the result in the millimetres of the set? Align it by its "
-            "cameras first."
+            f"points {distance:g} apart on the faces would be about {total / 2:.1g}; needed: at "
+            f"most {_MOST_POINTS / 2:.0g}. Is the result in the millimetres of the set? Align it "
+            "by its cameras first."
         )
     face = torch.arange(len(usable)).repeat_interleave(counts)
     within = torch.arange(len(face)) - (counts.cumsum(0) - counts)[face]
