@@ -13,12 +13,11 @@ from pimper_torch.baselines.openmvs import OpenMvs
 from pimper_torch.baselines.pmvs import Pmvs
 from pimper_torch.baselines.smoothed import Smoothed
 from pimper_torch.errors import ConfigError
-from pimper_torch.io.accounts import mean_lights, world_lights
+from pimper_torch.io.estimates import estimate_of
 from pimper_torch.pipeline import Pimper, load_config
 from pimper_torch.records import (
     CoarseMesh,
     Estimate,
-    Reconstruction,
     Record,
     SparseScene,
     Views,
@@ -97,7 +96,7 @@ def _preset(name: str) -> Method:
         seconds = time.perf_counter() - began
         found = {key: value for report in result.report for key, value in report.figures.items()}
         return Outcome(
-            estimate=_estimate_of(result),
+            estimate=estimate_of(result),
             seconds=seconds,
             mesh_points=int(found["mesh_points"]),
             triangles=int(found["triangles"]),
@@ -119,15 +118,3 @@ def _rival(module: nn.Module) -> Method:
         )
 
     return run
-
-
-def _estimate_of(result: Reconstruction) -> Estimate:
-    _, lights_world, determined = world_lights(result)
-    names = result.scene.views.names
-    return Estimate(
-        mesh=result.mesh,
-        names=names,
-        cameras=result.cameras,
-        lights_world=mean_lights(lights_world, determined)[0],
-        reference=names[result.coarse.reference],
-    )

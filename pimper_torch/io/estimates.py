@@ -10,9 +10,27 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.io.accounts import mean_lights, world_lights
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.records import Cameras, Estimate
+from pimper_torch.records import Cameras, Estimate, Reconstruction
 from pimper_torch.sfm.colmap import pinhole_of, read_model
+
+
+def estimate_of(result: Reconstruction) -> Estimate:
+    """Take what a run of ours says about the object.
+
+    A view's light is its mean over the patches that determine it, NaN where none does.
+    """
+    _, lights_world, determined = world_lights(result)
+    mean, counts = mean_lights(lights_world, determined)
+    names = result.scene.views.names
+    return Estimate(
+        mesh=result.mesh,
+        names=names,
+        cameras=result.cameras,
+        lights_world=torch.where(counts[:, None] > 0, mean, torch.nan),
+        reference=names[result.coarse.reference],
+    )
 
 
 def read_estimate(path: Path | str) -> Estimate:

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.io import results
-from pimper_torch.io.estimates import read_estimate
+from pimper_torch.io.estimates import estimate_of, read_estimate
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.pipeline import PimperConfig
 
@@ -31,6 +31,15 @@ def test_a_result_is_read_back_as_it_was_written(folder, reconstruction):
     assert_close(found.cameras.intrinsics, cameras.intrinsics.double())
     assert_close(found.cameras.cam_from_world, cameras.cam_from_world.double())
     assert torch.equal(found.cameras.sizes_px, cameras.sizes_px)
+
+
+def test_a_result_says_the_same_from_memory_and_from_its_folder(folder, reconstruction):
+    said, read = estimate_of(reconstruction), read_estimate(folder)
+    assert (said.names, said.reference) == (read.names, read.reference)
+    assert_close(
+        said.lights_world.double(), read.lights_world.double(), rtol=1e-5, atol=1e-6, equal_nan=True
+    )
+    assert_close(said.mesh.vertices_world, read.mesh.vertices_world.to(said.mesh.vertices_world))
 
 
 def test_lights_are_paired_by_name_and_unknown_ones_are_nan(folder):
