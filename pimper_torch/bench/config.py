@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pimper_torch.config import require
+from pimper_torch.metrics.evaluate import EvaluateConfig
 from pimper_torch.scenes.config import SceneConfig
 
 SCENES = ("mug", "jar", "balls", "potatoes")
@@ -54,6 +55,11 @@ class BenchConfig:
         require(self.seed >= 0, "seed", self.seed, "0 or more")
         require(self.samples >= 1, "samples", self.samples, "1 or more")
         require(self.processes >= 1, "processes", self.processes, "1 or more")
+
+    @property
+    def evaluation(self) -> EvaluateConfig:
+        """How the surfaces are measured."""
+        return EvaluateConfig(seed=self.seed, samples=self.samples)
 
     @property
     def scene(self) -> SceneConfig:

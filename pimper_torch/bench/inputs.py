@@ -8,6 +8,8 @@ from pimper_torch.bench.config import BenchConfig
 from pimper_torch.coarse.triangulate import Triangulate
 from pimper_torch.datasets.rendered import read_rendered
 from pimper_torch.io.photographs import load_views
+from pimper_torch.metrics.distances import TrueSurface
+from pimper_torch.metrics.evaluate import prepared_surface
 from pimper_torch.records import Capture, CoarseMesh, Record, SparseScene
 from pimper_torch.scenes.write import render_scene
 from pimper_torch.sfm.reconstruct import Reconstruct
@@ -21,12 +23,14 @@ class Inputs(Record):
         scene: Cameras and cloud, found or true, and the photographs.
         coarse: Facets for the rivals that start from some; of the default preset.
         capture: The truth, without the photographs.
+        surface: Its surface, prepared for the comparison with all methods.
         sfm_seconds: Wall clock of structure from motion; 0 with true cameras.
     """
 
     scene: SparseScene
     coarse: CoarseMesh
     capture: Capture
+    surface: TrueSurface
     sfm_seconds: float
 
 
@@ -58,9 +62,13 @@ def prepare(folder: Path, config: BenchConfig) -> Inputs:
     began = time.perf_counter()
     scene = Reconstruct()(views, model)
     seconds = 0.0 if model else time.perf_counter() - began
+    capture = read_rendered(folder, photographs=False)
+    surface = prepared_surface(capture, config.evaluation)
+    assert surface is not None  # a rendered scene has its mesh
     return Inputs(
         scene=scene,
         coarse=Triangulate()(scene),
-        capture=read_rendered(folder, photographs=False),
+        capture=capture,
+        surface=surface,
         sfm_seconds=seconds,
     )

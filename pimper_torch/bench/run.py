@@ -9,45 +9,25 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from pimper_torch.bench.config import BenchConfig
 from pimper_torch.bench.inputs import Inputs, prepare, scene_folder
 from pimper_torch.bench.machine import this_machine
 from pimper_torch.bench.memory import peak_memory
 from pimper_torch.bench.methods import Method, Outcome, method_named
+from pimper_torch.bench.panels import ERROR_SCALE, method_panels, scene_row
 from pimper_torch.bench.rows import Row, Table, row_of_failure, with_published, write_json
 from pimper_torch.bench.table import markdown
 from pimper_torch.errors import PimperError, PimperWarning
-from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.io.folders import written_whole
 from pimper_torch.io.meshes import write_ply
-from pimper_torch.metrics.distances import bounding_diagonal
-from pimper_torch.metrics.evaluate import EvaluateConfig, Evaluation, evaluate
-from pimper_torch.metrics.relative import meet_in_view
-from pimper_torch.metrics.similarity import pair_views, split_similarity
+from pimper_torch.metrics.alignment import carry
+from pimper_torch.metrics.evaluate import Evaluation, evaluate
 from pimper_torch.progress import listening
-from pimper_torch.records import Capture, Mesh, Record, StageReport
+from pimper_torch.records import Record, StageReport
 from pimper_torch.reporting import Observer, Silent, peak_memory_mb
-from pimper_torch.viz.heatmap import (
-    ErrorScale,
-    MethodPanels,
-    SceneRow,
-    crop_to,
-    draw_heatmap,
-    draw_sheet,
-    error_picture,
-    normals_picture,
-    photograph_picture,
-    shading_in_view,
-    surface_picture,
-)
+from pimper_torch.viz.heatmap import MethodPanels, SceneRow, draw_sheet
 
 BENCH_NAMES = ("table.md", "table.json", "sheet.png", "heatmaps", "meshes")
-# Per cent of the diagonal: twice what the facets alone are off by, so that methods differ.
-_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -133,7 +113,7 @@ def run_bench(
         write_json(table, staging / "table.json")
         (staging / "table.md").write_text(markdown(table) + "\n", encoding="utf-8")
         if sheet:
-            draw_sheet(sheet, _SCALE, staging / "sheet.png")
+            draw_sheet(sheet, ERROR_SCALE, staging / "sheet.png")
     return table
 
 
@@ -158,7 +138,8 @@ def _scene(
     for method, run in methods.items():
         with _shown(observer, f"{name} {method}"):
             cells.append(_cell(name, method, run, inputs, config, staging))
-    return [cell.row for cell in cells], [_pictures(name, inputs, cells)]
+    row = scene_row(name, inputs, tuple(cell.panels for cell in cells))
+    return [cell.row for cell in cells], [row]
 
 
 def _cell(
@@ -166,36 +147,26 @@ def _cell(
 ) -> Measured:
     """Run a method and measure what it gives."""
     began = time.perf_counter()
-    file = f"{scene}_{Path(method).stem}"
     sfm_minutes = inputs.sfm_seconds / 60 or None
     try:
         with peak_memory() as peak:
             outcome = run(inputs.scene, inputs.coarse)
             memory = None if outcome.external else peak()
-        settings = EvaluateConfig(seed=config.seed, samples=config.samples)
-        evaluation = evaluate(outcome.estimate, inputs.capture, settings)
+        evaluation = evaluate(
+            outcome.estimate, inputs.capture, config.evaluation, surface=inputs.surface
+        )
     except (PimperError, MemoryError) as error:
         minutes = (time.perf_counter() - began) / 60
         row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
         return Measured(row=row, panels=MethodPanels(method=method, note=row.note))
-    mesh = _carried(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
+    mesh = carry(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
+    file = f"{scene}_{Path(method).stem}"
     write_ply(mesh, staging / "meshes" / f"{file}.ply")
-    row = row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes)
-    view = reference_view(inputs)
-    errors = error_along_rays(mesh, inputs.capture, view)
-    cameras = inputs.capture.cameras
-    if errors is None or cameras is None:
-        return Measured(row=row, panels=MethodPanels(method=method, note="points only"))
-    path = staging / "heatmaps" / f"{file}.png"
-    draw_heatmap(mesh, cameras, view, errors, _SCALE, path, title=f"{scene}, {method}")
-    crop = _crop(inputs.capture, view)
-    shading = shading_in_view(mesh, cameras, view)
-    panels = MethodPanels(
-        method=method,
-        surface=surface_picture(mesh, cameras, view)[crop],
-        error=error_picture(errors, _SCALE, shading=shading)[crop],
+    heatmap = staging / "heatmaps" / f"{file}.png"
+    return Measured(
+        row=row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes),
+        panels=method_panels(mesh, inputs, scene, method, heatmap),
     )
-    return Measured(row=row, panels=panels)
 
 
 def row_of(
@@ -238,75 +209,6 @@ def row_of(
         if seen
         else (),
         peak_memory_mb=memory,
-    )
-
-
-def error_along_rays(
-    mesh: Mesh, capture: Capture, view: int
-) -> Float[Tensor, "height width"] | None:
-    """Give the distance of a surface from the truth along the rays of a view.
-
-    Args:
-        mesh: In the frame of the truth.
-        capture: With depth maps and the object's foreground.
-        view: One of its views.
-
-    Returns:
-        Per cent of the diagonal of the true bounding box; infinite on the object where the
-        surface is missed, NaN off the object. ``None`` for points without faces, and where no
-        ray meets both.
-    """
-    truth = capture.truth
-    if not len(mesh.faces) or truth.depth is None or truth.mesh is None or capture.cameras is None:
-        return None
-    where = None if truth.foreground is None else truth.foreground[view]
-    try:
-        met = meet_in_view(
-            mesh, torch.eye(4).double(), capture.cameras, view, truth.depth[view], where
-        )
-    except PimperError:
-        return None
-    error = torch.full(met.valid.shape, torch.nan, dtype=torch.float64)
-    error[met.valid] = torch.inf
-    distance = (met.points - met.points_true).norm(dim=-1).double()
-    error[met.both] = 100 * distance / bounding_diagonal(truth.mesh)
-    return error
-
-
-def reference_view(inputs: Inputs) -> int:
-    """Find the reference view of the methods among the views of the truth."""
-    name = inputs.scene.views.names[inputs.coarse.reference]
-    return int(pair_views([name], inputs.capture.views.names)[1][0])
-
-
-def _pictures(scene: str, inputs: Inputs, cells: list[Measured]) -> SceneRow:
-    capture, view = inputs.capture, reference_view(inputs)
-    assert capture.cameras is not None
-    assert capture.truth.normals_world is not None
-    crop = _crop(capture, view)
-    taken = inputs.scene.views.images[inputs.coarse.reference]
-    return SceneRow(
-        scene=scene,
-        photograph=photograph_picture(taken)[crop],
-        truth=normals_picture(capture.truth.normals_world[view], capture.cameras, view)[crop],
-        methods=tuple(cell.panels for cell in cells),
-    )
-
-
-def _crop(capture: Capture, view: int) -> tuple[slice, slice]:
-    assert capture.truth.foreground is not None
-    return crop_to(capture.truth.foreground[view])
-
-
-def _carried(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
-    """Put a mesh in the frame of the truth."""
-    _, rotation = split_similarity(truth_from_world)
-    turn = torch.eye(4).double()
-    turn[:3, :3] = rotation
-    normals = mesh.normals_world
-    return mesh.replace(
-        vertices_world=transform(truth_from_world.double(), mesh.vertices_world.double()),
-        normals_world=None if normals is None else rotate(turn, normals.double()),
     )
 
 

@@ -2,7 +2,7 @@
 
 from pimper_torch.metrics.account import Row, account, rows
 from pimper_torch.metrics.alignment import Alignment, align_estimate
-from pimper_torch.metrics.distances import SurfaceComparison, compare_surfaces
+from pimper_torch.metrics.distances import SurfaceComparison, TrueSurface
 from pimper_torch.metrics.dtu import DtuFigures, dtu_figures
 from pimper_torch.metrics.evaluate import EvaluateConfig, Evaluation, evaluate
 from pimper_torch.metrics.icp import IcpConfig, IcpResult, trimmed_icp
@@ -51,7 +51,6 @@ __all__ = [
     "compare_cameras",
     "compare_in_view",
     "compare_lights",
-    "compare_surfaces",
     "dtu_figures",
     "evaluate",
     "mean_absolute_depth_error",

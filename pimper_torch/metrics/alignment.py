@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.geometry.frames import transform
 from pimper_torch.metrics.distances import true_surface
 from pimper_torch.metrics.icp import IcpConfig, trimmed_icp
 from pimper_torch.metrics.similarity import (
@@ -17,7 +18,7 @@ from pimper_torch.metrics.similarity import (
     split_similarity,
 )
 from pimper_torch.metrics.visible import joined
-from pimper_torch.records import Cameras, Capture, Estimate, Record
+from pimper_torch.records import Cameras, Capture, Estimate, Mesh, Record
 
 Method = Literal["auto", "none", "cameras", "icp"]
 
@@ -115,6 +116,17 @@ def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Camer
     except InputError:
         return None
     return estimate.cameras.take(ours.tolist()), capture.cameras.take(truth.tolist())
+
+
+def carry(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
+    """Put a mesh in the frame of the truth by a similarity, in float64 on the CPU."""
+    mesh = mesh.to("cpu")
+    _, rotation = split_similarity(truth_from_world)
+    normals = mesh.normals_world
+    return mesh.replace(
+        vertices_world=transform(truth_from_world.cpu().double(), mesh.vertices_world.double()),
+        normals_world=None if normals is None else normals.double() @ rotation.cpu().double().mT,
+    )
 
 
 def _told(

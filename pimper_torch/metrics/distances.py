@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
@@ -99,58 +99,76 @@ class SurfaceComparison(Record):
     seen_share: float | None
 
 
-def compare_surfaces(
-    mesh: Mesh,
-    capture: Capture,
-    *,
-    thresholds_percent: Sequence[float] = (0.25, 0.5, 1.0),
-    seen_from: int = 3,
-    samples: int = 200_000,
-    generator: torch.Generator,
-) -> SurfaceComparison:
-    """Measure the distances between an estimate and the truth, area by area.
+class TrueSurface:
+    """The true surface prepared for the comparison with any number of estimates.
 
     Samples are drawn evenly over each surface, and each is compared with the nearest point
     of the other surface itself, not with its samples or vertices. Points stand for the
     surface where one has no faces.
 
     Args:
-        mesh: The estimate, in the frame of the truth.
         capture: With the true mesh or points, and its cameras for what is seen.
-        thresholds_percent: Of the diagonal, for precision, recall and F-score.
         seen_from: How many places of the camera must see a true point that is counted as
             seen; see :func:`pimper_torch.metrics.visible.count_seeing`.
         samples: On each surface.
-        generator: On the CPU.
+        seed: Of their places.
 
     Raises:
-        InputError: There is no true surface, or a surface has no extent.
+        InputError: There is no true surface, or it has no extent.
     """
-    truth = true_surface(capture)
-    diagonal = bounding_diagonal(truth)
-    ours = sample_surface(mesh, samples, generator).points
-    theirs = sample_surface(truth, samples, generator)
-    to_truth = NearestSurface(truth).query(ours).distance
-    aside = _nearer_to(capture.truth.surroundings, ours, to_truth)
-    to_truth = to_truth[~aside]
-    to_estimate = NearestSurface(mesh).query(theirs.points).distance
-    count = count_seeing(theirs, capture, diagonal)
-    seen = None if count is None else count >= seen_from
 
-    def two_sided(distances: Float[Tensor, " sample"]) -> TwoSided | None:
-        if len(distances) == 0 or len(to_truth) == 0:
-            return None
-        return _two_sided(to_truth, distances, diagonal, thresholds_percent)
+    def __init__(
+        self, capture: Capture, *, seen_from: int = 3, samples: int = 200_000, seed: int = 0
+    ) -> None:
+        truth, surroundings = true_surface(capture), capture.truth.surroundings
+        self.diagonal = bounding_diagonal(truth)
+        self._generator = torch.Generator().manual_seed(seed)
+        drawn = sample_surface(truth, samples, self._generator)
+        count = count_seeing(drawn, capture, self.diagonal)
+        self._points, self._samples = drawn.points, samples
+        self._state = self._generator.get_state()
+        self._seen, self._seen_from = None if count is None else count >= seen_from, seen_from
+        self._object = NearestSurface(truth)
+        self._surroundings = None
+        if surroundings is not None and len(surroundings.vertices_world):
+            self._surroundings = NearestSurface(surroundings)
 
-    return SurfaceComparison(
-        diagonal=diagonal,
-        accuracy=_figures(to_truth, diagonal) if len(to_truth) else None,
-        surroundings_share=float(aside.double().mean()),
-        whole=two_sided(to_estimate),
-        seen=None if seen is None else two_sided(to_estimate[seen]),
-        seen_from=seen_from,
-        seen_share=None if seen is None else float(seen.double().mean()),
-    )
+    def compare(
+        self, mesh: Mesh, thresholds_percent: Sequence[float] = (0.25, 0.5, 1.0)
+    ) -> SurfaceComparison:
+        """Measure the distances between an estimate and the truth, area by area.
+
+        Args:
+            mesh: The estimate, in the frame of the truth.
+            thresholds_percent: Of the diagonal, for precision, recall and F-score.
+
+        Raises:
+            InputError: The estimate has no extent.
+        """
+        self._generator.set_state(self._state)  # the order of the estimates changes nothing
+        ours = sample_surface(mesh, self._samples, self._generator).points
+        to_truth = self._object.query(ours).distance
+        aside = torch.zeros(len(ours), dtype=torch.bool)
+        if self._surroundings is not None:
+            aside = self._surroundings.query(ours).distance < to_truth
+        to_truth = to_truth[~aside]
+        to_estimate = NearestSurface(mesh).query(self._points).distance
+
+        def two_sided(distances: Float[Tensor, " sample"]) -> TwoSided | None:
+            if len(distances) == 0 or len(to_truth) == 0:
+                return None
+            return _two_sided(to_truth, distances, self.diagonal, thresholds_percent)
+
+        seen = self._seen
+        return SurfaceComparison(
+            diagonal=self.diagonal,
+            accuracy=_figures(to_truth, self.diagonal) if len(to_truth) else None,
+            surroundings_share=float(aside.double().mean()),
+            whole=two_sided(to_estimate),
+            seen=None if seen is None else two_sided(to_estimate[seen]),
+            seen_from=self._seen_from,
+            seen_share=None if seen is None else float(seen.double().mean()),
+        )
 
 
 def true_surface(capture: Capture) -> Mesh:
@@ -175,16 +193,6 @@ def bounding_diagonal(mesh: Mesh) -> float:
     vertices = mesh.vertices_world.double()
     used = vertices[torch.unique(mesh.faces)] if len(mesh.faces) else vertices
     return float((used.amax(dim=0) - used.amin(dim=0)).norm())
-
-
-def _nearer_to(
-    surroundings: Mesh | None,
-    points: Float[Tensor, "sample 3"],
-    distance: Float[Tensor, " sample"],
-) -> Bool[Tensor, " sample"]:
-    if surroundings is None or len(surroundings.vertices_world) == 0:
-        return torch.zeros(len(points), dtype=torch.bool)
-    return NearestSurface(surroundings).query(points).distance < distance
 
 
 def _two_sided(

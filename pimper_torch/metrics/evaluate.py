@@ -8,12 +8,17 @@ from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.frames import transform
-from pimper_torch.metrics.alignment import Alignment, Method, align_estimate, paired_cameras
+from pimper_torch.metrics.alignment import (
+    Alignment,
+    Method,
+    align_estimate,
+    carry,
+    paired_cameras,
+)
 from pimper_torch.metrics.distances import (
     SurfaceComparison,
+    TrueSurface,
     bounding_diagonal,
-    compare_surfaces,
     true_surface,
 )
 from pimper_torch.metrics.dtu import DtuFigures, dtu_figures
@@ -26,7 +31,7 @@ from pimper_torch.metrics.similarity import (
     similarity_between_cameras,
     split_similarity,
 )
-from pimper_torch.records import Capture, DtuProtocol, Estimate, Mesh, Record
+from pimper_torch.records import Capture, DtuProtocol, Estimate, Record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,6 +92,7 @@ def evaluate(
     capture: Capture,
     config: EvaluateConfig | None = None,
     *,
+    surface: TrueSurface | None = None,
     maps: Capture | None = None,
     dtu: DtuProtocol | None = None,
 ) -> Evaluation:
@@ -98,6 +104,8 @@ def evaluate(
         estimate: In a frame of its own.
         capture: The truth; its views may be a part of those the estimate was made from.
         config: Settings.
+        surface: That of ``capture``, where many estimates are measured against it; see
+            :func:`prepared_surface`.
         maps: The same data set with the maps of the views to compare in, where ``capture``
             was read without any to save memory.
         dtu: Where the scan is judged, if it is one of the DTU set; needs the scan's points.
@@ -109,18 +117,8 @@ def evaluate(
     config = config or EvaluateConfig()
     generator = torch.Generator().manual_seed(config.seed)
     alignment = align_estimate(estimate, capture, config.alignment, config.icp, generator=generator)
-    moved = _carried(estimate.mesh, alignment.truth_from_world)
-    known = capture.truth.mesh is not None or capture.truth.points_world is not None
-    surface = None
-    if known:
-        surface = compare_surfaces(
-            moved,
-            capture,
-            thresholds_percent=config.thresholds_percent,
-            seen_from=config.seen_from,
-            samples=config.samples,
-            generator=generator,
-        )
+    moved = carry(estimate.mesh, alignment.truth_from_world)
+    surface = surface or prepared_surface(capture, config)
     maps = maps or capture
     compared = (
         compare_along_rays(moved, torch.eye(4).double(), maps, view)
@@ -131,11 +129,20 @@ def evaluate(
         figures = dtu_figures(moved, capture.truth.points_world, dtu, generator)
     return Evaluation(
         alignment=alignment,
-        surface=surface,
+        surface=surface.compare(moved, config.thresholds_percent) if surface else None,
         views=tuple(view for view in compared if view is not None),
         lights=_lights(estimate, capture, alignment.truth_from_world),
         cameras=_cameras(estimate, capture),
         dtu=figures,
+    )
+
+
+def prepared_surface(capture: Capture, config: EvaluateConfig) -> TrueSurface | None:
+    """Prepare the true surface for :func:`evaluate`; ``None`` if nobody knows it."""
+    if capture.truth.mesh is None and capture.truth.points_world is None:
+        return None
+    return TrueSurface(
+        capture, seen_from=config.seen_from, samples=config.samples, seed=config.seed
     )
 
 
@@ -164,19 +171,6 @@ def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -
         except InputError:
             pass
     return (len(names) // 2,) if names else ()
-
-
-def _carried(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
-    """Put a mesh in the frame of the truth, in float64 on the CPU."""
-    mesh = mesh.to("cpu")
-    _, rotation = split_similarity(truth_from_world)
-    normals = mesh.normals_world
-    if normals is not None:
-        normals = normals.double() @ rotation.mT
-    return mesh.replace(
-        vertices_world=transform(truth_from_world, mesh.vertices_world.double()),
-        normals_world=normals,
-    )
 
 
 def _lights(

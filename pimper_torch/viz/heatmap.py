@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate
-from pimper_torch.geometry.visibility import cast_view
+from pimper_torch.geometry.visibility import Hits, cast_view
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viz.maps import normal_colors, view_maps
@@ -148,12 +148,19 @@ def normals_picture(
     return _on_white(normals_cam)
 
 
-def surface_picture(mesh: Mesh, cameras: Cameras, view: int) -> Picture:
-    """Colour the normals that a mesh carries, or those of its shape if it carries none."""
+def surface_picture(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None) -> Picture:
+    """Colour the normals that a mesh carries, or those of its shape if it carries none.
+
+    Args:
+        mesh: Any; points without faces give a white picture.
+        cameras: Its world.
+        view: One of them.
+        hits: Of the view's rays on the mesh, if they are known already.
+    """
     if not len(mesh.faces):
         width, height = (int(side) for side in cameras.sizes_px[view])
         return np.ones((height, width, 3), dtype=np.float32)
-    return _on_white(view_maps(mesh, cameras, view).normals_cam)
+    return _on_white(view_maps(mesh, cameras, view, hits).normals_cam)
 
 
 def photograph_picture(radiance: Float[Tensor, "channel height width"]) -> Picture:
@@ -180,27 +187,23 @@ def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
 
 
 def draw_heatmap(
-    mesh: Mesh,
-    cameras: Cameras,
-    view: int,
     error: Float[Tensor, "height width"],
     scale: ErrorScale,
     path: Path,
     *,
+    shading: Float[Tensor, "height width 3"] | None = None,
     title: str = "",
 ) -> None:
     """Draw one error map on the shaded surface, with its colour bar, as PNG.
 
     Args:
-        mesh: In the frame of the cameras.
-        cameras: World and units of the truth.
-        view: The one that the errors were measured in.
-        error: Of every pixel of the view, see the head of this file.
+        error: Of every pixel of a view, see the head of this file.
         scale: Colours and their unit.
         path: Ends in ``.png``.
+        shading: The surface in that view, see :func:`shading_in_view`.
         title: Above it.
     """
-    picture = error_picture(error, scale, shading=shading_in_view(mesh, cameras, view))
+    picture = error_picture(error, scale, shading=shading)
     rows, columns = crop_to(~error.isnan())
     cropped = picture[rows, columns]
     tall = 2 * _PANEL_IN * cropped.shape[0] / cropped.shape[1]

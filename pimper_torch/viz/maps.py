@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.geometry.visibility import cast_view
+from pimper_torch.geometry.visibility import Hits, cast_view
 from pimper_torch.records import Cameras, Mesh, Record
 
 _GREY = 0.5  # colour of a mesh whose albedo nobody knows
@@ -34,14 +34,20 @@ class ViewMaps(Record):
     confidence: Float[Tensor, "height width"]
 
 
-def view_maps(mesh: Mesh, cameras: Cameras, view: int) -> ViewMaps:
+def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None) -> ViewMaps:
     """Look at a mesh through one camera.
 
     A mesh without normals shows those of its faces, averaged round the vertices; one
     without albedo is grey, one without confidence has full confidence. A constant to
     autograd.
+
+    Args:
+        mesh: Any.
+        cameras: Its world.
+        view: One of them.
+        hits: Of the view's rays on the mesh, if they are known already.
     """
-    hits = cast_view(mesh, cameras, view)
+    hits = hits or cast_view(mesh, cameras, view)
     vertices = mesh.vertices_world
     normals = mesh.normals_world
     if normals is None:

@@ -8,8 +8,9 @@ from pimper_torch.bench import run as runner
 from pimper_torch.bench.config import BenchConfig
 from pimper_torch.bench.inputs import Inputs
 from pimper_torch.bench.methods import Outcome, method_named
+from pimper_torch.bench.panels import error_along_rays, meet_truth
 from pimper_torch.bench.rows import read_json
-from pimper_torch.bench.run import BENCH_NAMES, error_along_rays, run_bench
+from pimper_torch.bench.run import BENCH_NAMES, run_bench
 from pimper_torch.errors import (
     ConfigError,
     MissingProgramError,
@@ -18,6 +19,7 @@ from pimper_torch.errors import (
 )
 from pimper_torch.geometry.frames import transform
 from pimper_torch.io.meshes import read_mesh
+from pimper_torch.metrics import TrueSurface
 from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
 from pimper_torch.scenes import Body, render_bodies, sparse_scene
 from pimper_torch.scenes.cameras import arc_cameras
@@ -54,6 +56,7 @@ def ball():
             mesh=mesh, reference=2, is_point=torch.ones(len(vertices), dtype=torch.bool)
         ),
         capture=capture,
+        surface=TrueSurface(capture, samples=5_000),
         sfm_seconds=30.0,
     )
 
@@ -178,13 +181,13 @@ def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball)
     shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
     mesh = ball.capture.truth.mesh
     moved = mesh.replace(vertices_world=transform(shift, mesh.vertices_world))
-    error = error_along_rays(moved, ball.capture, view)
+    error = error_along_rays(meet_truth(moved, ball.capture, view), ball.capture)
     foreground = ball.capture.truth.foreground[view]
     assert torch.equal(error.isnan(), ~foreground)
     middle = error[22, 30]
     assert_close(middle, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
     half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
-    missed = error_along_rays(half, ball.capture, view).isinf()
+    missed = error_along_rays(meet_truth(half, ball.capture, view), ball.capture).isinf()
     assert 0.3 < missed[foreground].float().mean() < 0.7
 
 

@@ -88,7 +88,7 @@ def test_points_without_faces_are_drawn_as_nothing(plane, front, tmp_path):
     assert shading_in_view(points, front, 0) is None
     assert (surface_picture(points, front, 0) == 1).all()
     error = torch.full((36, 48), torch.inf)
-    draw_heatmap(points, front, 0, error, SCALE, tmp_path / "map.png")
+    draw_heatmap(error, SCALE, tmp_path / "map.png")
     assert has_color(tmp_path / "map.png", MISSED)
 
 
@@ -119,10 +119,11 @@ def test_the_crop_holds_every_true_pixel_and_stays_inside():
 
 def test_a_heat_map_is_drawn_with_what_is_missed(plane, front, tmp_path):
     error = vertex_errors_in_view(plane, torch.zeros(4), front, 0)
-    draw_heatmap(plane, front, 0, error, SCALE, tmp_path / "whole.png", title="mug, default")
+    shading = shading_in_view(plane, front, 0)
+    draw_heatmap(error, SCALE, tmp_path / "whole.png", shading=shading, title="mug, default")
     assert not has_color(tmp_path / "whole.png", MISSED)
     error[10:20, 20:30] = torch.inf
-    draw_heatmap(plane, front, 0, error, SCALE, tmp_path / "missed.png")
+    draw_heatmap(error, SCALE, tmp_path / "missed.png", shading=shading)
     assert has_color(tmp_path / "missed.png", MISSED)
 
 

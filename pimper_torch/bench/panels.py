@@ -1,0 +1,117 @@
+"""Pictures of the table: each method's surface, and its errors along the rays of a view."""
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.bench.inputs import Inputs
+from pimper_torch.errors import PimperError
+from pimper_torch.metrics.distances import bounding_diagonal
+from pimper_torch.metrics.relative import Meeting, meet_in_view
+from pimper_torch.metrics.similarity import pair_views
+from pimper_torch.records import Capture, Mesh
+from pimper_torch.viz.heatmap import (
+    ErrorScale,
+    MethodPanels,
+    SceneRow,
+    crop_to,
+    draw_heatmap,
+    error_picture,
+    normals_picture,
+    photograph_picture,
+    shading_in_view,
+    surface_picture,
+)
+
+# Per cent of the diagonal: twice what the facets alone are off by, so that methods differ.
+ERROR_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
+
+
+def method_panels(
+    mesh: Mesh, inputs: Inputs, scene: str, method: str, heatmap: Path
+) -> MethodPanels:
+    """Draw the errors of a surface on it, and give its pictures for the sheet.
+
+    Args:
+        mesh: In the frame of the truth.
+        inputs: What it was made from.
+        scene: Name.
+        method: Name.
+        heatmap: Where the errors are drawn, as PNG.
+    """
+    capture, view = inputs.capture, reference_view(inputs)
+    met = meet_truth(mesh, capture, view)
+    if met is None or capture.cameras is None:
+        return MethodPanels(method=method, note="points only")
+    errors = error_along_rays(met, capture)
+    shading = shading_in_view(mesh, capture.cameras, view)
+    draw_heatmap(errors, ERROR_SCALE, heatmap, shading=shading, title=f"{scene}, {method}")
+    crop = _crop(capture, view)
+    return MethodPanels(
+        method=method,
+        surface=surface_picture(mesh, capture.cameras, view, met.hits)[crop],
+        error=error_picture(errors, ERROR_SCALE, shading=shading)[crop],
+    )
+
+
+def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> SceneRow:
+    """Put what all methods made of a scene beside its photograph and the truth."""
+    capture, view = inputs.capture, reference_view(inputs)
+    assert capture.cameras is not None
+    assert capture.truth.normals_world is not None
+    crop = _crop(capture, view)
+    taken = inputs.scene.views.images[inputs.coarse.reference]
+    return SceneRow(
+        scene=scene,
+        photograph=photograph_picture(taken)[crop],
+        truth=normals_picture(capture.truth.normals_world[view], capture.cameras, view)[crop],
+        methods=methods,
+    )
+
+
+def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
+    """Cast the rays of a true view on a surface in the frame of the truth.
+
+    Returns:
+        ``None`` for points without faces, and where no ray meets both.
+    """
+    truth, cameras = capture.truth, capture.cameras
+    if not len(mesh.faces) or truth.depth is None or cameras is None:
+        return None
+    where = None if truth.foreground is None else truth.foreground[view]
+    try:
+        return meet_in_view(mesh, torch.eye(4).double(), cameras, view, truth.depth[view], where)
+    except PimperError:
+        return None
+
+
+def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:
+    """Give the distance of a surface from the truth along the rays of a view.
+
+    Args:
+        met: The surface and the truth.
+        capture: With the true mesh.
+
+    Returns:
+        Per cent of the diagonal of the true bounding box; infinite on the object where the
+        surface is missed, NaN off the object.
+    """
+    assert capture.truth.mesh is not None
+    error = torch.full(met.valid.shape, torch.nan, dtype=torch.float64)
+    error[met.valid] = torch.inf
+    distance = (met.points - met.points_true).norm(dim=-1).double()
+    error[met.both] = 100 * distance / bounding_diagonal(capture.truth.mesh)
+    return error
+
+
+def reference_view(inputs: Inputs) -> int:
+    """Find the reference view of the methods among the views of the truth."""
+    name = inputs.scene.views.names[inputs.coarse.reference]
+    return int(pair_views([name], inputs.capture.views.names)[1][0])
+
+
+def _crop(capture: Capture, view: int) -> tuple[slice, slice]:
+    assert capture.truth.foreground is not None
+    return crop_to(capture.truth.foreground[view])
