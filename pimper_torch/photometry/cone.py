@@ -35,7 +35,7 @@ def project_to_cone(shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
     scalar, vector = shading[..., :1], shading[..., 1:]
     directed = (vector != 0).any(dim=-1, keepdim=True)
     safe = torch.where(directed, vector, 1)  # the norm has no gradient at zero
-    length = safe.norm(dim=-1, keepdim=True)
+    length = _length(safe)
     albedo = torch.where(directed, (scalar + length).clamp_min(0) / 2, 0)
     normal = torch.where(directed, safe / length, 0)
     return torch.cat([albedo, albedo * normal], dim=-1)
@@ -51,7 +51,13 @@ def split_shading(
     vector = shading[..., 1:]
     directed = (vector != 0).any(dim=-1, keepdim=True)
     safe = torch.where(directed, vector, 1)
-    return shading[..., 0], torch.where(directed, safe / safe.norm(dim=-1, keepdim=True), 0)
+    return shading[..., 0], torch.where(directed, safe / _length(safe), 0)
+
+
+def _length(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
+    # Component by component in memory, where torch's norm takes twice as long.
+    x, y, z = vector.unbind(dim=-1)
+    return (x * x + y * y + z * z).sqrt()[..., None]
 
 
 def tangents(
