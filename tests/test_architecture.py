@@ -50,6 +50,7 @@ ROOMS = [
 SOLE_IMPORTERS = {
     "pycolmap": {"sfm/colmap.py"},
     "embreex": {"geometry/visibility.py"},
+    "fcpw": {"metrics/nearest.py"},
     "kornia_rs": {"io/decode.py"},
     "tifffile": {"io/decode.py"},
     "yaml": {"config.py"},

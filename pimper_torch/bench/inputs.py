@@ -10,6 +10,7 @@ from pimper_torch.datasets.rendered import read_rendered
 from pimper_torch.io.photographs import load_views
 from pimper_torch.metrics.distances import TrueSurface
 from pimper_torch.metrics.evaluate import prepared_surface
+from pimper_torch.metrics.similarity import pair_views
 from pimper_torch.records import Capture, CoarseMesh, Record, SparseScene
 from pimper_torch.scenes.write import render_scene
 from pimper_torch.sfm.reconstruct import Reconstruct
@@ -22,8 +23,9 @@ class Inputs(Record):
     Attributes:
         scene: Cameras and cloud, found or true, and the photographs.
         coarse: Facets for the rivals that start from some; of the default preset.
-        capture: The truth, without the photographs.
+        capture: The truth, without photographs and maps.
         surface: Its surface, prepared for the comparison with all methods.
+        maps: Of the methods' reference view alone, for those of all fill the memory.
         sfm_seconds: Wall clock of structure from motion; 0 with true cameras.
     """
 
@@ -31,6 +33,7 @@ class Inputs(Record):
     coarse: CoarseMesh
     capture: Capture
     surface: TrueSurface
+    maps: Capture
     sfm_seconds: float
 
 
@@ -62,13 +65,16 @@ def prepare(folder: Path, config: BenchConfig) -> Inputs:
     began = time.perf_counter()
     scene = Reconstruct()(views, model)
     seconds = 0.0 if model else time.perf_counter() - began
-    capture = read_rendered(folder, photographs=False)
+    coarse = Triangulate()(scene)
+    capture = read_rendered(folder, maps=False, photographs=False)
     surface = prepared_surface(capture, config.evaluation)
     assert surface is not None  # a rendered scene has its mesh
+    _, (view, *_) = pair_views([scene.views.names[coarse.reference]], capture.views.names)
     return Inputs(
         scene=scene,
-        coarse=Triangulate()(scene),
+        coarse=coarse,
         capture=capture,
         surface=surface,
+        maps=read_rendered(folder, views=[int(view)], photographs=False),
         sfm_seconds=seconds,
     )

@@ -10,7 +10,6 @@ from pimper_torch.bench.inputs import Inputs
 from pimper_torch.errors import PimperError
 from pimper_torch.metrics.distances import bounding_diagonal
 from pimper_torch.metrics.relative import Meeting, meet_in_view
-from pimper_torch.metrics.similarity import pair_views
 from pimper_torch.records import Capture, Mesh
 from pimper_torch.viz.heatmap import (
     ErrorScale,
@@ -41,48 +40,52 @@ def method_panels(
         method: Name.
         heatmap: Where the errors are drawn, as PNG.
     """
-    capture, view = inputs.capture, reference_view(inputs)
-    met = meet_truth(mesh, capture, view)
-    if met is None or capture.cameras is None:
+    truth = inputs.maps
+    met = meet_truth(mesh, truth)
+    if met is None or truth.cameras is None:
         return MethodPanels(method=method, note="points only")
-    errors = error_along_rays(met, capture)
-    shading = shading_in_view(mesh, capture.cameras, view)
+    errors = error_along_rays(met, truth)
+    shading = shading_in_view(mesh, truth.cameras, 0)
     draw_heatmap(errors, ERROR_SCALE, heatmap, shading=shading, title=f"{scene}, {method}")
-    crop = _crop(capture, view)
+    crop = _crop(truth)
     return MethodPanels(
         method=method,
-        surface=surface_picture(mesh, capture.cameras, view, met.hits)[crop],
+        surface=surface_picture(mesh, truth.cameras, 0, met.hits)[crop],
         error=error_picture(errors, ERROR_SCALE, shading=shading)[crop],
     )
 
 
 def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> SceneRow:
     """Put what all methods made of a scene beside its photograph and the truth."""
-    capture, view = inputs.capture, reference_view(inputs)
-    assert capture.cameras is not None
-    assert capture.truth.normals_world is not None
-    crop = _crop(capture, view)
+    maps = inputs.maps
+    assert maps.cameras is not None
+    assert maps.truth.normals_world is not None
+    crop = _crop(maps)
     taken = inputs.scene.views.images[inputs.coarse.reference]
     return SceneRow(
         scene=scene,
         photograph=photograph_picture(taken)[crop],
-        truth=normals_picture(capture.truth.normals_world[view], capture.cameras, view)[crop],
+        truth=normals_picture(maps.truth.normals_world[0], maps.cameras, 0)[crop],
         methods=methods,
     )
 
 
-def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
+def meet_truth(mesh: Mesh, maps: Capture) -> Meeting | None:
     """Cast the rays of a true view on a surface in the frame of the truth.
+
+    Args:
+        mesh: The surface.
+        maps: The truth in that view alone.
 
     Returns:
         ``None`` for points without faces, and where no ray meets both.
     """
-    truth, cameras = capture.truth, capture.cameras
+    truth, cameras = maps.truth, maps.cameras
     if not len(mesh.faces) or truth.depth is None or cameras is None:
         return None
-    where = None if truth.foreground is None else truth.foreground[view]
+    where = None if truth.foreground is None else truth.foreground[0]
     try:
-        return meet_in_view(mesh, torch.eye(4).double(), cameras, view, truth.depth[view], where)
+        return meet_in_view(mesh, torch.eye(4).double(), cameras, 0, truth.depth[0], where)
     except PimperError:
         return None
 
@@ -106,12 +109,6 @@ def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height wi
     return error
 
 
-def reference_view(inputs: Inputs) -> int:
-    """Find the reference view of the methods among the views of the truth."""
-    name = inputs.scene.views.names[inputs.coarse.reference]
-    return int(pair_views([name], inputs.capture.views.names)[1][0])
-
-
-def _crop(capture: Capture, view: int) -> tuple[slice, slice]:
-    assert capture.truth.foreground is not None
-    return crop_to(capture.truth.foreground[view])
+def _crop(maps: Capture) -> tuple[slice, slice]:
+    assert maps.truth.foreground is not None
+    return crop_to(maps.truth.foreground[0])

@@ -153,7 +153,11 @@ def _cell(
             outcome = run(inputs.scene, inputs.coarse)
             memory = None if outcome.external else peak()
         evaluation = evaluate(
-            outcome.estimate, inputs.capture, config.evaluation, surface=inputs.surface
+            outcome.estimate,
+            inputs.capture,
+            config.evaluation,
+            surface=inputs.surface,
+            maps=inputs.maps,
         )
     except (PimperError, MemoryError) as error:
         minutes = (time.perf_counter() - began) / 60

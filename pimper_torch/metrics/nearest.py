@@ -1,43 +1,21 @@
-"""The nearest point of a surface: exact distances from points to triangles.
+"""The nearest point of a surface.
 
-A tree of boxes round the triangles, searched breadth first for all points at once. A first
-descent follows the nearest boxes alone, to a triangle that is near if not the nearest; the
-second drops every box that lies farther, and compares what remains exactly. The boxes lie
-along the surface, for boxes along the axes of the world are so thick where the surface is
-oblique that a point some way off cannot tell them apart. It runs on the CPU in float64
-whatever the device of the tensors, and its answers are constants to autograd.
+The one place that talks to fcpw. It searches on the CPU in float32 whatever the device of the
+tensors; the distance to the face that it names is then computed in float64. Answers are
+constants to autograd.
 """
 
 from dataclasses import dataclass
 
+import fcpw
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Mesh, Record
-
-# Children of a box. Two to eight differ by a third in time; measured on a million faces.
-_ARITY = 4
-# Points searched together; their boxes then stay in the processor's cache.
-_BATCH = 8192
-# Boxes that the first descent follows at each level; two leave it astray twice as often.
-_BEAM = 4
-# The first bound is loosened by this share of itself and of the largest coordinate, so that
-# rounding drops no box that touches it.
-_SLACK = 1e-12
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Boxes(Record):
-    """A level of the tree: ``low <= axes @ point <= high`` holds in a box."""
-
-    axes: Float[Tensor, "box 3 3"]
-    low: Float[Tensor, "box 3"]
-    high: Float[Tensor, "box 3"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -59,7 +37,8 @@ class NearestSurface:
     """A mesh prepared for questions about its nearest point; a point cloud without faces.
 
     Degenerate faces count as the edges or points they have shrunk to. Vertices without a
-    face are no part of a mesh that has faces.
+    face are no part of a mesh that has faces. Of faces whose distances differ by less than a
+    millionth of the extent of mesh and points, any may be taken for the nearest.
 
     Raises:
         InputError: The mesh has no vertices.
@@ -71,79 +50,47 @@ class NearestSurface:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        vertices = mesh.vertices_world.detach().cpu().double()
-        faces = mesh.faces.cpu()
-        if len(vertices) == 0:
+        self._vertices = mesh.vertices_world.detach().cpu().double()
+        self._faces = mesh.faces.cpu()
+        if len(self._vertices) == 0:
             raise InputError("the surface has no vertices; needed: a mesh or a point cloud.")
-        self._has_faces = len(faces) > 0
-        if not self._has_faces:
-            self._places = vertices
-            self._tree = cKDTree(vertices.numpy())
+        if len(self._faces) == 0:
+            self._tree = cKDTree(self._vertices.numpy())
             return
-        corners = vertices[faces]
-        self._order, self._real = _balanced_order(corners.mean(dim=1))
-        self._corners = torch.where(self._real[:, None, None], corners[self._order], 0)
-        self._levels = _tree(self._corners, self._real)
+        used = self._vertices[torch.unique(self._faces)]
+        # Float32 is finest round the origin.
+        self._origin = (used.amin(dim=0) + used.amax(dim=0)) / 2
+        self._scene = fcpw.scene_3D()
+        self._scene.set_object_count(1)
+        self._scene.set_object_vertices(self._columns(self._vertices), 0)
+        self._scene.set_object_triangles(np.asfortranarray(self._faces.int().numpy()), 0)
+        self._scene.build(fcpw.aggregate_type.bvh_surface_area, True)
 
     def query(self, points: Float[Tensor, "point 3"]) -> Nearest:
         """Find the nearest place of the surface for every point."""
         asked = points.detach().cpu().double()
-        if self._has_faces and len(points):
-            # Neighbours in space share the boxes that they look at.
-            order = torch.from_numpy(cKDTree(asked.numpy()).indices).long()
-            found = [
-                self._search(asked[chosen])
-                for chosen in order.tensor_split(tuple(range(_BATCH, len(order), _BATCH)))
-            ]
-            back = order.argsort()
-            place, face = (torch.cat(parts)[back] for parts in zip(*found, strict=True))
-        elif self._has_faces:
-            place, face = asked, torch.zeros(0, dtype=torch.long)
+        if len(self._faces):
+            face = self._nearest_faces(asked)
+            place = closest_on_triangles(asked, self._vertices[self._faces[face]])
         else:
             face = torch.from_numpy(np.asarray(self._tree.query(asked.numpy())[1])).long()
-            place = self._places[face]
+            place = self._vertices[face]
         return Nearest(
             distance=(asked - place).norm(dim=1).to(points),
             points=place.to(points),
             face=face.to(points.device),
         )
 
-    def _search(
-        self, points: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, "point 3"], Int[Tensor, " point"]]:
-        """Descend level by level with all pairs of a point and a box that may hold its answer."""
-        grain = _SLACK * torch.maximum(points.abs().amax(), self._corners.abs().amax())
-        limit = (self._first_bound(points) * (1 + _SLACK) + grain).square()
-        count = len(self._levels[-1].low)
-        who = torch.arange(len(points)).repeat_interleave(count)
-        node = torch.arange(count).repeat(len(points))
-        for level in reversed(self._levels):
-            near = (_squares(points[who], level, node) <= limit[who]).nonzero()[:, 0]
-            who, node = who[near], node[near]
-            if level is not self._levels[0]:
-                who = who.repeat_interleave(_ARITY)
-                node = (_ARITY * node[:, None] + torch.arange(_ARITY)).flatten()
-        place = closest_on_triangles(points[who], self._corners[node])
-        square = (place - points[who]).square().sum(dim=1)
-        least = torch.full_like(limit, torch.inf).scatter_reduce(0, who, square, "amin")
-        best = (square == least[who]).nonzero()[:, 0]
-        winner = torch.zeros_like(who[: len(points)]).scatter(0, who[best], best)
-        return place[winner], self._order[node[winner]]
+    def _nearest_faces(self, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
+        found = fcpw.interaction_3D_list()
+        anywhere = np.full(len(points), np.inf, dtype=np.float32)
+        self._scene.find_closest_points(self._columns(points), anywhere, found)
+        return torch.tensor([one.primitive_index for one in found], dtype=torch.long)
 
-    def _first_bound(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Give the distance to a triangle that is likely to be near."""
-        node = torch.arange(len(self._levels[-1].low)).expand(len(points), -1)
-        for level in reversed(self._levels):
-            who = torch.arange(len(points)).repeat_interleave(node.shape[1])
-            score = _scores(points[who], level, node.flatten()).reshape(node.shape)
-            beam = score.topk(min(_BEAM, node.shape[1]), dim=1, largest=False).indices
-            node = node.gather(1, beam)
-            if level is not self._levels[0]:
-                node = (_ARITY * node[:, :, None] + torch.arange(_ARITY)).flatten(1)
-        asked = points.repeat_interleave(node.shape[1], dim=0)
-        place = closest_on_triangles(asked, self._corners[node.flatten()])
-        distance = (place - asked).norm(dim=1).reshape(node.shape)
-        return torch.where(self._real[node], distance, torch.inf).amin(dim=1)
+    def _columns(
+        self, points: Float[Tensor, "point 3"]
+    ) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+        return np.asfortranarray((points - self._origin).float().numpy())
 
 
 def closest_on_triangles(
@@ -174,80 +121,6 @@ def closest_on_triangles(
         best = torch.where(nearer[:, None], place, best)
         least = torch.where(nearer, square, least)
     return best
-
-
-def _balanced_order(
-    places: Float[Tensor, "place 3"],
-) -> tuple[Int[Tensor, " leaf"], Bool[Tensor, " leaf"]]:
-    """Put places in an order whose blocks of 2, 4, 8 and so on are each close together.
-
-    Every block is split in halves of equal number across its longest side, as in a kd-tree.
-
-    Returns:
-        Which place each leaf holds, and whether it holds any: their number is a power of two.
-    """
-    size = 1 << max(2, (len(places) - 1).bit_length())
-    order = np.arange(size)
-    leaves = np.full((size, 3), np.inf)
-    leaves[: len(places)] = places.numpy()
-    while size > _ARITY:
-        blocks = leaves.reshape(-1, size, 3)
-        high = np.where(np.isinf(blocks), -np.inf, blocks).max(axis=1)
-        axis = (high - blocks.min(axis=1)).argmax(axis=1)
-        key = np.take_along_axis(blocks, axis[:, None, None], axis=2)[:, :, 0]
-        halves = np.argpartition(key, size // 2, axis=1)  # empty leaves go last
-        moved = (halves + size * np.arange(len(blocks))[:, None]).reshape(-1)
-        leaves, order = leaves[moved], order[moved]
-        size //= 2
-    real = order < len(places)
-    return torch.from_numpy(np.where(real, order, 0)), torch.from_numpy(real)
-
-
-def _tree(corners: Float[Tensor, "leaf 3 3"], real: Bool[Tensor, " leaf"]) -> list[_Boxes]:
-    """Give the boxes of single triangles, then of ever larger blocks, up to a few."""
-    levels, size = [_level(corners, real, 1)], 1
-    while len(levels[-1].low) > 2 * _ARITY:
-        size *= _ARITY
-        levels.append(_level(corners, real, size))
-    return levels
-
-
-def _level(corners: Float[Tensor, "leaf 3 3"], real: Bool[Tensor, " leaf"], size: int) -> _Boxes:
-    """Give the boxes of blocks of ``size`` leaves, along the mean normal of each."""
-    a, b, c = corners.reshape(-1, size, 3, 3).unbind(dim=2)
-    normal = normalize(torch.linalg.cross(b - a, c - a).sum(dim=1), dim=1)
-    # A block that faces all ways has no normal; any axes will do.
-    normal = torch.where(normal.any(dim=1, keepdim=True), normal, normal.new_tensor([0.0, 0, 1]))
-    across = torch.eye(3).to(normal)[normal.abs().argmin(dim=1)]
-    u = normalize(torch.linalg.cross(normal, across), dim=1)
-    axes = torch.stack([u, torch.linalg.cross(normal, u), normal], dim=1)
-    local = corners.reshape(-1, 3 * size, 3) @ axes.mT
-    there = real.reshape(-1, size, 1).expand(-1, size, 3).reshape(-1, 3 * size, 1)
-    return _Boxes(
-        axes=axes,
-        low=torch.where(there, local, torch.inf).amin(dim=1),
-        high=torch.where(there, local, -torch.inf).amax(dim=1),
-    )
-
-
-def _squares(
-    points: Float[Tensor, "pair 3"], level: _Boxes, box: Int[Tensor, " pair"]
-) -> Float[Tensor, " pair"]:
-    """Give the squared distance of each point to its box; 0 inside."""
-    local = (level.axes[box] @ points[:, :, None])[:, :, 0]
-    outside = torch.maximum(level.low[box] - local, local - level.high[box]).clamp_min(0)
-    return outside.square().sum(dim=1)
-
-
-def _scores(
-    points: Float[Tensor, "pair 3"], level: _Boxes, box: Int[Tensor, " pair"]
-) -> Float[Tensor, " pair"]:
-    """Rank boxes by distance, and those that all hold the point by their middles'."""
-    local = (level.axes[box] @ points[:, :, None])[:, :, 0]
-    low, high = level.low[box] - local, local - level.high[box]
-    outside = torch.maximum(low, high).clamp_min(0).square().sum(dim=1)
-    aside = (low - high).square().sum(dim=1) / 4
-    return outside + torch.where(outside.isfinite(), aside, 0)
 
 
 def _dot(one: Float[Tensor, "pair 3"], other: Float[Tensor, "pair 3"]) -> Float[Tensor, " pair"]:

@@ -38,18 +38,27 @@ def ball():
     lights = wandering_lights(5, generator, distance=5.0)
     texture = random_speckle(generator, cells=(0.3,))
     scene = render_bodies([Body(mesh=mesh, texture=texture)], cameras, lights, generator)
-    truth = Truth(
-        mesh=mesh,
-        depth=scene.depth,
-        normals_world=scene.normals_world,
-        albedo=scene.albedo,
-        foreground=scene.foreground,
-    )
     numbers = torch.arange(5)
     capture = Capture(
-        views=scene.views, cameras=cameras, truth=truth, position=numbers, light=numbers
+        views=scene.views,
+        cameras=cameras,
+        truth=Truth(mesh=mesh),
+        position=numbers,
+        light=numbers,
     )
-
+    maps = Capture(
+        views=scene.views.take([2]),
+        cameras=cameras.take([2]),
+        truth=Truth(
+            mesh=mesh,
+            depth=scene.depth[[2]],
+            normals_world=scene.normals_world[[2]],
+            albedo=scene.albedo[[2]],
+            foreground=scene.foreground[[2]],
+        ),
+        position=numbers[[2]],
+        light=numbers[[2]],
+    )
     return Inputs(
         scene=sparse_scene(scene, 60, generator),
         coarse=CoarseMesh(
@@ -57,6 +66,7 @@ def ball():
         ),
         capture=capture,
         surface=TrueSurface(capture, samples=5_000),
+        maps=maps,
         sfm_seconds=30.0,
     )
 
@@ -175,19 +185,18 @@ def test_a_scene_without_cameras_has_a_row_for_every_method(staged, tmp_path, mo
 
 
 def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball):
-    view = 2
     shift = torch.eye(4).double()
-    camera = ball.capture.cameras.cam_from_world[view]
+    camera = ball.maps.cameras.cam_from_world[0]
     shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
     mesh = ball.capture.truth.mesh
     moved = mesh.replace(vertices_world=transform(shift, mesh.vertices_world))
-    error = error_along_rays(meet_truth(moved, ball.capture, view), ball.capture)
-    foreground = ball.capture.truth.foreground[view]
+    error = error_along_rays(meet_truth(moved, ball.maps), ball.maps)
+    foreground = ball.maps.truth.foreground[0]
     assert torch.equal(error.isnan(), ~foreground)
     middle = error[22, 30]
     assert_close(middle, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
     half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
-    missed = error_along_rays(meet_truth(half, ball.capture, view), ball.capture).isinf()
+    missed = error_along_rays(meet_truth(half, ball.maps), ball.maps).isinf()
     assert 0.3 < missed[foreground].float().mean() < 0.7
 
 
