@@ -8,16 +8,20 @@ from pimper_torch.metrics.evaluate import EvaluateConfig
 from pimper_torch.scenes.config import SceneConfig
 
 SCENES = ("mug", "jar", "balls", "potatoes")
-METHODS = (
-    "default",
-    "paper",
-    "smoothed",
-    "global-stereo",
-    "lim",
-    "pmvs",
-    "openmvs",
-    "colmap-dense",
-)
+METHODS = {
+    "quick": ("default", "smoothed", "global-stereo"),
+    "full": (
+        "default",
+        "paper",
+        "smoothed",
+        "global-stereo",
+        "lim",
+        "pmvs",
+        "openmvs",
+        "colmap-dense",
+    ),
+}
+"""What each scale runs unless told otherwise; quick is to end within ten minutes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +31,9 @@ class BenchConfig:
     Attributes:
         scale: quick: 16 photographs of 640x480 a scene; full: 30 of 1600x1200.
         scenes: Names of rendered scenes, or folders that `pimper render` wrote.
-        methods: Presets, YAML files of settings, and rivals.
+        methods: Presets, YAML files of settings, and rivals. None is those of the scale: quick
+            runs default, smoothed and global-stereo; full also paper, lim, pmvs, openmvs and
+            colmap-dense.
         masks: Give the methods the true masks of the object; without, they see the table too.
         cameras: found by structure from motion, once a scene and the same for all methods; or
             the true ones with a true cloud.
@@ -38,7 +44,7 @@ class BenchConfig:
 
     scale: Literal["quick", "full"] = "quick"
     scenes: tuple[str, ...] = SCENES
-    methods: tuple[str, ...] = METHODS
+    methods: tuple[str, ...] | None = None
     masks: bool = False
     cameras: Literal["found", "true"] = "found"
     seed: int = 0
@@ -48,13 +54,17 @@ class BenchConfig:
     def __post_init__(self) -> None:
         """Refuse a table without rows."""
         require(len(self.scenes) > 0, "scenes", self.scenes, "one scene or more")
-        require(len(self.methods) > 0, "methods", self.methods, "one method or more")
-        for name in ("scenes", "methods"):
-            given = getattr(self, name)
+        require(len(self.chosen_methods) > 0, "methods", self.methods, "one method or more")
+        for name, given in (("scenes", self.scenes), ("methods", self.chosen_methods)):
             require(len(set(given)) == len(given), name, given, "each only once")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
         require(self.samples >= 1, "samples", self.samples, "1 or more")
         require(self.processes >= 1, "processes", self.processes, "1 or more")
+
+    @property
+    def chosen_methods(self) -> tuple[str, ...]:
+        """The methods given, or those of the scale."""
+        return METHODS[self.scale] if self.methods is None else self.methods
 
     @property
     def evaluation(self) -> EvaluateConfig:

@@ -77,7 +77,7 @@ def run_bench(
         OutputError: The folder holds something else, or cannot be written.
     """
     observer = observer or Silent()
-    methods = {name: method_named(name) for name in config.methods}
+    methods = {name: method_named(name) for name in config.chosen_methods}
     folder = Path(folder)
     rows: list[Row] = []
     sheet: list[SceneRow] = []

@@ -4,6 +4,9 @@ Every edge of the coarse mesh is cut into as many pieces as its length asks for,
 facet carries the triangular lattice of its most finely cut edge. Where another edge has
 fewer pieces, the lattice points on it slide to the nearest cut, and triangles that vanish
 thereby are left out. Both facets of an edge so use the same cuts, whatever their sizes.
+
+A long and narrow facet would be far too fine across its length, so the cuts of its edges are
+limited by its area: it is then a little too coarse along its length.
 """
 
 from dataclasses import dataclass
@@ -12,7 +15,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import Record
+
+# An edge has at most so many times the pieces that it would have if its facet were equilateral,
+# of the same area: those of a half square's diagonal, and at most 2 points a spacing squared,
+# where the equilateral lattice has 1.2.
+_MOST_PIECES = 1.32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -58,7 +67,8 @@ def subdivide(
         vertices: Of the coarse mesh. Unused ones do not appear in the result.
         facets: Its faces, any number of them at an edge.
         spacing: Wanted length of the pieces' edges in each facet, scene units; an edge
-            follows the finer of its facets.
+            follows the finer of its facets. Pieces of a narrow facet are longer along it
+            and shorter across.
 
     Returns:
         A mesh with the coarse mesh's topology and surface: an edge inside it has as many
@@ -73,7 +83,7 @@ def subdivide(
     (12, 14)
     """
     edges, facet_edges = _edges(facets)
-    pieces = _pieces(vertices.detach(), edges, facet_edges, spacing.detach())
+    pieces = _pieces(vertices.detach(), facets, edges, facet_edges, spacing.detach())
     # Slot 0 opposite to a longest edge: that edge carries the lattice's own cuts, so that
     # only two edges ever slide, both counted from slot 0.
     first = pieces[facet_edges].argmax(dim=1)
@@ -152,6 +162,7 @@ def _edges(facets: Int[Tensor, "facet 3"]) -> tuple[Int[Tensor, "edge 2"], Int[T
 
 def _pieces(
     vertices: Float[Tensor, "corner 3"],
+    facets: Int[Tensor, "facet 3"],
     edges: Int[Tensor, "edge 2"],
     facet_edges: Int[Tensor, "facet 3"],
     spacing: Float[Tensor, " facet"],
@@ -159,10 +170,16 @@ def _pieces(
     """Count the pieces each edge is cut into."""
     ends = vertices[edges]
     length = (ends[:, 1] - ends[:, 0]).norm(dim=-1)
-    finest = torch.full_like(length, torch.inf).scatter_reduce(
-        0, facet_edges.flatten(), spacing.repeat_interleave(3), "amin"
-    )
-    return (length / finest).round().long().clamp_min(1)
+    area = face_normals(vertices, facets).norm(dim=-1) / 2
+    equilateral = (4 / 3**0.5 * area).sqrt()  # the side of one of that area
+
+    def least(per_facet: Float[Tensor, " facet"]) -> Float[Tensor, " edge"]:
+        spread = per_facet.repeat_interleave(3)
+        unset = torch.full_like(length, torch.inf)
+        return unset.scatter_reduce(0, facet_edges.flatten(), spread, "amin")
+
+    length = torch.minimum(length, _MOST_PIECES * least(equilateral))
+    return (length / least(spacing)).round().long().clamp_min(1)
 
 
 def _starts(counts: Int[Tensor, " group"]) -> Int[Tensor, " group"]:

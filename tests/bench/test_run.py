@@ -208,12 +208,15 @@ def test_names_that_are_no_method_are_refused():
 def test_presets_and_rivals_have_names():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for name in BenchConfig().methods:
+        for name in BenchConfig(scale="full").chosen_methods:
             assert callable(method_named(name))
+    assert set(BenchConfig().chosen_methods) < set(BenchConfig(scale="full").chosen_methods)
+    assert BenchConfig(methods=("lim",)).chosen_methods == ("lim",)
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"scenes": ()}, {"methods": ("lim", "lim")}, {"processes": 0}, {"seed": -1}]
+    "wrong",
+    [{"scenes": ()}, {"methods": ("lim", "lim")}, {"methods": ()}, {"processes": 0}, {"seed": -1}],
 )
 def test_a_table_that_makes_no_sense_is_refused(wrong):
     with pytest.raises(ConfigError):

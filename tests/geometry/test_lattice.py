@@ -90,6 +90,15 @@ def test_edges_are_about_one_spacing_long_where_facets_are_well_shaped():
     assert float(lengths.max()) < 2 * 0.05
 
 
+def test_a_narrow_facet_has_no_more_points_than_its_area_asks_for():
+    spacing = 0.005
+    for height in (1.0, 0.3, 0.1, 0.03):
+        corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.4, height, 0]], dtype=torch.float64)
+        lattice = subdivide(corners, torch.tensor([[0, 1, 2]]), corners.new_tensor([spacing]))
+        asked = height / 2 / spacing**2
+        assert 0.9 * asked < len(lattice.points) < 2.3 * asked  # 2, and the rim
+
+
 def test_an_edge_follows_the_finer_of_its_facets():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
