@@ -1,7 +1,7 @@
 """Figures that compare a result with the truth, each under its own named convention."""
 
 from pimper_torch.metrics.account import Row, account, rows
-from pimper_torch.metrics.alignment import Alignment, align_estimate
+from pimper_torch.metrics.alignment import Alignment, align_estimate, carry
 from pimper_torch.metrics.distances import SurfaceComparison, TrueSurface
 from pimper_torch.metrics.dtu import DtuFigures, dtu_figures
 from pimper_torch.metrics.evaluate import EvaluateConfig, Evaluation, evaluate
@@ -46,6 +46,7 @@ __all__ = [
     "account",
     "align_estimate",
     "angles_deg",
+    "carry",
     "compare_albedo",
     "compare_along_rays",
     "compare_cameras",
