@@ -14,18 +14,22 @@ from pimper_torch.records import Reconstruction
 # What JSON can hold.
 Account = dict[str, object]
 
+# Directions of a light that all samples together see with less than this share of the best seen
+# one are left open.
+_UNDETERMINED = 1e-6
+
 
 def lights_account(result: Reconstruction) -> Account:
-    """Tell the light of every view, for each patch and averaged over the patches.
+    """Tell the light of every view, for each patch and for all of them together.
 
     Lights are first-order harmonics ``l`` in the world frame: radiance is
     ``albedo * (l[0] + l[1:] . n)`` with ``n`` the outward unit normal. A patch that a view
-    does not have is ``null`` there. The averages leave out such patches, and those whose
-    light varied too little for a factorization.
+    does not have is ``null`` there. A view's one light leaves out such patches, and those
+    whose light varied too little for a factorization; see :func:`common_lights`.
     """
     facets, lights_world, determined = world_lights(result)
     lit = (lights_world != 0).any(dim=-1)
-    mean, counts = mean_lights(lights_world, determined)
+    common, counts = common_lights(result)
     views = result.scene.views.names
     return {
         "reference": views[result.coarse.reference],
@@ -33,7 +37,7 @@ def lights_account(result: Reconstruction) -> Account:
         "views": [
             {
                 "name": name,
-                "light": _rounded(mean[index]) if counts[index] > 0 else None,
+                "light": _rounded(common[index]) if counts[index] > 0 else None,
                 "patches": int(counts[index]),
             }
             for index, name in enumerate(views)
@@ -54,18 +58,41 @@ def lights_account(result: Reconstruction) -> Account:
     }
 
 
-def mean_lights(
-    lights_world: Float[Tensor, "patch view 4"], determined: Bool[Tensor, " patch"]
+def common_lights(
+    result: Reconstruction,
 ) -> tuple[Float[Tensor, "view 4"], Int[Tensor, " view"]]:
-    """Average the lights of every view over the patches that determine them.
+    r"""Find the one light of every view that shades all patches most nearly as their own do.
+
+    A patch that is nearly flat tells its light only along its normal, so lights are weighted
+    by what they were determined from: minimised is :math:`\sum_p \sum_s \rho_s^2 ((l - l_p)
+    \cdot (1, n_s))^2` over the valid samples. What they leave open together is the mean's.
 
     Returns:
-        The averages, and over how many patches each is taken; zero where over none.
+        The lights, world frame, and of how many patches each is; zero where of none.
     """
-    counted = (lights_world != 0).any(dim=-1) & determined[:, None]
+    _, lights_world, determined = world_lights(result)
+    counted = ((lights_world != 0).any(dim=-1) & determined[:, None]).double()
     counts = counted.sum(dim=0)
-    total = (lights_world * counted[..., None]).sum(dim=0)
-    return total / counts[:, None].clamp_min(1), counts
+    lights = lights_world.double()
+    mean = (lights * counted[..., None]).sum(dim=0) / counts[:, None].clamp_min(1)
+    weight = _determined_by(result)
+    known = torch.einsum("pij,pv->vij", weight, counted)
+    pull = torch.einsum("pij,pvj->vi", weight, counted[..., None] * (lights - mean))
+    step = torch.linalg.pinv(known, rtol=_UNDETERMINED, hermitian=True) @ pull[..., None]
+    return (mean + step[..., 0]).to(lights_world), counts.long()
+
+
+def _determined_by(result: Reconstruction) -> Float[Tensor, "patch 4 4"]:
+    """Sum ``rho^2 (1, n) (1, n)^T`` over each patch's samples, world frame, order of facets."""
+    photometric = result.patches.photometric
+    facets, sums = [], []
+    for templates, found in zip(photometric.patches.buckets, photometric.buckets, strict=True):
+        weight = found.albedo.double().mean(dim=-1).square() * found.valid
+        normals = rotate(templates.patch_from_world.mT, found.normals_patch.flatten(1, 2)).double()
+        shading = torch.cat([torch.ones_like(normals[..., :1]), normals], dim=-1)
+        sums.append(shading.mT @ (weight.flatten(1)[..., None] * shading))
+        facets.append(templates.facet)
+    return torch.cat(sums)[torch.cat(facets).argsort()]
 
 
 def world_lights(

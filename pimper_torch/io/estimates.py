@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.io.accounts import mean_lights, world_lights
+from pimper_torch.io.accounts import common_lights
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Cameras, Estimate, Reconstruction
 from pimper_torch.sfm.colmap import pinhole_of, read_model
@@ -19,16 +19,16 @@ from pimper_torch.sfm.colmap import pinhole_of, read_model
 def estimate_of(result: Reconstruction) -> Estimate:
     """Take what a run of ours says about the object.
 
-    A view's light is its mean over the patches that determine it, NaN where none does.
+    A view's light is that of the patches that determine it, taken together, NaN where none
+    does; see :func:`pimper_torch.io.accounts.common_lights`.
     """
-    _, lights_world, determined = world_lights(result)
-    mean, counts = mean_lights(lights_world, determined)
+    lights, counts = common_lights(result)
     names = result.scene.views.names
     return Estimate(
         mesh=result.mesh,
         names=names,
         cameras=result.cameras,
-        lights_world=torch.where(counts[:, None] > 0, mean, torch.nan),
+        lights_world=torch.where(counts[:, None] > 0, lights, torch.nan),
         reference=names[result.coarse.reference],
     )
 

@@ -14,7 +14,7 @@ from pimper_torch.errors import OutputError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io import results
-from pimper_torch.io.accounts import lights_account, summary_account, world_lights
+from pimper_torch.io.accounts import common_lights, lights_account, summary_account, world_lights
 from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.meshes import write_glb, write_ply
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -165,6 +165,36 @@ def test_the_mean_light_leaves_out_what_is_unknown(reconstruction):
     assert account["patches"][1]["lights"][2] is None
     assert account["patches"][0]["lights"][2] is not None
     assert account["reference"] == "b.png"
+
+
+def test_the_common_light_is_what_the_patches_see_of_one_light(reconstruction):
+    # Each patch's light is the true one, plus anything along what its own normals cannot see.
+    photometric = reconstruction.patches.photometric
+    truth = torch.tensor([[0.2, 0.3, -0.5, 0.7], [0.1, -0.4, 0.2, 0.9], [0.3, 0.0, 0.6, 0.5]])
+    buckets = []
+    for templates, found in zip(photometric.patches.buckets, photometric.buckets, strict=True):
+        normals = torch.zeros_like(found.normals_patch)
+        normals[..., 0] = torch.linspace(-0.6, 0.6, normals.shape[2])
+        normals[..., 2] = -(1 - normals[..., 0].square()).sqrt()  # a cylinder: y is not seen
+        turning = templates.patch_from_world[:, None, :3, :3]
+        directed = (turning @ truth[None, :, 1:, None])[..., 0]
+        lights = torch.cat([truth[None, :, :1].expand_as(directed[..., :1]), directed], dim=-1)
+        lights[..., 2] += 5.0
+        buckets.append(
+            found.replace(
+                normals_patch=normals,
+                lights_patch=lights,
+                valid=torch.ones_like(found.valid),
+                determined=torch.ones_like(found.determined),
+            )
+        )
+    patches = reconstruction.patches
+    turned = reconstruction.replace(
+        patches=patches.replace(photometric=photometric.replace(buckets=tuple(buckets)))
+    )
+    found, counts = common_lights(turned)
+    assert counts.tolist() == [2, 2, 2]
+    assert_close(found, truth, rtol=1e-4, atol=1e-5)
 
 
 def test_the_summary_counts(reconstruction):
