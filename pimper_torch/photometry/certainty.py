@@ -103,7 +103,7 @@ def fit_albedo(
 
 
 def light_varies(
-    lights: Float[Tensor, "view 4"],
+    lights: Float[Tensor, "patch view 4"],
     share: Float[Tensor, "patch view"],
     least: float,
 ) -> Bool[Tensor, " patch"]:
@@ -113,8 +113,8 @@ def light_varies(
     share of the patch that their view sees. A shading vector has three degrees of freedom:
     the third singular value of the weighted lights, over the first, must reach ``least``.
     """
-    unit = lights / lights.norm(dim=1, keepdim=True).clamp_min(1e-30)
-    moment = torch.einsum("pf,fi,fj->pij", share.double(), unit.double(), unit.double())
+    unit = (lights / lights.norm(dim=2, keepdim=True).clamp_min(1e-30)).double()
+    moment = unit.mT @ (share.double()[..., None] * unit)
     values = torch.linalg.eigvalsh(moment).clamp_min(0)
     return (values[:, 1] > 0) & (values[:, 1] >= least**2 * values[:, 3])
 

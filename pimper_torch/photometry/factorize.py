@@ -11,12 +11,14 @@ from torch import Tensor, nn
 
 from pimper_torch.config import require
 from pimper_torch.errors import PimperWarning
+from pimper_torch.geometry.frames import invert_rigid, rotate
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, select
 from pimper_torch.photometry.certainty import fit_albedo, light_varies, refine_on_cone
 from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.photometry.lights import fit_lights
+from pimper_torch.photometry.light_field import LightField, faces_lamp
+from pimper_torch.photometry.lights import fit_light_field
 from pimper_torch.photometry.rows import Rows, coarse_normals, on_raster, rows_of
 from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.progress import track
@@ -29,8 +31,8 @@ from pimper_torch.records import (
     Templates,
 )
 
-# Lights are fitted to this many samples at most; more would only repeat them.
-LIGHT_SAMPLES = 30_000
+# Light is fitted to this many samples at most; more would only repeat them.
+LIGHT_SAMPLES = 10_000
 
 # A batch of patches has this many entries of J at most: about 300 MB in all while solving.
 CHUNK_ENTRIES = 4_000_000
@@ -49,10 +51,13 @@ SPREAD_SAMPLES = 512
 class FactorizeConfig:
     """Settings of :class:`Factorize`.
 
-    The published method is ``start="svd"``, not robust, ``light_coupling`` and
-    ``geometry_weight`` 0.
+    The published method is ``start="svd"``, ``light="soft"``, not robust, ``light_coupling``
+    and ``geometry_weight`` 0.
 
     Attributes:
+        light: What is fitted to the coarse mesh: ``"soft"``, one first-order light a view all
+            over the scene; ``"lamp"``, an ambient term and a lamp at some place, with attached
+            shadows; ``"auto"``, the one of them that explains the photographs better.
         start: Where lights and normals start: ``"mesh"``, lights fitted to the coarse
             mesh; ``"svd"``, the data's own factors, whose Lorentz ambiguity is then fixed by
             the lights that the mesh gives.
@@ -70,6 +75,7 @@ class FactorizeConfig:
         tolerance: Relative change at which a patch is done.
     """
 
+    light: Literal["auto", "soft", "lamp"] = "auto"
     start: Literal["mesh", "svd"] = "mesh"
     solver: Literal["balm", "descent"] = "balm"
     light_coupling: float = 1.0
@@ -82,6 +88,8 @@ class FactorizeConfig:
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
+        models = ("auto", "soft", "lamp")
+        require(self.light in models, "factorize.light", self.light, "auto, soft or lamp")
         require(self.start in ("mesh", "svd"), "factorize.start", self.start, "mesh or svd")
         solvers = ("balm", "descent")
         require(self.solver in solvers, "factorize.solver", self.solver, "balm or descent")
@@ -100,9 +108,10 @@ class FactorizeConfig:
 class Factorize(nn.Module):
     r"""Separate albedo, normals and light: ``J = L N`` with ``N`` on the photometric cone.
 
-    First one light a view is fitted to the smoothed normals of the coarse mesh. Then every
-    patch is factorized, its lights coupled to those by ``light_coupling``; the last step of
-    each sample is exact, and albedo is fitted to every channel.
+    First the light field of every view is fitted to the smoothed normals of the coarse mesh:
+    soft light, or a lamp at some place. Then every patch is factorized, its lights coupled to
+    what the field has there by ``light_coupling``; samples that face away from the lamp are
+    missing. The last step of each sample is exact, and albedo is fitted to every channel.
 
     Gauge: albedo and light share one free factor for the whole scene; it is set so that the
     99th percentile of gray albedo is 1. With ``light_coupling`` 0 and ``start="svd"`` each
@@ -127,9 +136,9 @@ class Factorize(nn.Module):
     def forward(self, seen: PatchViews) -> PhotometricPatches:
         """Factorize all patches."""
         coarse = [coarse_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
-        lights_world = self._lights(seen, coarse)
+        field = self._field(seen, coarse)
         buckets = [
-            self._bucket(templates, registered, normals, lights_world)
+            self._bucket(templates, registered, normals, field)
             for templates, registered, normals in track(
                 list(zip(seen.patches.buckets, seen.buckets, coarse, strict=True))
             )
@@ -142,18 +151,16 @@ class Factorize(nn.Module):
         templates: Templates,
         registered: Registered,
         normals: Float[Tensor, "patch height width 3"],
-        lights_world: Float[Tensor, "view 4"],
+        field: LightField,
     ) -> Photometry:
         samples = max(int(templates.inside.sum(dim=(1, 2)).max()), 1) if len(normals) else 1
-        size = max(1, CHUNK_ENTRIES // (samples * max(len(lights_world), 1)))
+        size = max(1, CHUNK_ENTRIES // (samples * max(len(field.soft), 1)))
         order = torch.arange(len(normals), device=normals.device)
         chunks = []
         for first in range(0, len(normals), size):
             some = order[first : first + size]
             chunks.append(
-                self._chunk(
-                    select(templates, some), select(registered, some), normals[some], lights_world
-                )
+                self._chunk(select(templates, some), select(registered, some), normals[some], field)
             )
         return _joined(chunks)
 
@@ -162,14 +169,18 @@ class Factorize(nn.Module):
         templates: Templates,
         registered: Registered,
         normals: Float[Tensor, "patch height width 3"],
-        lights_world: Float[Tensor, "view 4"],
+        field: LightField,
     ) -> Photometry:
         config = self.config
+        patch_from_world = templates.patch_from_world.to(normals)
+        middle = invert_rigid(patch_from_world)[:, :3, 3]
+        anchor = rotate_lights(patch_from_world, field.lights_at(middle))
+        lamp = rotate(patch_from_world, field.lamp_at(middle))
         rows = rows_of(templates, registered, normals)
-        anchor = rotate_lights(templates.patch_from_world.to(normals), lights_world)
+        rows = rows.replace(seen=rows.seen & faces_lamp(lamp, rows.normals))
         lit = rows.seen.sum(dim=1) >= config.min_views
         share = rows.seen.sum(dim=2) / rows.seen.sum(dim=2).amax(dim=1, keepdim=True).clamp_min(1)
-        determined = light_varies(lights_world, share, config.min_light_variation)
+        determined = light_varies(anchor, share, config.min_light_variation)
         determined = determined & lit.any(dim=1)
         problem = self._problem(rows, anchor, normals.shape[1] * normals.shape[2])
         factors = self._solve(problem)
@@ -230,17 +241,16 @@ class Factorize(nn.Module):
         data = problem.replace(radiance=problem.radiance.detach())
         return solve(data, self.config.max_iterations, self.config.tolerance)
 
-    def _lights(
-        self, seen: PatchViews, coarse: list[Float[Tensor, "_ _ _ 3"]]
-    ) -> Float[Tensor, "view 4"]:
-        """Fit the lights to samples spread evenly over the facets themselves."""
+    def _field(self, seen: PatchViews, coarse: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
+        """Fit the light field to samples spread evenly over the facets themselves."""
+        mesh = seen.patches.coarse.mesh
         chosen = [
             (templates.barycentric >= 0).all(dim=-1)
             & (registered.valid.sum(dim=1) >= self.config.min_views)
             for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True)
         ]
         stride = max(1, -(-sum(int(each.sum()) for each in chosen) // LIGHT_SAMPLES))
-        radiance, visible, normals = [], [], []
+        radiance, visible, normals, points = [], [], [], []
         for templates, registered, blend, these in zip(
             seen.patches.buckets, seen.buckets, coarse, chosen, strict=True
         ):
@@ -251,8 +261,16 @@ class Factorize(nn.Module):
             visible.append(registered.valid[patch, :, row, column] & finite)
             to_world = templates.patch_from_world[patch, :3, :3].to(blend)
             normals.append((blend[patch, row, column, None] @ to_world)[:, 0])
-        lights, _ = fit_lights(torch.cat(radiance), torch.cat(visible), torch.cat(normals))
-        return lights
+            corners = mesh.vertices_world[mesh.faces[templates.facet[patch]]].detach().to(blend)
+            inner = templates.barycentric[patch, row, column].to(blend)
+            points.append((inner[..., None] * corners).sum(dim=1))
+        return fit_light_field(
+            torch.cat(radiance),
+            torch.cat(visible),
+            torch.cat(normals),
+            torch.cat(points),
+            model=self.config.light,
+        )
 
 
 def _joined(chunks: list[Photometry]) -> Photometry:

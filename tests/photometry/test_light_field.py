@@ -1,0 +1,114 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.photometry.light_field import LightField, faces_lamp
+from pimper_torch.photometry.lights import fit_light_field
+
+
+@pytest.fixture
+def room(generator):
+    """Points and normals of a bumpy bowl, and six lamps three to six radii away."""
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    points = normalize(draw(900, 3), dim=1) + torch.tensor([5.0, -2.0, 1.0])
+    normals = normalize(draw(900, 3) + torch.tensor([0.0, 0.0, 1.5]), dim=1)
+    directions = normalize(draw(6, 3) * 0.6 + torch.tensor([0.0, 0.0, 1.0]), dim=1)
+    field = LightField(
+        origin=points.mean(dim=0),
+        soft=torch.tensor([[0.1, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(6, 1),
+        lamp=torch.linspace(0.5, 1.5, 6).double()[:, None] * directions,
+        closeness=1 / torch.linspace(3, 6, 6).double(),
+    )
+    return points, normals, field
+
+
+def seen_by(field, points, normals, albedo):
+    lamp = field.lamp_at(points)
+    direct = (lamp * normals[:, None]).sum(dim=-1).clamp_min(0)
+    return albedo[:, None] * (field.soft[:, 0] + direct)
+
+
+def test_a_lamp_falls_off_with_the_square_and_points_at_its_place():
+    place = torch.tensor([0.0, 3.0, 4.0], dtype=torch.float64)
+    field = LightField(
+        origin=torch.zeros(3).double(),
+        soft=torch.zeros(1, 4).double(),
+        lamp=2.0 * place[None] / 5,
+        closeness=torch.tensor([1 / 5]).double(),
+    )
+    points = torch.tensor([[0.0, 0, 0], [1.0, 0, 4], [-2, 1, 0]], dtype=torch.float64)
+    found = field.lamp_at(points)[:, 0]
+    away = place - points
+    assert_close(normalize(found, dim=1), normalize(away, dim=1))
+    assert_close(found.norm(dim=1), 2.0 * 25 / away.square().sum(dim=1))
+    assert_close(field.lights_at(points)[:, 0, 1:], found)
+
+
+def test_a_lamp_far_away_is_the_same_everywhere():
+    field = LightField(
+        origin=torch.zeros(3).double(),
+        soft=torch.tensor([[0.3, 0.1, 0.2, 0.4]]).double(),
+        lamp=torch.tensor([[0.6, 0.0, 0.8]]).double(),
+        closeness=torch.zeros(1).double(),
+    )
+    points = torch.tensor([[0.0, 0, 0], [50.0, -8, 4]], dtype=torch.float64)
+    expected = torch.tensor([0.3, 0.7, 0.2, 1.2], dtype=torch.float64)
+    assert_close(field.lights_at(points)[:, 0], expected.expand(2, 4))
+
+
+def test_lamps_are_found_where_they_are(room, generator):
+    points, normals, field = room
+    albedo = 0.2 + torch.rand(len(points), generator=generator, dtype=torch.float64)
+    J = seen_by(field, points, normals, albedo)
+    seen = torch.rand(J.shape, generator=generator) > 0.4
+    found = fit_light_field(torch.where(seen, J, torch.nan), seen, normals, points, iterations=150)
+    scale = field.lamp[0].norm() / found.lamp[0].norm()
+    assert_close(found.lamp * scale, field.lamp, rtol=1e-3, atol=1e-3)
+    assert_close(found.soft * scale, field.soft, rtol=1e-3, atol=1e-3)
+    assert_close(found.closeness, field.closeness, rtol=1e-3, atol=1e-3)
+
+
+def test_lamps_survive_cast_shadows_and_highlights(room, generator):
+    points, normals, field = room
+    albedo = 0.2 + torch.rand(len(points), generator=generator, dtype=torch.float64)
+    J = seen_by(field, points, normals, albedo)
+    draw = torch.rand(J.shape, generator=generator)
+    J = torch.where(draw < 0.15, 0.1 * albedo[:, None], torch.where(draw > 0.95, 2.0, J))
+    found = fit_light_field(J, torch.ones_like(draw, dtype=torch.bool), normals, points)
+    cosine = (normalize(found.lamp, dim=1) * normalize(field.lamp, dim=1)).sum(dim=1)
+    assert torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max() < 2
+    assert (found.closeness / field.closeness - 1).abs().max() < 0.1
+
+
+def test_light_from_all_sides_is_taken_for_no_lamp(room, generator):
+    points, normals, _ = room
+    soft = torch.cat([torch.ones(6, 1), 0.5 * torch.randn(6, 3, generator=generator)], dim=1)
+    soft = soft.double()
+    albedo = 0.2 + torch.rand(len(points), generator=generator, dtype=torch.float64)
+    basis = torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
+    J = albedo[:, None] * (basis @ soft.mT)
+    found = fit_light_field(J, J > 0, normals, points)
+    assert (found.lamp == 0).all()
+    assert_close(found.soft / found.soft[:1, :1], soft / soft[:1, :1], rtol=1e-4, atol=1e-4)
+    asked = fit_light_field(J, J > 0, normals, points, model="lamp")
+    assert (asked.lamp.norm(dim=1) > 0).all()
+
+
+def test_what_faces_away_from_the_lamp_is_told():
+    lamp = torch.tensor([[[0.0, 0, -2], [0, 0, 0]]])
+    normals = torch.tensor([[[0.0, 0, -1], [0, 0, 1], [1, 0, 0]]])
+    assert faces_lamp(lamp, normals).tolist() == [[[True, False, False], [True, True, True]]]
+
+
+def test_a_field_without_data_is_dark():
+    none = torch.zeros(0, 5)
+    found = fit_light_field(none, none.bool(), torch.zeros(0, 3), torch.zeros(0, 3))
+    assert (found.lights_at(torch.zeros(2, 3)) == 0).all()
+    unseen = fit_light_field(
+        torch.full((4, 5), torch.nan), torch.zeros(4, 5).bool(), torch.ones(4, 3), torch.ones(4, 3)
+    )
+    assert (unseen.soft == 0).all()
