@@ -61,39 +61,54 @@ def congruence(
 def solve_packed(
     packed: Float[Tensor, "*batch packed item"], rhs: Float[Tensor, "*batch size item"]
 ) -> Float[Tensor, "*batch size item"]:
-    """Solve symmetric positive systems by Cholesky, in float64.
+    """Solve symmetric positive systems by Cholesky, in float64; see :class:`PackedCholesky`."""
+    return PackedCholesky(packed, rhs.shape[-2]).solve(rhs)
+
+
+class PackedCholesky:
+    """Factors ``A = C C^T`` of many small symmetric positive matrices, in float64.
 
     A direction whose pivot is below 1e-12 of the matrix's trace carries no information:
-    its pivot is raised to that, so that the answer stays finite; an empty matrix answers
-    zero to a zero right-hand side. Differentiable.
+    its pivot is raised to that, so that answers stay finite; an empty matrix answers zero
+    to a zero right-hand side. Differentiable.
     """
-    size = rhs.shape[-2]
-    rows, columns = _triangle(size)
-    entries = {
-        (column, row): packed[..., place, :].double()
-        for place, (row, column) in enumerate(zip(rows, columns, strict=True))
-    }
-    trace = torch.stack([entries[i, i] for i in range(size)]).sum(dim=0)
-    floor = (1e-12 * trace.detach()).clamp_min(torch.finfo(torch.float64).tiny ** 0.5)
-    lower: dict[tuple[int, int], Tensor] = {}
-    forward: list[Tensor] = []
-    for i in range(size):
-        for j in range(i + 1):
-            total = entries[i, j]
-            for k in range(j):
-                total = total - lower[i, k] * lower[j, k]
-            lower[i, j] = torch.maximum(total, floor).sqrt() if i == j else total / lower[j, j]
-        value = rhs[..., i, :].double()
-        for k in range(i):
-            value = value - lower[i, k] * forward[k]
-        forward.append(value / lower[i, i])
-    solution = forward
-    for i in reversed(range(size)):
-        value = forward[i]
-        for k in range(i + 1, size):
-            value = value - lower[k, i] * solution[k]
-        solution[i] = value / lower[i, i]
-    return torch.stack(solution, dim=-2).to(rhs.dtype)
+
+    def __init__(self, packed: Float[Tensor, "*batch packed item"], size: int) -> None:
+        rows, columns = _triangle(size)
+        entries = {
+            (column, row): packed[..., place, :].double()
+            for place, (row, column) in enumerate(zip(rows, columns, strict=True))
+        }
+        trace = torch.stack([entries[i, i] for i in range(size)]).sum(dim=0)
+        floor = (1e-12 * trace.detach()).clamp_min(torch.finfo(torch.float64).tiny ** 0.5)
+        self._size, self._lower = size, dict[tuple[int, int], Tensor]()
+        lower = self._lower
+        for i in range(size):
+            for j in range(i + 1):
+                total = entries[i, j]
+                for k in range(j):
+                    total = total - lower[i, k] * lower[j, k]
+                lower[i, j] = torch.maximum(total, floor).sqrt() if i == j else total / lower[j, j]
+
+    def solve(self, rhs: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch size item"]:
+        """Give ``A^-1 b``, in the dtype of ``b``."""
+        solution = list(self.whiten(rhs).unbind(dim=-2))
+        for i in reversed(range(self._size)):
+            value = solution[i]
+            for k in range(i + 1, self._size):
+                value = value - self._lower[k, i] * solution[k]
+            solution[i] = value / self._lower[i, i]
+        return torch.stack(solution, dim=-2).to(rhs.dtype)
+
+    def whiten(self, rhs: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch size item"]:
+        """Give ``C^-1 b`` in float64: products of such vectors are ``b^T A^-1 b'``."""
+        forward: list[Tensor] = []
+        for i in range(self._size):
+            value = rhs[..., i, :].double()
+            for k in range(i):
+                value = value - self._lower[i, k] * forward[k]
+            forward.append(value / self._lower[i, i])
+        return torch.stack(forward, dim=-2)
 
 
 def _triangle(size: int) -> tuple[list[int], list[int]]:

@@ -1,0 +1,90 @@
+"""Factorization from several places, until the best minimum repeats."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.low_rank import LowRank, random_left
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.records import Record
+
+# Residuals below this share of the data are zero but for rounding.
+_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Restarted(Record):
+    """The best of several factorizations of one matrix.
+
+    Attributes:
+        best: A batch of one.
+        residuals: Of all starts, in their order.
+        repeated: Whether the best minimum was reached as often as asked; else a better one
+            may well have been missed.
+    """
+
+    best: LowRank
+    residuals: Float[Tensor, " start"]
+    repeated: bool
+
+
+def factorize_from_many(
+    matrix: Float[Tensor, "row column"],
+    weight: Float[Tensor, "row column"],
+    rank: int,
+    generator: torch.Generator,
+    *,
+    repeats: int = 2,
+    max_starts: int = 50,
+    closeness: float = 1e-6,
+    max_iterations: int = 300,
+    tolerance: float = 1e-9,
+) -> Restarted:
+    """Factorize a matrix with missing entries from random starts until the best repeats.
+
+    Args:
+        matrix: Entries without weight do not matter.
+        weight: 0 where missing.
+        rank: Of the factors.
+        generator: On the CPU.
+        repeats: How many starts must end in the best minimum.
+        max_starts: Starts at most.
+        closeness: Residuals that differ by less than this share are of the same minimum.
+        max_iterations: Of each start.
+        tolerance: See
+            :func:`~pimper_torch.photometry.variable_projection.solve_variable_projection`.
+
+    Raises:
+        InputError: No starts are allowed, or the matrix, weights or rank make no sense.
+    """
+    if not 1 <= repeats <= max_starts:
+        raise InputError(
+            f"repeats is {repeats} and max_starts {max_starts}; needed: 1 <= repeats <= max_starts."
+        )
+    best: LowRank | None = None
+    residuals: list[float] = []
+    repeated = False
+    seen = weight > 0
+    level = float((weight[seen] * matrix[seen].square()).sum() / weight[seen].sum()) ** 0.5
+    while len(residuals) < max_starts:
+        start = random_left(1, matrix.shape[0], rank, generator).to(matrix.device)
+        found = solve_variable_projection(
+            matrix[None], weight[None], start, max_iterations, tolerance
+        )
+        residuals.append(float(found.convergence.residual))
+        if best is None or residuals[-1] < float(best.convergence.residual):
+            best = found
+        # On exact data the best residual is rounding, and no two are alike.
+        same = max(min(residuals) * (1 + closeness), _ROUNDING * level)
+        repeated = sum(one <= same for one in residuals) >= repeats
+        if repeated:
+            break
+    assert best is not None
+    return Restarted(
+        best=best,
+        residuals=torch.tensor(residuals, dtype=torch.float64),
+        repeated=repeated,
+    )
