@@ -37,7 +37,7 @@ from pimper_torch.photometry.bilinear import Factors
 from pimper_torch.photometry.certainty import refine_on_cone
 from pimper_torch.photometry.cone import split_shading
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.photometry.lights import fit_lights
+from pimper_torch.photometry.lights import fit_distant_lights
 from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.records import CoarseMesh, Convergence, Estimate, Record, SparseScene
 
@@ -205,7 +205,7 @@ class GlobalStereo(nn.Module):
 def solve_from_mesh(matrix: Matrix, config: GlobalStereoConfig) -> Whole:
     """Separate albedo, normals and light of one matrix, up to a Lorentz transformation."""
     steps, some = 0, _well_seen(matrix, config.min_views, LIGHT_SAMPLES)
-    lights, _ = fit_lights(some.radiance.mT, some.seen.mT, some.normals)
+    lights = fit_distant_lights(some.radiance.mT, some.seen.mT, some.normals)
     if config.start == "svd":
         shading = _best_shading(some, lights)
         lights = start_from_data(some.radiance[None], some.seen[None], lights[None], shading[None])[
@@ -235,7 +235,7 @@ def fix_ambiguity(matrix: Matrix, whole: Whole, min_views: int) -> Whole:
     (told,) = often.nonzero(as_tuple=True)
     few = told[:: _stride(len(told), LIGHT_SAMPLES)]
     some = matrix.take(few)
-    lights, _ = fit_lights(some.radiance.mT, some.seen.mT, some.normals)
+    lights = fit_distant_lights(some.radiance.mT, some.seen.mT, some.normals)
     move = align_factorizations(
         whole.shading[None, :, few],
         _best_shading(some, lights)[None],

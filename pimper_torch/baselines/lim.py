@@ -43,7 +43,7 @@ from pimper_torch.config import require
 from pimper_torch.geometry.reliefs import sample_raster
 from pimper_torch.integration.integrate import integrate_normals
 from pimper_torch.patches.warp import WarpConfig
-from pimper_torch.photometry.lights import fit_lights
+from pimper_torch.photometry.lights import fit_distant_lights
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, Record, SparseScene
 
 # A relief that hides samples from a view needs no more vertices than this many samples apart.
@@ -201,7 +201,7 @@ def relief_from(
     lights = factorize_rank_three(some.radiance, some.seen, config.alternations)
     factors = Rank3(lights=lights, vectors=solve_vectors(matrix.radiance, matrix.seen, lights))
     spans = spans_between(edges_of(points), template, factors, often)
-    surface_lights, _ = fit_lights(some.radiance.mT, some.seen.mT, some.normals)
+    surface_lights = fit_distant_lights(some.radiance.mT, some.seen.mT, some.normals)
     start = matrix_between_lights(lights, surface_lights[:, 1:])
     factors = facing(factors.moved(ambiguity_between_points(spans, start)), often)
     relief = _integrated(template, factors, often, config)

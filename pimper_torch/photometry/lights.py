@@ -36,17 +36,20 @@ def fit_light_field(
     radiance: Float[Tensor, "sample view"],
     seen: Bool[Tensor, "sample view"],
     normals: Float[Tensor, "sample 3"],
-    points: Float[Tensor, "sample 3"],
+    points: Float[Tensor, "sample 3"] | None = None,
     model: Literal["auto", "soft", "lamp"] = "auto",
     iterations: int = 60,
 ) -> LightField:
     r"""Fit soft light or lamps, or both, and take what leaves the smaller residuals.
 
+    Minimised is :math:`\sum_{ig} \phi(x_{gi} - \rho_i\, s_g(i))`, :math:`\phi` being Cauchy's
+    loss with a scale of 2.385 spreads of the view's residuals (wider at first).
+
     Args:
         radiance: Gray, linear. Entries that are not seen do not matter.
         seen: False where missing.
         normals: Unit, world.
-        points: World.
+        points: World; without, lamps are far away.
         model: Which to fit; ``auto`` is both.
         iterations: At most, for each model.
 
@@ -54,7 +57,9 @@ def fit_light_field(
         The scale between light and albedo is free; here the median of ``|l|`` over the views,
         at the middle of the points, is 1. A view without data has zero.
 
-    Computed in float64. Constant to autograd.
+    Fails where the normals span too little (a plane shows one number of each soft light): the
+    answer is then the smallest change from lights that shine along the mean normal, and
+    lights that differ are found parallel. Computed in float64. Constant to autograd.
 
     Source: of the lamp, Queau et al., LED-based photometric stereo, JMIV 60, 2018; that it is
     calibrated by the coarse shape is ours.
@@ -71,9 +76,11 @@ def fit_light_field(
         some = seen.any(dim=1)
         seen = seen[some]
         J = torch.where(seen, radiance[some], 0).double()
-        known, places = normals[some].double(), points[some].double()
+        known = normals[some].double()
+        places = torch.zeros_like(known) if points is None else points[some].double()
         origin = places.mean(dim=0)
-        size = (places - origin).norm(dim=1).mean().clamp_min(1e-300)
+        size = (places - origin).norm(dim=1).mean()
+        size = torch.where(size > 0, size, 1)
         soft = lamp = None
         if model != "lamp":
             soft = _fit(_Soft(basis=harmonics(known)), J, seen, iterations)
@@ -86,7 +93,7 @@ def fit_light_field(
             lights = soft.lights
         else:
             lights[:, 0], lamps = lamp.lights[:, 0], lamp.lights[:, 1:4]
-            closeness = lamp.lights[:, 4] / size
+            closeness = torch.zeros_like(closeness) if points is None else lamp.lights[:, 4] / size
         factor = _typical((lights.square().sum(dim=1) + lamps.square().sum(dim=1)).sqrt())
         return LightField(
             origin=origin.to(radiance),
@@ -96,40 +103,18 @@ def fit_light_field(
         )
 
 
-def fit_lights(
+def fit_distant_lights(
     radiance: Float[Tensor, "sample view"],
     seen: Bool[Tensor, "sample view"],
     normals: Float[Tensor, "sample 3"],
-    iterations: int = 40,
-) -> tuple[Float[Tensor, "view 4"], Float[Tensor, " sample"]]:
-    r"""Fit one soft light a view and one albedo a sample, robustly.
-
-    Minimises :math:`\sum_{ig} \phi(x_{gi} - \rho_i\, l_g^\top (1, n_i))`, :math:`\phi` being
-    Cauchy's loss with a scale of 2.385 spreads of the view's residuals (wider at first).
-
-    Args:
-        radiance: Gray, linear. Entries that are not seen do not matter.
-        seen: False where missing.
-        normals: Unit, in the frame the lights are wanted in.
-        iterations: At most.
+) -> Float[Tensor, "view 4"]:
+    """Fit lights that are the same everywhere; see :func:`fit_light_field`.
 
     Returns:
-        Lights with ``(1, n)`` and albedos. The scale between them is free; here the median
-        of ``|l|`` over the views is 1. A view or sample without data has zero.
-
-    Fails where the normals span too little (a plane shows one number of each light): the
-    answer is then the smallest change from lights that shine along the mean normal, and
-    lights that differ are found parallel. Computed in float64. Constant to autograd.
+        First-order lights in the frame of the normals, of what faces the lamp.
     """
-    with torch.no_grad():
-        if not seen.any():
-            return radiance.new_zeros(seen.shape[1], 4), radiance.new_zeros(len(seen))
-        J = torch.where(seen, radiance, 0).double()
-        found = _fit(_Soft(basis=harmonics(normals).double()), J, seen, iterations)
-        factor = _typical(found.lights.norm(dim=1))
-        if (found.albedo < 0).sum() > (found.albedo > 0).sum():
-            factor = -factor
-        return (found.lights / factor).to(radiance), (found.albedo * factor).to(radiance)
+    field = fit_light_field(radiance, seen, normals)
+    return field.lights_at(field.origin[None])[0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
