@@ -8,19 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.datasets.dtu import CALIBRATED_WIDTH, dtu_capture
 from pimper_torch.datasets.layout import contents, expect, numbers, read_text
 from pimper_torch.datasets.matlab import read_matlab
 from pimper_torch.datasets.projections import decompose_projections
-from pimper_torch.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.datasets.sampling import choose_photographs
 from pimper_torch.geometry.frames import rigid
-from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.records import Cameras, Capture, DtuProtocol, Truth
+from pimper_torch.records import Capture, DtuProtocol, Truth
 
 KIND = "the DTU multi-view stereo set of 2014"
 ALL_LAMPS = 7  # our number for `max`, the brightest of the seven photographs at each pixel
-_CALIBRATED_WIDTH = 1600
 _NAME = re.compile(r"rect_(\d{3})_(?:(\d)_r5000|(max))\.png")
 
 
@@ -89,24 +87,14 @@ def read_dtu_mvs(
         kind=KIND,
     )
     places, lamps, paths = zip(*(named[index] for index in chosen), strict=True)
-    order = sorted(set(places))
-    K, cam_from_world = _read_cameras(root, order)
-    index = torch.tensor([order.index(place) for place in places])
-    views = read_photographs(
-        paths, [path.name for path in paths], linear=linear, max_size_px=max_size_px
-    )
-    factor = float(views.sizes_px[0, 0]) / _CALIBRATED_WIDTH
-    K = scale_intrinsics(intrinsics_from_indices(K), factor, factor)
-    return Capture(
-        views=views,
-        cameras=Cameras(
-            intrinsics=K[index].float(),
-            cam_from_world=cam_from_world[index].float(),
-            sizes_px=views.sizes_px,
-        ),
-        truth=Truth(points_world=_scan(root, scan)),
-        position=torch.tensor(places),
-        light=torch.tensor(lamps),
+    return dtu_capture(
+        paths,
+        places,
+        lamps,
+        _read_cameras(root, sorted(set(places))),
+        Truth(points_world=_scan(root, scan)),
+        linear=linear,
+        max_size_px=max_size_px,
     )
 
 
@@ -193,7 +181,7 @@ def _parse_mvsnet(path: Path) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "4 4"
     K = numbers(words[18:27], 9, "intrinsic", path, KIND).reshape(3, 3)
     # MVSNet's training copies are 160 x 128: their principal point lies near (80, 64).
     expect(
-        float(K[0, 2]) > _CALIBRATED_WIDTH / 4,
+        float(K[0, 2]) > CALIBRATED_WIDTH / 4,
         path,
         KIND,
         "intrinsics of the photographs of 1600 x 1200",

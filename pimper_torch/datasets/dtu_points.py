@@ -8,16 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.datasets.dtu import dtu_capture
 from pimper_torch.datasets.layout import expect, first_of
 from pimper_torch.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.datasets.projections import decompose_projections
-from pimper_torch.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.datasets.sampling import choose_photographs
-from pimper_torch.geometry.pixels import scale_intrinsics
-from pimper_torch.records import Cameras, Capture, Truth
+from pimper_torch.records import Capture, Truth
 
 KIND = "the DTU point feature set"
-_CALIBRATED_WIDTH = 1600  # the calibration is for 1600 x 1200; a copy of half the size exists
 _NAME = re.compile(r"Img(\d{3})_(\d{2})\.(bmp|png)", re.IGNORECASE)
 _CALIBRATIONS = ("Calib_Results_11.mat", "calibrationFile.mat")
 _SCANS = ("CleanRecon_2009_11_16", "reconstructions", ".")
@@ -88,25 +86,15 @@ def read_dtu_points(
     calibration = first_of([root / name for name in _CALIBRATIONS])
     expect(calibration is not None, root, KIND, f"the calibration {' or '.join(_CALIBRATIONS)}")
     assert calibration is not None
-    numbers = sorted(set(places))
-    projections = read_toolbox_projections(calibration, numbers, KIND)
-    index = torch.tensor([numbers.index(place) for place in places])
-    views = read_photographs(
-        paths, [path.name for path in paths], linear=linear, max_size_px=max_size_px
-    )
-    K, cam_from_world = decompose_projections(projections)
-    factor = float(views.sizes_px[0, 0]) / _CALIBRATED_WIDTH
-    K = scale_intrinsics(intrinsics_from_indices(K), factor, factor)
-    return Capture(
-        views=views,
-        cameras=Cameras(
-            intrinsics=K[index].float(),
-            cam_from_world=cam_from_world[index].float(),
-            sizes_px=views.sizes_px,
-        ),
-        truth=Truth(points_world=_scan(root, scan)),
-        position=torch.tensor(places),
-        light=torch.tensor(lamps),
+    projections = read_toolbox_projections(calibration, sorted(set(places)), KIND)
+    return dtu_capture(
+        paths,
+        places,
+        lamps,
+        decompose_projections(projections),
+        Truth(points_world=_scan(root, scan)),
+        linear=linear,
+        max_size_px=max_size_px,
     )
 
 
