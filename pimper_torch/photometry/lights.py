@@ -6,8 +6,7 @@ lights that are calibrated leave no ambiguity for the factorization.
 Two models are fitted, and the one that explains the photographs better is taken: soft light,
 the same first-order harmonics all over the scene; and a lamp at some place, whose light
 falls off, with attached shadows and an ambient term. One light for all, linear in
-:math:`(1, n)`, is no model for a lamp: on a mug under a near lamp the directions found so
-were 50 degrees off, and 13 with the second one.
+:math:`(1, n)`, is no model for a lamp: its falling off and its shadows are taken for shape.
 """
 
 from dataclasses import dataclass
@@ -220,25 +219,27 @@ def _fit(
     """
     gain, albedo = _brightness(J, seen)
     lights = model.admit(model.start(gain))
+    shading = model.shade(lights)
+    residual = torch.where(seen, J - albedo[:, None] * shading, 0)
     damping = 1e-3
     for step in range(limit):
         widen = max(1.0, 4.0 * 0.7**step)
-        residual = torch.where(seen, J - albedo[:, None] * model.shade(lights), 0)
         scale = widen * _scale(J, seen, residual)
         weight = seen * cauchy_weights(residual, scale)
         cost = _cost(seen, residual, scale)
-        lights_step, albedo_step = _step(model, lights, albedo, residual, weight, damping)
+        slopes = albedo[:, None, None] * model.slopes(lights)
+        lights_step, albedo_step = _step(shading, slopes, residual, weight, damping)
         moved, changed = model.admit(lights + lights_step), albedo + albedo_step
-        left = torch.where(seen, J - changed[:, None] * model.shade(moved), 0)
+        shown = model.shade(moved)
+        left = torch.where(seen, J - changed[:, None] * shown, 0)
         after = _cost(seen, left, scale)
         if after < cost:
-            lights, albedo = moved, changed
+            lights, albedo, shading, residual = moved, changed, shown, left
             damping = max(damping / 4, 1e-9)
             if widen == 1 and after > cost * (1 - 1e-7):
                 break
         else:
             damping = min(damping * 10, 1e6)
-    residual = torch.where(seen, J - albedo[:, None] * model.shade(lights), 0)
     relative = residual.abs() / _level(J, seen).clamp_min(1e-300)
     return _Found(lights=lights, albedo=albedo, misfit=float(relative[seen].median()))
 
@@ -278,17 +279,25 @@ def _cost(
 
 
 def _step(
-    model: _Model,
-    lights: Float[Tensor, "view parameter"],
-    albedo: Float[Tensor, " sample"],
+    shading: Float[Tensor, "sample view"],
+    slopes: Float[Tensor, "sample view parameter"],
     residual: Float[Tensor, "sample view"],
     weight: Float[Tensor, "sample view"],
     damping: float,
 ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
-    """Solve the normal equations for all lights and albedos, albedos eliminated (Schur)."""
-    num_views, size = lights.shape
-    shading = model.shade(lights)
-    slopes = albedo[:, None, None] * model.slopes(lights)
+    """Solve the normal equations for all lights and albedos, albedos eliminated (Schur).
+
+    Args:
+        shading: What albedo 1 shows: the derivatives by the albedos.
+        slopes: The derivatives by the parameters of the lights.
+        residual: What is left to explain.
+        weight: Of each.
+        damping: Share of the diagonal that is added to it.
+
+    Returns:
+        What to add to lights and albedos.
+    """
+    _, num_views, size = slopes.shape
     heavy = weight[..., None] * slopes
     blocks = heavy.permute(1, 2, 0) @ slopes.transpose(0, 1)
     diagonal = blocks.diagonal(dim1=1, dim2=2)
@@ -300,7 +309,7 @@ def _step(
     own = (weight * shading**2).sum(dim=1) * (1 + damping)
     inverse = torch.where(own > 0, 1 / torch.where(own > 0, own, 1), 0)
     cross = (heavy * shading[..., None]).flatten(1)
-    view = torch.arange(num_views, device=lights.device)
+    view = torch.arange(num_views, device=slopes.device)
     spread_out = damped.new_zeros(num_views, size, num_views, size)
     spread_out[view, :, view, :] = damped
     schur = spread_out.reshape(size * num_views, -1) - cross.mT @ (inverse[:, None] * cross)

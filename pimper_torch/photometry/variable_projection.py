@@ -77,10 +77,8 @@ def solve_variable_projection(
         small = torch.zeros_like(error)
         taken = torch.full_like(error, max_iterations).long()
         running = torch.ones_like(error, dtype=torch.bool)
-        fresh, system = True, None
+        system = _equations(matrix, weight, left, right, factored)
         for step in range(max_iterations):
-            if fresh or system is None:
-                system = _equations(matrix, weight, left, right, factored)
             moved = torch.linalg.qr(left + _move(*system, damping)).Q
             tried, tried_factors = solve_right(matrix, weight, moved)
             after = squared_error(matrix, weight, moved, tried)
@@ -90,17 +88,15 @@ def solve_variable_projection(
             left = torch.where(better[:, None, None], moved, left)
             error = torch.where(better, after, error)
             damping = damping * torch.where(better, _LESS, _MORE)
-            fresh = bool(better.any())
-            if fresh:
-                if bool(better.all()):
-                    right, factored = tried, tried_factors
-                else:
-                    right, factored = solve_right(matrix, weight, left)
             ended = running & ((small >= _SMALL_STEPS) | (damping > _MOST_DAMPING) | (error == 0))
             taken[ended] = step + 1
             running = running & ~ended
             if not bool(running.any()):
                 break
+            if bool(better.any()):
+                if not bool(better.all()):
+                    tried, tried_factors = solve_right(matrix, weight, left)
+                system = _equations(matrix, weight, left, tried, tried_factors)
         return finished(matrix, weight, left, taken, max_iterations)
 
 
