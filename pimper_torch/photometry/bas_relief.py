@@ -1,0 +1,105 @@
+r"""What rank-three factorization leaves free once the surface is one: bas-relief.
+
+:math:`J = L B = (L A^{-1})(A B)` for every invertible 3 x 3 matrix, where the columns of ``B``
+are albedo times normal. That normals belong to a surface ``z(x, y)`` ties ``A`` down to the
+transformations of :math:`\bar z = \lambda z + \mu x + \nu y`, the generalised bas-relief
+transformations, times one factor between albedo and light.
+
+Source: Belhumeur, Kriegman & Yuille, IJCV 35(1), 1999.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.records import Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class BasRelief(Record):
+    r"""A generalised bas-relief transformation, ready to act on a factorization.
+
+    Frame: x right, y down, z forward, normals facing the viewer (``n_z < 0``); the surface's
+    depth becomes :math:`\lambda z + \mu x + \nu y`, and :math:`b = \rho n` becomes ``G b``
+    with ``G = [[lambda, 0, -mu], [0, lambda, -nu], [0, 0, 1]]``.
+
+    Attributes:
+        mu: Tilt along x.
+        nu: Tilt along y.
+        lam: Flattening, not zero; below zero hills become valleys.
+
+    >>> tilt = BasRelief(mu=torch.tensor(0.5), nu=torch.tensor(0.0), lam=torch.tensor(2.0))
+    >>> tilt.on_shading(torch.tensor([[0.0], [0.0], [-1.0]]))[:, 0]
+    tensor([ 0.5000,  0.0000, -1.0000])
+    """
+
+    mu: Float[Tensor, "*batch"]
+    nu: Float[Tensor, "*batch"]
+    lam: Float[Tensor, "*batch"]
+
+    @property
+    def matrix(self) -> Float[Tensor, "*batch 3 3"]:
+        """``G``."""
+        zero, one = torch.zeros_like(self.lam), torch.ones_like(self.lam)
+        rows = [[self.lam, zero, -self.mu], [zero, self.lam, -self.nu], [zero, zero, one]]
+        return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+    def on_shading(self, shading: Float[Tensor, "*batch 3 sample"]) -> Float[Tensor, "..."]:
+        """Give ``G B``."""
+        return self.matrix @ shading
+
+    def on_lights(self, lights: Float[Tensor, "*batch view 3"]) -> Float[Tensor, "..."]:
+        """Give ``L G^-1``, so that the product with :meth:`on_shading` stays the data."""
+        return lights @ self.inverse().matrix
+
+    def inverse(self) -> "BasRelief":
+        """Give the transformation that undoes this one."""
+        return BasRelief(mu=-self.mu / self.lam, nu=-self.nu / self.lam, lam=1 / self.lam)
+
+    def after(self, first: "BasRelief") -> "BasRelief":
+        """Give this transformation after another: they form a group."""
+        return BasRelief(
+            mu=self.lam * first.mu + self.mu,
+            nu=self.lam * first.nu + self.nu,
+            lam=self.lam * first.lam,
+        )
+
+
+def align_reliefs(
+    shading: Float[Tensor, "3 sample"],
+    reference: Float[Tensor, "3 sample"],
+    weight: Float[Tensor, " sample"],
+) -> BasRelief:
+    r"""Find the bas-relief transformation that brings one factorization closest to another.
+
+    Minimises :math:`\sum_k w_k \lVert s G b_k - \bar b_k \rVert^2` over ``G`` and the factor
+    ``s``, which is linear in ``s``, ``s lambda``, ``s mu``, ``s nu``.
+
+    Args:
+        shading: ``B`` to be moved, albedo times normal.
+        reference: Where it should come to lie.
+        weight: Not negative.
+
+    Ill-posed where all normals are parallel. Differentiable.
+    """
+    x, y, z = shading.double()
+    w = weight.double()
+    square = (w * (x * x + y * y)).sum()
+    depth = (w * z * z).sum()
+    slant_x, slant_y = (w * x * z).sum(), (w * y * z).sum()
+    a, b, c = reference.double()
+    # Unknowns s lam, s mu, s nu, s: rows x and y tell the first three, row z the last.
+    normal = torch.stack(
+        [
+            torch.stack([square, -slant_x, -slant_y]),
+            torch.stack([-slant_x, depth, torch.zeros_like(depth)]),
+            torch.stack([-slant_y, torch.zeros_like(depth), depth]),
+        ]
+    )
+    rhs = torch.stack([(w * (x * a + y * b)).sum(), -(w * z * a).sum(), -(w * z * b).sum()])
+    lam, mu, nu = torch.linalg.solve(normal, rhs)
+    scale = (w * z * c).sum() / depth
+    found = [value / scale for value in (mu, nu, lam)]
+    return BasRelief(mu=found[0].to(shading), nu=found[1].to(shading), lam=found[2].to(shading))
