@@ -12,7 +12,7 @@ from pathlib import Path
 import scipy.io
 import torch
 
-from pimper_torch.photometry.low_rank import random_left
+from pimper_torch.photometry.low_rank import low_rank_problem, random_left
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 
 # Name, rank, best residual known, starts.
@@ -40,7 +40,8 @@ def main() -> None:
         residuals, iterations, began = [], [], time.process_time()
         for _ in range(starts):
             start = random_left(1, matrix.shape[1], rank, generator)
-            found = solve_variable_projection(matrix, weight, start).convergence
+            problem = low_rank_problem(matrix, weight, start)
+            found = solve_variable_projection(problem).convergence
             residuals.append(float(found.residual))
             iterations.append(int(found.iterations))
         seconds = (time.process_time() - began) / starts

@@ -107,7 +107,7 @@ def reconstruction():
         convergence=Convergence(
             iterations=torch.tensor([12, 40]),
             residual=torch.tensor([0.1, 0.3]),
-            converged=torch.tensor([True, False]),
+            cause=torch.tensor([0, 2]),
         ),
     )
     patches = PatchSet(coarse=coarse, buckets=(templates,))

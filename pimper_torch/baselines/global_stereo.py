@@ -34,7 +34,7 @@ from pimper_torch.patches.warp import WarpConfig
 from pimper_torch.photometry.ambiguity import align_factorizations
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Factors
-from pimper_torch.photometry.certainty import refine_on_cone
+from pimper_torch.photometry.certainty import refine_on_manifold
 from pimper_torch.photometry.cone import split_shading
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.lights import fit_distant_lights
@@ -316,7 +316,7 @@ def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
     """Take every sample to its exact minimum, and say how sure it is."""
     lit = matrix.seen.sum(dim=0) >= min_views
     none = torch.zeros(1, dtype=torch.long, device=lit.device)
-    convergence = Convergence(iterations=none, residual=none.to(whole.lights), converged=none == 0)
+    convergence = Convergence(iterations=none, residual=none.to(whole.lights), cause=none)
     albedo, normals, confidence = [], [], []
     for part in chunks(len(lit)):
         problem = as_problem(matrix.take(part), whole.lights, whole.shading[:, part])
@@ -326,7 +326,7 @@ def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
             weight=problem.weight,
             convergence=convergence,
         )
-        found = refine_on_cone(problem, factors)
+        found = refine_on_manifold(problem, factors)
         albedo.append(found.albedo[0])
         normals.append(found.normals[0])
         confidence.append(found.confidence[0])

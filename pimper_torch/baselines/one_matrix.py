@@ -61,9 +61,7 @@ def as_problem(
         lights=lights[None],
         anchor=lights[None],
         shading=shading[None],
-        normals=matrix.normals.mT[None],
         pull=views,
-        geometry=views[:, 0],
     )
 
 

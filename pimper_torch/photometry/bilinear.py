@@ -1,17 +1,21 @@
-r"""The problem both solvers solve: lights and shading vectors whose product is the data.
+r"""The problem all solvers solve: lights and shading vectors whose product is the data.
 
 .. math::
 
     \min_{L, N} \sum_{fk} D_{fk}\, \phi(J_{fk} - l_f^\top n_k)
     + \sum_f c_f \lVert l_f - \bar l_f \rVert^2
-    + \gamma \sum_k \lVert b_k - \rho_k \bar n_k \rVert^2
-    \quad \text{with } n_k = (\rho_k, b_k),\ \lVert b_k \rVert = \rho_k
+    + \sum_k n_k^\top P_k n_k
+    \quad \text{with } n_k \in \mathcal M
 
-for every patch of a batch. :math:`\phi` is the square, or Cauchy's loss. With ``c`` and
-:math:`\gamma` 0 and the square this is the published problem.
+for every patch of a batch, with ``M`` the photometric manifold of some order of lighting and
+:math:`\phi` a loss. Without ``c`` and ``P``, with squares and the cone this is the published
+problem; with any vectors, low-rank factorization with missing data.
+
+A solver is a function of such a problem, a limit of iterations and a tolerance.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -19,15 +23,30 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.photometry.quadratics import diagonal, outer
-from pimper_torch.photometry.robust import cauchy_weights, spread
-from pimper_torch.records import Convergence, Record
+from pimper_torch.photometry.manifolds import Cone, Free, Manifold
+from pimper_torch.photometry.quadratics import (
+    PackedCholesky,
+    apply_packed,
+    congruence,
+    diagonal,
+    outer,
+)
+from pimper_torch.photometry.robust import Loss, Squares, spread
+from pimper_torch.records import Convergence, Record, StopCause
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 # The spread of residuals is never taken to be less than this share of a patch's brightness:
 # on exact data all residuals are rounding, and none is an outlier.
 SMALLEST_SPREAD = 1e-4
+
+# Robust weights follow the residuals every so many steps: they change slowly, and their
+# medians cost as much as a step.
+REWEIGH_EVERY = 3
+
+# A step along a curved manifold longer than this share of albedo, about radians of the normal,
+# leaves the place where its quadratic model holds.
+LONGEST_STEP = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -39,24 +58,25 @@ class Bilinear(Record):
         weight: ``D``: how much each entry counts; 0 where missing.
         lights: Where the lights start.
         anchor: What the lights are pulled to.
-        shading: Where ``N`` starts, columns on the cone.
-        normals: What the normals are pulled to, unit.
+        shading: Where ``N`` starts, columns on the manifold.
         pull: ``c_f`` per view.
-        geometry: The weight ``gamma`` of each patch.
-        robust_scale: Cauchy's scale in spreads of the patch's residuals; ``None`` for
-            plain least squares.
-        stride: The spread is taken over every so many samples.
+        prior: ``P``, packed: what else is known of the shading vectors, such as normals they
+            should not bend away from (:meth:`Cone.bend
+            <pimper_torch.photometry.manifolds.Cone.bend>`); ``None`` for nothing.
+        manifold: What shading vectors can be.
+        loss: What residuals cost, their deviation estimated patch by patch.
+        stride: The deviation is taken over every so many samples.
     """
 
     radiance: Float[Tensor, "patch view sample"]
     weight: Float[Tensor, "patch view sample"]
-    lights: Float[Tensor, "patch view 4"]
-    anchor: Float[Tensor, "patch view 4"]
-    shading: Float[Tensor, "patch 4 sample"]
-    normals: Float[Tensor, "patch 3 sample"]
+    lights: Float[Tensor, "patch view rank"]
+    anchor: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
     pull: Float[Tensor, "patch view"]
-    geometry: Float[Tensor, " patch"]
-    robust_scale: float | None = None
+    prior: Float[Tensor, "patch packed sample"] | None = None
+    manifold: Manifold = Cone()  # noqa: RUF009 - frozen
+    loss: Loss = Squares()  # noqa: RUF009 - frozen
     stride: int = 1
 
 
@@ -66,15 +86,18 @@ class Factors(Record):
 
     Attributes:
         lights: ``L``.
-        shading: ``N``, columns on the cone.
+        shading: ``N``, columns on the manifold.
         weight: What each entry counted in the end: ``D`` times the robust weights.
         convergence: Of each patch.
     """
 
-    lights: Float[Tensor, "patch view 4"]
-    shading: Float[Tensor, "patch 4 sample"]
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
     weight: Float[Tensor, "patch view sample"]
     convergence: Convergence
+
+
+Solver = Callable[[Bilinear, int, float], Factors]
 
 
 def select(record: AnyRecord, patches: Int[Tensor, " chosen"]) -> AnyRecord:
@@ -86,82 +109,171 @@ def select(record: AnyRecord, patches: Int[Tensor, " chosen"]) -> AnyRecord:
 
 def reweigh(
     problem: Bilinear,
-    lights: Float[Tensor, "patch view 4"],
-    shading: Float[Tensor, "patch 4 sample"],
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch view sample"]:
-    """Give ``D`` times the weights of Cauchy's loss at the present residuals."""
-    if problem.robust_scale is None:
+    """Give ``D`` times the weights of the loss at the present residuals."""
+    if isinstance(problem.loss, Squares):
         return problem.weight
     residual = problem.radiance - lights @ shading
-    scale = problem.robust_scale * _spread(problem, residual)
-    return problem.weight * cauchy_weights(residual, scale[:, None, None])
+    deviation = _spread(problem, residual)
+    return problem.weight * problem.loss.weights(residual, deviation[:, None, None])
 
 
 def equations_of_samples(
     problem: Bilinear,
-    lights: Float[Tensor, "patch view 4"],
+    lights: Float[Tensor, "patch view rank"],
     weight: Float[Tensor, "patch view sample"],
-) -> tuple[Float[Tensor, "patch 10 sample"], Float[Tensor, "patch 4 sample"]]:
-    """Assemble the normal equations for every sample's shading vector, lights given.
-
-    Without the geometry's pull, which :func:`geometry_of_samples` gives.
-    """
+) -> tuple[Float[Tensor, "patch packed sample"], Float[Tensor, "patch rank sample"]]:
+    """Assemble the normal equations for every sample's shading vector, lights given."""
     packed = outer(lights.mT) @ weight
+    if problem.prior is not None:
+        packed = packed + problem.prior
     return packed, lights.mT @ (weight * problem.radiance)
-
-
-def geometry_of_samples(problem: Bilinear) -> Float[Tensor, "patch 10 sample"]:
-    r"""Give the quadratic form of :math:`\gamma \lVert b - \rho \bar n \rVert^2` in (rho, b)."""
-    n = problem.normals
-    gamma = problem.geometry[:, None]
-    one, zero = torch.ones_like(n[:, 0]), torch.zeros_like(n[:, 0])
-    square = (n * n).sum(dim=1)
-    rows = [square, -n[:, 0], -n[:, 1], -n[:, 2], one, zero, zero, one, zero, one]
-    return torch.stack([gamma * row for row in rows], dim=1)
 
 
 def equations_of_views(
     problem: Bilinear,
-    shading: Float[Tensor, "patch 4 sample"],
+    shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
-) -> tuple[Float[Tensor, "patch 10 view"], Float[Tensor, "patch 4 view"]]:
+) -> tuple[Float[Tensor, "patch packed view"], Float[Tensor, "patch rank view"]]:
     """Assemble the normal equations for every view's light, pull included."""
     packed = (weight @ outer(shading).mT).mT.clone()
-    packed[:, diagonal(4)] += problem.pull[:, None, :]
+    packed[:, diagonal(shading.shape[1])] += problem.pull[:, None, :]
     rhs = (weight * problem.radiance) @ shading.mT + problem.pull[..., None] * problem.anchor
     return packed, rhs.mT
 
 
 def objective(
     problem: Bilinear,
-    lights: Float[Tensor, "patch view 4"],
-    shading: Float[Tensor, "patch 4 sample"],
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
 ) -> Float[Tensor, " patch"]:
     """Evaluate what is minimised, with the robust loss frozen in ``weight``."""
+    return evaluate(problem, lights, shading, weight)[0]
+
+
+def evaluate(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+    weight: Float[Tensor, "patch view sample"],
+) -> tuple[Float[Tensor, " patch"], Float[Tensor, "patch view rank"]]:
+    """Give the :func:`objective`, and minus half its gradient by the lights."""
     residual = problem.radiance - lights @ shading
-    data = (weight * residual**2).sum(dim=(1, 2))
-    coupling = (problem.pull * ((lights - problem.anchor) ** 2).sum(dim=2)).sum(dim=1)
-    bent = shading[:, 1:] - shading[:, :1] * problem.normals
-    return data + coupling + problem.geometry * (bent**2).sum(dim=(1, 2))
+    heavy = weight * residual
+    cost = torch.linalg.vecdot(heavy.flatten(1), residual.flatten(1))
+    apart = lights - problem.anchor
+    cost = cost + (problem.pull * apart.square().sum(dim=2)).sum(dim=1)
+    if problem.prior is not None:
+        bent = shading * apply_packed(problem.prior, shading)
+        cost = cost + bent.sum(dim=(1, 2))
+    return cost, heavy @ shading.mT - problem.pull[..., None] * apart
+
+
+def follow(
+    problem: Bilinear,
+    packed: Float[Tensor, "patch packed sample"],
+    rhs: Float[Tensor, "patch rank sample"],
+    shading: Float[Tensor, "patch rank sample"],
+    steps: int = 1,
+) -> Float[Tensor, "patch rank sample"]:
+    r"""Bring every sample to the minimum of :math:`s^\top A s - 2 b^\top s` on the manifold.
+
+    By Gauss-Newton steps along the manifold, at most as long as their model holds; a sample that
+    a step does not help stays. Exact at once where any vector will do.
+    """
+    if isinstance(problem.manifold, Free):
+        return PackedCholesky(packed, shading.shape[1]).solve(rhs)
+    image = apply_packed(packed, shading)
+    value = _dot(shading, image - 2 * rhs)
+    for step in range(steps):
+        moved = step_along(problem.manifold, packed, rhs - image, shading)
+        reached = apply_packed(packed, moved)
+        after = _dot(moved, reached - 2 * rhs)
+        # The last steps are too small for the value to show.
+        better = (after <= value + 8 * torch.finfo(value.dtype).eps * value.abs())[:, None]
+        shading = torch.where(better, moved, shading)
+        if step + 1 < steps:
+            image = torch.where(better, reached, image)
+            value = torch.where(better[:, 0], after, value)
+    return shading
+
+
+def step_along(
+    manifold: Manifold,
+    packed: Float[Tensor, "patch packed sample"],
+    slope: Float[Tensor, "patch rank sample"],
+    shading: Float[Tensor, "patch rank sample"],
+) -> Float[Tensor, "patch rank sample"]:
+    r"""Take the step :math:`(B^\top A B)^{-1} B^\top r`, ``B`` the manifold's tangents.
+
+    Args:
+        manifold: Along which to go.
+        packed: ``A``.
+        slope: ``r = b - A s``.
+        shading: ``s``.
+    """
+    columns = manifold.tangents(shading)
+    descent = torch.stack([_dot(column, slope) for column in columns], dim=1)
+    curvature = congruence(packed, columns)
+    damped = curvature.clone()
+    size = len(columns)
+    damped[:, diagonal(size)] += 1e-9 * curvature[:, diagonal(size)].sum(dim=1, keepdim=True)
+    step = PackedCholesky(damped, size).solve(descent)
+    length = _dot(step, step).detach().sqrt()[:, None]
+    limit = LONGEST_STEP * manifold.split(shading.mT)[0].detach()[:, None]
+    step = step * torch.where(length > limit, limit / length.clamp_min(1e-30), 1)
+    moved = shading
+    for place, column in enumerate(columns):
+        moved = moved + column * step[:, place : place + 1]
+    return manifold.retract(moved.mT).mT
+
+
+def keep_scale(
+    problem: Bilinear,
+    before: Float[Tensor, "patch view rank"],
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch rank sample"]]:
+    """Hold the size of the lights where nothing else does, and shrink shading by as much."""
+    was, size = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
+    loose = (problem.pull.amax(dim=1) == 0) & (size > 0) & (was > 0)
+    factor = torch.where(loose, (was / torch.where(size > 0, size, 1)).sqrt(), 1)[:, None, None]
+    return lights * factor, shading / factor
 
 
 def finish(
     problem: Bilinear,
-    lights: Float[Tensor, "patch view 4"],
-    shading: Float[Tensor, "patch 4 sample"],
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
     iterations: Int[Tensor, " patch"],
-    limit: int,
+    cause: Int[Tensor, " patch"],
 ) -> Factors:
     """Put the solution in its record."""
     residual = problem.radiance - lights @ shading
-    count = problem.weight.sum(dim=(1, 2)).clamp_min(1)
-    rms = ((problem.weight * residual**2).sum(dim=(1, 2)) / count).sqrt()
+    count = problem.weight.sum(dim=(1, 2))
+    total = (problem.weight * residual**2).sum(dim=(1, 2))
+    rms = (total / torch.where(count > 0, count, 1)).sqrt()
+    empty = torch.full_like(cause, int(StopCause.EMPTY))
     convergence = Convergence(
-        iterations=iterations, residual=rms.detach(), converged=iterations < limit
+        iterations=iterations,
+        residual=rms.detach(),
+        cause=torch.where(count > 0, cause, empty),
     )
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
+
+
+def _dot(
+    first: Float[Tensor, "patch component sample"], second: Float[Tensor, "patch component sample"]
+) -> Float[Tensor, "patch sample"]:
+    # Component by component: several times as fast as a sum over this axis.
+    total = torch.zeros_like(second[:, 0])
+    for a, b in zip(first.unbind(dim=1), second.unbind(dim=1), strict=True):
+        total = torch.addcmul(total, a, b)
+    return total
 
 
 def _spread(

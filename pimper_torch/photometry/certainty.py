@@ -1,4 +1,4 @@
-"""The last word on every sample: the exact minimum on the cone, and how sure it is."""
+"""The last word on every sample: the exact minimum on the manifold, and how sure it is."""
 
 import math
 from dataclasses import dataclass
@@ -7,26 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.bilinear import (
-    Bilinear,
-    Factors,
-    equations_of_samples,
-    geometry_of_samples,
-)
-from pimper_torch.photometry.cone import project_to_cone, split_shading, tangent_columns
-from pimper_torch.photometry.quadratics import (
-    apply_packed,
-    congruence,
-    diagonal,
-    solve_packed,
-)
+from pimper_torch.photometry.bilinear import Bilinear, Factors, equations_of_samples, step_along
+from pimper_torch.photometry.quadratics import apply_packed, congruence, diagonal, solve_packed
 from pimper_torch.records import Record
 
 # A normal whose standard error is this counts half.
 HALF_CONFIDENCE_DEG = 8.0
-
-# A step longer than this, in radians, is not Newton's last: the model there is no model.
-LONGEST_STEP = 0.3
 
 # A sample's own residuals are few; the patch's spread joins as if it were so many views.
 BORROWED_VIEWS = 4.0
@@ -47,10 +33,10 @@ class Certain(Record):
     confidence: Float[Tensor, "patch sample"]
 
 
-def refine_on_cone(problem: Bilinear, factors: Factors) -> Certain:
-    r"""Take each sample's Newton step along the cone, with lights and weights given.
+def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
+    r"""Take each sample's Newton step along the manifold, with lights and weights given.
 
-    With ``A`` and ``b`` the sample's normal equations and ``B`` the cone's tangents,
+    With ``A`` and ``b`` the sample's normal equations and ``B`` the manifold's tangents,
     :math:`\delta = (B^\top A B)^{-1} B^\top (b - A n)`. At a converged solution the step is
     next to nothing, but its derivative by the radiances is the implicit function's (Gauss-
     Newton's approximation, lights held): this step is what gradients go through.
@@ -62,23 +48,12 @@ def refine_on_cone(problem: Bilinear, factors: Factors) -> Certain:
     brightness and small residuals all raise it. Confidence is constant to autograd.
     """
     A, b = equations_of_samples(problem, factors.lights, factors.weight)
-    A = A + geometry_of_samples(problem)
-    columns = tangent_columns(factors.shading)
-    curvature = congruence(A, columns)
     slope = b - apply_packed(A, factors.shading)
-    descent = torch.stack([(column * slope).sum(dim=1) for column in columns], dim=1)
-    damped = curvature.clone()
-    damped[:, diagonal(3)] += 1e-9 * curvature[:, diagonal(3)].sum(dim=1, keepdim=True)
-    step = solve_packed(damped, descent)
-    size = step.norm(dim=1, keepdim=True).detach()
-    limit = LONGEST_STEP * factors.shading[:, :1]
-    step = step * torch.where(size > limit, limit / size.clamp_min(1e-30), 1)
-    moved = factors.shading
-    for place, column in enumerate(columns):
-        moved = moved + column * step[:, place : place + 1]
-    albedo, normals = split_shading(project_to_cone(moved.mT))
+    moved = step_along(problem.manifold, A, slope, factors.shading)
+    albedo, normals = problem.manifold.split(moved.mT)
     with torch.no_grad():
-        error = _standard_error(problem, factors, damped)
+        curvature = congruence(A, problem.manifold.tangents(factors.shading))
+        error = _standard_error(problem, factors, curvature)
         half = math.radians(HALF_CONFIDENCE_DEG)
         confidence = 1 / (1 + (error / half) ** 2)
     return Certain(albedo=albedo, normals=normals, confidence=confidence.nan_to_num(nan=0.0))
@@ -103,7 +78,7 @@ def fit_albedo(
 
 
 def light_varies(
-    lights: Float[Tensor, "patch view 4"],
+    lights: Float[Tensor, "patch view rank"],
     share: Float[Tensor, "patch view"],
     least: float,
 ) -> Bool[Tensor, " patch"]:
@@ -116,12 +91,14 @@ def light_varies(
     unit = (lights / lights.norm(dim=2, keepdim=True).clamp_min(1e-30)).double()
     moment = unit.mT @ (share.double()[..., None] * unit)
     values = torch.linalg.eigvalsh(moment).clamp_min(0)
-    return (values[:, 1] > 0) & (values[:, 1] >= least**2 * values[:, 3])
+    return (values[:, -3] > 0) & (values[:, -3] >= least**2 * values[:, -1])
 
 
 def _standard_error(
     problem: Bilinear, factors: Factors, curvature: Float[Tensor, "patch 6 sample"]
 ) -> Float[Tensor, "patch sample"]:
+    damped = curvature.clone()
+    damped[:, diagonal(3)] += 1e-9 * curvature[:, diagonal(3)].sum(dim=1, keepdim=True)
     residual = problem.radiance - factors.lights @ factors.shading
     square = (factors.weight * residual**2).sum(dim=1)
     count = factors.weight.sum(dim=1)
@@ -134,8 +111,8 @@ def _standard_error(
     for place in (1, 2):
         unit = torch.zeros_like(factors.shading[:, :3])
         unit[:, place] = 1
-        variance = variance + solve_packed(curvature, unit)[:, place]
-    albedo = factors.shading[:, 0]
+        variance = variance + solve_packed(damped, unit)[:, place]
+    albedo, _ = problem.manifold.split(factors.shading.mT)
     some = albedo > 0
     error = (spread * variance).clamp_min(0).sqrt() / torch.where(some, albedo, 1)
     return torch.where(some & (variance > 0), error, torch.inf)

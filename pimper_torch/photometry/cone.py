@@ -4,7 +4,7 @@ It is a cone of light in four dimensions: the time axis is albedo, the space axe
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -32,13 +32,11 @@ def project_to_cone(shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
     >>> project_to_cone(torch.tensor([1.0, 0.0, 0.0, -3.0]))
     tensor([ 2.,  0.,  0., -2.])
     """
-    scalar, vector = shading[..., :1], shading[..., 1:]
-    directed = (vector != 0).any(dim=-1, keepdim=True)
-    safe = torch.where(directed, vector, 1)  # the norm has no gradient at zero
-    length = _length(safe)
+    scalar, *vector = shading.unbind(dim=-1)
+    length, directed = _length(vector)
     albedo = torch.where(directed, (scalar + length).clamp_min(0) / 2, 0)
-    normal = torch.where(directed, safe / length, 0)
-    return torch.cat([albedo, albedo * normal], dim=-1)
+    ratio = albedo / length
+    return _vectors([albedo, *(torch.where(directed, part, 0) * ratio for part in vector)])
 
 
 def split_shading(
@@ -48,16 +46,9 @@ def split_shading(
 
     A vector without direction gives the normal zero. Differentiable away from the apex.
     """
-    vector = shading[..., 1:]
-    directed = (vector != 0).any(dim=-1, keepdim=True)
-    safe = torch.where(directed, vector, 1)
-    return shading[..., 0], torch.where(directed, safe / _length(safe), 0)
-
-
-def _length(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
-    # Component by component in memory, where torch's norm takes twice as long.
-    x, y, z = vector.unbind(dim=-1)
-    return (x * x + y * y + z * z).sqrt()[..., None]
+    albedo, *vector = shading.unbind(dim=-1)
+    length, directed = _length(vector)
+    return albedo, _vectors([torch.where(directed, part / length, 0) for part in vector])
 
 
 def tangents(
@@ -73,8 +64,8 @@ def tangents(
     sign = torch.where(z >= 0, 1.0, -1.0).to(normals.dtype)
     a = -1 / (sign + z)
     b = x * y * a
-    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], dim=-1)
-    second = torch.stack([b, sign + y * y * a, -y], dim=-1)
+    first = _vectors([1 + sign * x * x * a, sign * b, -sign * x])
+    second = _vectors([b, sign + y * y * a, -y])
     return first, second
 
 
@@ -87,9 +78,23 @@ def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
     """
     _, normal = split_shading(shading.mT)
     first, second = tangents(normal)
-    still = torch.zeros_like(first[..., :1])
+    still = torch.zeros_like(first[..., 0])
     return [
-        torch.cat([torch.ones_like(still), normal], dim=-1).mT,
-        torch.cat([still, first], dim=-1).mT,
-        torch.cat([still, second], dim=-1).mT,
+        torch.stack([still + 1, *normal.unbind(dim=-1)], dim=-2),
+        torch.stack([still, *first.unbind(dim=-1)], dim=-2),
+        torch.stack([still, *second.unbind(dim=-1)], dim=-2),
     ]
+
+
+def _length(vector: list[Tensor]) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
+    """Give lengths, of vectors without direction any, and which vectors have one."""
+    x, y, z = vector
+    square = x * x + y * y + z * z
+    directed = square > 0
+    # The root has no gradient at zero.
+    return torch.where(directed, square, 1).sqrt(), directed
+
+
+def _vectors(parts: list[Tensor]) -> Float[Tensor, "..."]:
+    """Put components together, each in one piece of memory, as products with lights want."""
+    return torch.stack(parts, dim=-2).mT if parts[0].ndim else torch.stack(parts)

@@ -1,27 +1,47 @@
 """Factorization by gradient descent with projection: the second opinion.
 
 The gradient comes from autograd, so that another loss or a learned prior is one more term of
-the objective. Each step goes down the gradient along the cone, scaled by the curvature of
-its own block, and is projected back on the cone.
+the objective. Each step goes down the gradient along the manifold, scaled by the curvature of
+its own block, and is brought back to the manifold: Riemannian descent.
+
+Source: Absil, Mahony & Sepulchre, Optimization Algorithms on Matrix Manifolds, 2008.
 """
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.photometry.balm import REWEIGH_EVERY
 from pimper_torch.photometry.bilinear import (
+    REWEIGH_EVERY,
     Bilinear,
     Factors,
     equations_of_samples,
     equations_of_views,
     finish,
-    geometry_of_samples,
     objective,
     reweigh,
 )
-from pimper_torch.photometry.cone import project_to_cone, tangent_columns
+from pimper_torch.photometry.iteration import RUNNING, iterate
 from pimper_torch.photometry.quadratics import congruence, solve_packed
+from pimper_torch.photometry.robust import Squares
+from pimper_torch.records import Record, StopCause
+
+# A step that must be this much shorter than Newton's to descend does not descend.
+_SHORTEST_STRIDE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _State(Record):
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    before_lights: Float[Tensor, "patch view rank"]
+    before_shading: Float[Tensor, "patch rank sample"]
+    weight: Float[Tensor, "patch view sample"]
+    cost: Float[Tensor, " patch"]
+    momentum: Float[Tensor, " patch"]
+    stride: Float[Tensor, " patch"]
 
 
 def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> Factors:
@@ -34,57 +54,74 @@ def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> F
             share of their length.
 
     Returns:
-        Factors with ``N`` on the cone; the same minimum as BALM's where there is one.
+        Factors with ``N`` on the manifold; the same minimum as BALM's where there is one.
 
     Half a Newton step of every block is tried, as two blocks curve into each other at most
     by that; where it fails to descend, half of it. Momentum (Nesterov's) restarts in a patch
-    whose objective went up. Constant to autograd. Patches do not influence one another, save
-    that all go on until the last.
+    whose objective went up. Constant to autograd. Patches do not influence one another.
     """
+
+    def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
+        state, better = _step(work, state)
+        if not isinstance(work.loss, Squares) and step % REWEIGH_EVERY == REWEIGH_EVERY - 1:
+            weight = reweigh(work, state.lights, state.shading)
+            cost = objective(work, state.lights, state.shading, weight)
+            state = state.replace(weight=weight, cost=cost)
+        size = state.shading.norm(dim=(1, 2)).clamp_min(torch.finfo(weight_type).tiny ** 0.5)
+        change = (state.shading - state.before_shading).norm(dim=(1, 2)) / size
+        done = better & (change <= tolerance)
+        cause = torch.where(done, int(StopCause.CONVERGED), RUNNING)
+        stalled = (state.stride < _SHORTEST_STRIDE) & ~done
+        return state, torch.where(stalled, int(StopCause.STALLED), cause)
+
     lights, shading = problem.lights.detach(), problem.shading.detach()
+    weight_type = lights.dtype
     weight = reweigh(problem, lights, shading)
-    before_lights, before_shading = lights, shading
-    momentum = torch.ones(len(lights), dtype=lights.dtype, device=lights.device)
-    stride = torch.full_like(momentum, 0.5)
-    cost = objective(problem, lights, shading, weight)
-    taken = torch.full((len(lights),), max_iterations, device=lights.device)
-    for step in range(max_iterations):
-        following = (1 + (1 + 4 * momentum**2).sqrt()) / 2
-        push = ((momentum - 1) / following)[:, None, None]
-        ahead_lights = lights + push * (lights - before_lights)
-        ahead_shading = shading + push * (shading - before_shading)
-        moved = _descend(problem, ahead_lights, ahead_shading, weight, stride)
-        found = objective(problem, *moved, weight)
-        better = found <= cost
-        shorter = torch.where(momentum == 1, stride / 2, stride)
-        stride = torch.where(better, (1.2 * stride).clamp_max(0.5), shorter)
-        momentum = torch.where(better, following, 1.0).to(lights.dtype)
-        keep = better[:, None, None]
-        before_lights, before_shading = lights, shading
-        lights = torch.where(keep, moved[0], lights)
-        shading = torch.where(keep, moved[1], shading)
-        cost = torch.where(better, found, cost)
-        if problem.robust_scale is not None and step % REWEIGH_EVERY == REWEIGH_EVERY - 1:
-            weight = reweigh(problem, lights, shading)
-            cost = objective(problem, lights, shading, weight)
-        size = shading.norm(dim=(1, 2)).clamp_min(torch.finfo(shading.dtype).tiny ** 0.5)
-        change = (shading - before_shading).norm(dim=(1, 2)) / size
-        small = (better & (change <= tolerance)) | (stride < 1e-6)
-        done = small & (taken == max_iterations)
-        taken = torch.where(done, step + 1, taken)
-        if (taken < max_iterations).all():
-            break
-    return finish(problem, lights, shading, weight, taken, max_iterations)
+    one = torch.ones_like(weight[:, 0, 0])
+    start = _State(
+        lights=lights,
+        shading=shading,
+        before_lights=lights,
+        before_shading=shading,
+        weight=weight,
+        cost=objective(problem, lights, shading, weight),
+        momentum=one,
+        stride=one / 2,
+    )
+    state, taken, cause = iterate(problem, start, advance, max_iterations)
+    return finish(problem, state.lights, state.shading, state.weight, taken, cause)
+
+
+def _step(problem: Bilinear, state: _State) -> tuple[_State, Tensor]:
+    following = (1 + (1 + 4 * state.momentum**2).sqrt()) / 2
+    push = ((state.momentum - 1) / following)[:, None, None]
+    lights = state.lights + push * (state.lights - state.before_lights)
+    shading = state.shading + push * (state.shading - state.before_shading)
+    moved = _descend(problem, lights, shading, state.weight, state.stride)
+    found = objective(problem, *moved, state.weight)
+    better = found <= state.cost
+    shorter = torch.where(state.momentum == 1, state.stride / 2, state.stride)
+    keep = better[:, None, None]
+    state = state.replace(
+        lights=torch.where(keep, moved[0], state.lights),
+        shading=torch.where(keep, moved[1], state.shading),
+        before_lights=state.lights,
+        before_shading=state.shading,
+        cost=torch.where(better, found, state.cost),
+        momentum=torch.where(better, following, 1.0).to(lights.dtype),
+        stride=torch.where(better, (1.2 * state.stride).clamp_max(0.5), shorter),
+    )
+    return state, better
 
 
 def _descend(
     problem: Bilinear,
-    lights: Float[Tensor, "patch view 4"],
-    shading: Float[Tensor, "patch 4 sample"],
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
     stride: Float[Tensor, " patch"],
-) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
-    shading = project_to_cone(shading.mT).mT
+) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch rank sample"]]:
+    shading = problem.manifold.retract(shading.mT).mT
     with torch.enable_grad():
         L, N = lights.detach().requires_grad_(), shading.detach().requires_grad_()
         total = objective(problem, L, N, weight).sum()
@@ -93,10 +130,10 @@ def _descend(
     part = stride[:, None, None] / 2
     per_view, _ = equations_of_views(problem, shading, weight)
     per_sample, _ = equations_of_samples(problem, lights, weight)
-    columns = tangent_columns(shading)
-    along = congruence(per_sample + geometry_of_samples(problem), columns)
+    columns = problem.manifold.tangents(shading)
+    along = congruence(per_sample, columns)
     slope = torch.stack([(column * on_shading).sum(dim=1) for column in columns], dim=1)
     down = solve_packed(along, part * slope)
     step = sum((column * down[:, None, i] for i, column in enumerate(columns)), start=0 * shading)
     lights = lights - solve_packed(per_view, part * on_lights.mT).mT
-    return lights, project_to_cone((shading - step).mT).mT
+    return lights, problem.manifold.retract((shading - step).mT).mT

@@ -2,7 +2,9 @@
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -12,15 +14,19 @@ from torch import Tensor, nn
 from pimper_torch.config import require
 from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.frames import invert_rigid, rotate
+from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
-from pimper_torch.photometry.bilinear import Bilinear, Factors, select
-from pimper_torch.photometry.certainty import fit_albedo, light_varies, refine_on_cone
+from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver, select
+from pimper_torch.photometry.certainty import fit_albedo, light_varies, refine_on_manifold
 from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.light_field import LightField, faces_lamp
 from pimper_torch.photometry.lights import fit_light_field
+from pimper_torch.photometry.manifolds import Cone
+from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Loss, Squares
 from pimper_torch.photometry.rows import Rows, coarse_normals, on_raster, rows_of
 from pimper_torch.photometry.starts import start_from_data, start_from_mesh
+from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.progress import track
 from pimper_torch.records import (
     Convergence,
@@ -43,6 +49,24 @@ BORROWED_SAMPLES = 16.0
 # Free lights still need a hold where a view has next to no samples: this share of its data.
 LEAST_COUPLING = 1e-6
 
+# The Gauss-Newton matrix of a patch's lights is summed over about this many samples.
+CURVATURE_SAMPLES = 512
+
+SOLVERS: dict[str, Solver] = {
+    "variable-projection": partial(
+        solve_variable_projection, small_steps=1, curvature_samples=CURVATURE_SAMPLES
+    ),
+    "alternation": solve_alternation,
+    "balm": solve_balm,
+    "descent": solve_descent,
+}
+
+LOSSES: dict[str, Callable[[float], Loss]] = {
+    "squares": lambda _: Squares(),
+    "cauchy": Cauchy,
+    "geman-mcclure": GemanMcClure,
+}
+
 # The spread of a patch's residuals is read off about this many samples.
 SPREAD_SAMPLES = 512
 
@@ -51,8 +75,8 @@ SPREAD_SAMPLES = 512
 class FactorizeConfig:
     """Settings of :class:`Factorize`.
 
-    The published method is ``start="svd"``, ``light="soft"``, not robust, ``light_coupling``
-    and ``geometry_weight`` 0.
+    The published method is ``start="svd"``, ``light="soft"``, ``solver="balm"``,
+    ``loss="squares"``, ``light_coupling`` and ``geometry_weight`` 0.
 
     Attributes:
         light: What is fitted to the coarse mesh: ``"soft"``, one first-order light a view all
@@ -61,27 +85,32 @@ class FactorizeConfig:
         start: Where lights and normals start: ``"mesh"``, lights fitted to the coarse
             mesh; ``"svd"``, the data's own factors, whose Lorentz ambiguity is then fixed by
             the lights that the mesh gives.
-        solver: ``"balm"``, augmented Lagrangian; ``"descent"``, autograd with projection.
+        solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
+            eliminated; ``"alternation"``, least squares in turns; ``"balm"``, augmented
+            Lagrangian; ``"descent"``, autograd with projection.
         light_coupling: How strongly each patch's lights hold to those fitted to the mesh,
             in units of the patch's own data; 0 leaves them free, 1e6 fixes them.
         geometry_weight: How strongly normals hold to the coarse ones, in units of one view.
-        robust: Whether highlights and shadows lose weight (Cauchy's loss).
-        robust_scale: Residual, in spreads of the patch's residuals, that halves the weight.
+        loss: How highlights and shadows lose weight: ``"cauchy"``; ``"geman-mcclure"``, more
+            sharply; ``"squares"``, not at all.
+        loss_scale: Of the loss, in standard deviations of the patch's residuals; Cauchy's
+            weight there is a half.
         min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
             and the lights take their share.
         min_light_variation: Third singular value of the lights over the first that a patch
             needs; about the angle, in radians, by which the light moved across its way.
         max_iterations: Of the solver.
-        tolerance: Relative change at which a patch is done.
+        tolerance: Relative change at which a patch is done: of its objective with variable
+            projection and alternation, of its shading vectors with the others.
     """
 
     light: Literal["auto", "soft", "lamp"] = "auto"
     start: Literal["mesh", "svd"] = "mesh"
-    solver: Literal["balm", "descent"] = "balm"
+    solver: Literal["variable-projection", "alternation", "balm", "descent"] = "variable-projection"
     light_coupling: float = 1.0
     geometry_weight: float = 0.1
-    robust: bool = True
-    robust_scale: float = 2.0
+    loss: Literal["squares", "cauchy", "geman-mcclure"] = "cauchy"
+    loss_scale: float = 2.0
     min_views: int = 4
     min_light_variation: float = 0.02
     max_iterations: int = 60
@@ -91,12 +120,12 @@ class FactorizeConfig:
         models = ("auto", "soft", "lamp")
         require(self.light in models, "factorize.light", self.light, "auto, soft or lamp")
         require(self.start in ("mesh", "svd"), "factorize.start", self.start, "mesh or svd")
-        solvers = ("balm", "descent")
-        require(self.solver in solvers, "factorize.solver", self.solver, "balm or descent")
+        require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
+        require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
         coupling, pull = self.light_coupling, self.geometry_weight
         require(coupling >= 0, "factorize.light_coupling", coupling, "0 or more")
         require(pull >= 0, "factorize.geometry_weight", pull, "0 or more")
-        require(self.robust_scale > 0, "factorize.robust_scale", self.robust_scale, "above 0")
+        require(self.loss_scale > 0, "factorize.loss_scale", self.loss_scale, "above 0")
         require(self.min_views >= 3, "factorize.min_views", self.min_views, "3 or more")
         least = self.min_light_variation
         require(0 <= least < 1, "factorize.min_light_variation", least, "in [0, 1)")
@@ -125,7 +154,7 @@ class Factorize(nn.Module):
     as missing.
 
     Differentiable in the radiance through the last step (see
-    :func:`~pimper_torch.photometry.certainty.refine_on_cone`) and the albedo, with lights,
+    :func:`~pimper_torch.photometry.certainty.refine_on_manifold`) and the albedo, with lights,
     weights and gauge held constant.
     """
 
@@ -184,7 +213,7 @@ class Factorize(nn.Module):
         determined = determined & lit.any(dim=1)
         problem = self._problem(rows, anchor, normals.shape[1] * normals.shape[2])
         factors = self._solve(problem)
-        found = refine_on_cone(problem, factors)
+        found = refine_on_manifold(problem, factors)
         sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
         valid = lit & determined[:, None] & sure & (found.normals[..., 2] < 0)
         lights = torch.where(determined[:, None, None], factors.lights, anchor)
@@ -223,23 +252,25 @@ class Factorize(nn.Module):
             pull = max(config.light_coupling, LEAST_COUPLING) * (seen_square + borrowed[:, None])
             views = rows.seen.any(dim=2).sum(dim=1).clamp_min(1)
             level = (anchor**2).sum(dim=(1, 2)) / views
+            prior = None
+            if config.geometry_weight > 0:
+                gamma = config.geometry_weight * level
+                prior = gamma[:, None, None] * Cone().bend(rows.normals.mT)
         return Bilinear(
             radiance=gray,
             weight=weight,
             lights=lights,
             anchor=anchor,
             shading=shading,
-            normals=rows.normals.mT,
             pull=pull,
-            geometry=config.geometry_weight * level,
-            robust_scale=config.robust_scale if config.robust else None,
+            prior=prior,
+            loss=LOSSES[config.loss](config.loss_scale),
             stride=max(1, raster // SPREAD_SAMPLES),
         )
 
     def _solve(self, problem: Bilinear) -> Factors:
-        solve = {"balm": solve_balm, "descent": solve_descent}[self.config.solver]
         data = problem.replace(radiance=problem.radiance.detach())
-        return solve(data, self.config.max_iterations, self.config.tolerance)
+        return SOLVERS[self.config.solver](data, self.config.max_iterations, self.config.tolerance)
 
     def _field(self, seen: PatchViews, coarse: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
         """Fit the light field to samples spread evenly over the facets themselves."""
@@ -291,7 +322,7 @@ def _joined(chunks: list[Photometry]) -> Photometry:
         convergence=Convergence(
             iterations=torch.cat([chunk.convergence.iterations for chunk in chunks]),
             residual=torch.cat([chunk.convergence.residual for chunk in chunks]),
-            converged=torch.cat([chunk.convergence.converged for chunk in chunks]),
+            cause=torch.cat([chunk.convergence.cause for chunk in chunks]),
         ),
     )
 

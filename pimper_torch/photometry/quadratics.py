@@ -34,12 +34,12 @@ def apply_packed(
     """Multiply each packed matrix with its vector."""
     size = vectors.shape[-2]
     rows, columns = _triangle(size)
-    total = [torch.zeros_like(vectors[..., 0, :]) for _ in range(size)]
+    total = [torch.zeros_like(vectors[..., 0, :] * packed[..., 0, :]) for _ in range(size)]
     for place, (row, column) in enumerate(zip(rows, columns, strict=True)):
         entry = packed[..., place, :]
-        total[row] = total[row] + entry * vectors[..., column, :]
+        total[row] = torch.addcmul(total[row], entry, vectors[..., column, :])
         if row != column:
-            total[column] = total[column] + entry * vectors[..., row, :]
+            total[column] = torch.addcmul(total[column], entry, vectors[..., row, :])
     return torch.stack(total, dim=-2)
 
 

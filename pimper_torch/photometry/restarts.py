@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.low_rank import LowRank, random_left
+from pimper_torch.photometry.bilinear import Factors
+from pimper_torch.photometry.low_rank import low_rank_problem, random_left
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
 
@@ -20,13 +21,13 @@ class Restarted(Record):
     """The best of several factorizations of one matrix.
 
     Attributes:
-        best: A batch of one.
+        best: A batch of one, rows as views and columns as samples.
         residuals: Of all starts, in their order.
         repeated: Whether the best minimum was reached as often as asked; else a better one
             may well have been missed.
     """
 
-    best: LowRank
+    best: Factors
     residuals: Float[Tensor, " start"]
     repeated: bool
 
@@ -64,16 +65,15 @@ def factorize_from_many(
         raise InputError(
             f"repeats is {repeats} and max_starts {max_starts}; needed: 1 <= repeats <= max_starts."
         )
-    best: LowRank | None = None
+    best: Factors | None = None
     residuals: list[float] = []
     repeated = False
     seen = weight > 0
     level = float((weight[seen] * matrix[seen].square()).sum() / weight[seen].sum()) ** 0.5
     while len(residuals) < max_starts:
         start = random_left(1, matrix.shape[0], rank, generator).to(matrix.device)
-        found = solve_variable_projection(
-            matrix[None], weight[None], start, max_iterations, tolerance
-        )
+        problem = low_rank_problem(matrix[None], weight[None], start)
+        found = solve_variable_projection(problem, max_iterations, tolerance)
         residuals.append(float(found.convergence.residual))
         if best is None or residuals[-1] < float(best.convergence.residual):
             best = found

@@ -1,8 +1,70 @@
-"""Weights that make a least-squares fit indifferent to outliers."""
+"""Losses that make a least-squares fit indifferent to outliers."""
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from pimper_torch.config import require
+
+
+@dataclass(frozen=True, slots=True)
+class Squares:
+    """Plain least squares: every residual counts by its square."""
+
+    def weights(
+        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Weigh all residuals by 1."""
+        return torch.ones_like(residual)
+
+
+@dataclass(frozen=True, slots=True)
+class Cauchy:
+    r"""Cauchy's loss :math:`\tfrac{s^2}{2} \log(1 + (r / s)^2)`: outliers still pull a little.
+
+    Attributes:
+        scale: ``s`` in standard deviations of the residuals.
+    """
+
+    scale: float = 2.385  # 95 % efficient on Gaussian noise
+
+    def __post_init__(self) -> None:
+        require(self.scale > 0, "scale", self.scale, "above 0")
+
+    def weights(
+        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Weigh residuals for iterated least squares, by 1 at 0."""
+        return cauchy_weights(residual, self.scale * deviation)
+
+
+@dataclass(frozen=True, slots=True)
+class GemanMcClure:
+    r"""Geman & McClure's loss :math:`\tfrac12 r^2 / (1 + (r / s)^2)`: outliers cease to pull.
+
+    It has more bad minima than Cauchy's, and wants a good start.
+
+    Attributes:
+        scale: ``s`` in standard deviations of the residuals.
+
+    Source: Geman & McClure, Bulletin of the ISI 52(4), 1987.
+    """
+
+    scale: float = 3.79  # 95 % efficient on Gaussian noise
+
+    def __post_init__(self) -> None:
+        require(self.scale > 0, "scale", self.scale, "above 0")
+
+    def weights(
+        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Weigh residuals for iterated least squares, by 1 at 0."""
+        return cauchy_weights(residual, self.scale * deviation).square()
+
+
+Loss = Squares | Cauchy | GemanMcClure
 
 
 def spread(

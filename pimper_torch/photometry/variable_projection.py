@@ -1,141 +1,258 @@
-r"""Damped variable projection: the right factor eliminated, Gauss-Newton on the left one.
+r"""Damped variable projection: shading eliminated, Gauss-Newton on the lights.
 
-With :math:`R(L)` the best right factor, :math:`f(L) = \lVert \sqrt W (X - L R(L)) \rVert^2` has
-far fewer unknowns and far fewer bad minima than the joint problem. The Gauss-Newton matrix of
-f, in Ruhe and Wedin's second approximation, is
+With :math:`N(L)` the best shading vectors for the lights, :math:`f(L) = \lVert \sqrt W (J - L
+N(L)) \rVert^2` has far fewer unknowns and far fewer bad minima than the joint problem. Its
+Gauss-Newton matrix, in Ruhe and Wedin's second approximation, is
 
-.. math:: H = \sum_k (r_k r_k^\top) \otimes (W_k - W_k L A_k^{-1} L^\top W_k),
-          \quad A_k = L^\top W_k L,
+.. math:: H = \sum_k (n_k n_k^\top) \otimes
+          (W_k - W_k L B_k (B_k^\top L^\top W_k L B_k)^{-1} B_k^\top L^\top W_k)
 
-for columns k. Its null space, the invertible matrices between the factors, is left to the
-damping and to the QR decomposition after each step.
+for samples k, with ``B`` the tangents of their manifold: all directions in low-rank
+factorization, three on the photometric cone. What a factorization leaves free (an invertible
+matrix, a Lorentz transformation) is its null space, and left to the damping.
 
 Source: Ruhe & Wedin, SIAM Review 22(3), 1980; Okatani, Yoshida & Deguchi, ICCV 2011; Hong &
-Fitzgibbon, ICCV 2015.
+Fitzgibbon, ICCV 2015. That it runs on the tangents of the cone is ours.
 """
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.photometry.low_rank import (
-    LowRank,
-    checked,
-    finished,
-    solve_right,
-    squared_error,
+from pimper_torch.photometry.bilinear import (
+    Bilinear,
+    Factors,
+    equations_of_samples,
+    evaluate,
+    finish,
+    follow,
+    keep_scale,
+    reweigh,
 )
-from pimper_torch.photometry.quadratics import PackedCholesky
+from pimper_torch.photometry.iteration import RUNNING, iterate
+from pimper_torch.photometry.manifolds import Free
+from pimper_torch.photometry.quadratics import PackedCholesky, congruence, diagonal
+from pimper_torch.photometry.robust import Squares
+from pimper_torch.records import Record, StopCause
 
 # The damping starts at this share of the mean curvature; it falls and rises by the factors below.
 # Of starts from 1e-4 to 1e-2 and factors from 3 to 10 these led most random starts to the best
 # minimum known (9 of 10 on dino_trimmed; 10 and 1e-3 led 5 there).
 _FIRST_DAMPING = 1e-2
 _LESS, _MORE = 0.2, 5.0
-_MOST_DAMPING = 1e16
 
-# A matrix is done when so many accepted steps in a row gained less than the tolerance: one small
-# step may be the end of a bend in the valley.
-_SMALL_STEPS = 3
+# Steps of the samples along their manifold after each step of the lights.
+_FOLLOWING = 2
+
+# Residuals of so many roundings of the data are zero.
+_ROUNDINGS = 30.0
 
 # Entries of the Gauss-Newton matrices' factors that are held at once.
 _CHUNK_ENTRIES = 20_000_000
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _State(Record):
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    weight: Float[Tensor, "patch view sample"]
+    energy: Float[Tensor, " patch"]
+    cost: Float[Tensor, " patch"]
+    slope: Float[Tensor, "patch view rank"]
+    curvature: Float[Tensor, "patch unknown unknown"]
+    damping: Float[Tensor, " patch"]
+    small: Int[Tensor, " patch"]
+
+
 def solve_variable_projection(
-    matrix: Float[Tensor, "batch row column"],
-    weight: Float[Tensor, "batch row column"],
-    start: Float[Tensor, "batch row rank"],
+    problem: Bilinear,
     max_iterations: int = 300,
     tolerance: float = 1e-9,
-) -> LowRank:
-    """Factorize a batch of matrices with missing entries by damped variable projection.
+    *,
+    small_steps: int = 3,
+    curvature_samples: int | None = None,
+) -> Factors:
+    """Factorize a batch of patches by damped variable projection.
 
     Args:
-        matrix: Entries without weight do not matter.
-        weight: 0 where missing.
-        start: Left factors of full rank; see :func:`~pimper_torch.photometry.low_rank.random_left`.
+        problem: With its start. In low-rank factorization only the lights matter, which must
+            be of full rank; see :func:`~pimper_torch.photometry.low_rank.random_left`.
         max_iterations: Steps at most.
-        tolerance: A matrix is done when three accepted steps in a row gained less than this
-            share of its squared error.
+        tolerance: A step that lowered a patch's objective by less than this share is small.
+        small_steps: A patch is done after so many of them in a row: one may be the end of a
+            bend in the valley.
+        curvature_samples: The Gauss-Newton matrix, most of the work, is summed over about so
+            many samples of a patch, and over all if ``None``. It steers the steps only: where
+            they end does not depend on it.
 
     Returns:
-        Factors in float64, the left ones with orthonormal columns. A minimum, which may be a
-        bad one: start from several places.
+        A minimum, which may be a bad one: start well, or from several places. Without pull
+        low-rank lights are orthonormal, and others keep their size.
 
-    Raises:
-        InputError: A rank, weights or entries that make no sense.
-
-    Constant to autograd. Matrices do not influence one another.
+    Constant to autograd. Patches do not influence one another.
     """
+
+    def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
+        return _step(work, state, tolerance, small_steps, curvature_samples)
+
     with torch.no_grad():
-        matrix, weight = checked(matrix, weight, start.shape[-1])
-        left = torch.linalg.qr(start.double()).Q
-        right, factored = solve_right(matrix, weight, left)
-        error = squared_error(matrix, weight, left, right)
-        damping = torch.full_like(error, _FIRST_DAMPING)
-        small = torch.zeros_like(error)
-        taken = torch.full_like(error, max_iterations).long()
-        running = torch.ones_like(error, dtype=torch.bool)
-        system = _equations(matrix, weight, left, right, factored)
-        for step in range(max_iterations):
-            moved = torch.linalg.qr(left + _move(*system, damping)).Q
-            tried, tried_factors = solve_right(matrix, weight, moved)
-            after = squared_error(matrix, weight, moved, tried)
-            better = running & (after < error)
-            gain = (error - after) / error.clamp_min(torch.finfo(error.dtype).tiny)
-            small = torch.where(better, torch.where(gain < tolerance, small + 1, 0), small)
-            left = torch.where(better[:, None, None], moved, left)
-            error = torch.where(better, after, error)
-            damping = damping * torch.where(better, _LESS, _MORE)
-            ended = running & ((small >= _SMALL_STEPS) | (damping > _MOST_DAMPING) | (error == 0))
-            taken[ended] = step + 1
-            running = running & ~ended
-            if not bool(running.any()):
-                break
-            if bool(better.any()):
-                if not bool(better.all()):
-                    tried, tried_factors = solve_right(matrix, weight, left)
-                system = _equations(matrix, weight, left, tried, tried_factors)
-        return finished(matrix, weight, left, taken, max_iterations)
+        state = _start(problem, curvature_samples)
+        state, taken, cause = iterate(problem, state, advance, max_iterations)
+        return finish(problem, state.lights, state.shading, state.weight, taken, cause)
 
 
-def _equations(
-    matrix: Float[Tensor, "batch row column"],
-    weight: Float[Tensor, "batch row column"],
-    left: Float[Tensor, "batch row rank"],
-    right: Float[Tensor, "batch rank column"],
-    factored: PackedCholesky,
-) -> tuple[Float[Tensor, "batch unknown unknown"], Float[Tensor, "batch row rank"]]:
-    """Give the Gauss-Newton matrix, unknowns row by row, and the descent direction."""
-    batch, rows, rank = left.shape
-    residual = weight * (matrix - left @ right)
-    descent = residual @ right.mT
-    # (w_fk r_k r_k^T) on the diagonal blocks, one a row of the matrix.
-    products = (right[:, :, None] * right[:, None]).flatten(1, 2)
-    blocks = (weight @ products.mT).reshape(batch, rows, rank, rank)
-    normal = matrix.new_zeros(batch, rows, rank, rows, rank)
-    index = torch.arange(rows, device=matrix.device)
+def curvature_of_lights(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+    weight: Float[Tensor, "patch view sample"],
+    samples: int | None = None,
+) -> Float[Tensor, "patch unknown unknown"]:
+    """Give the Gauss-Newton matrices ``H``, unknowns view by view, pull included.
+
+    Args:
+        problem: Its manifold, pull and prior.
+        lights: At which to linearise.
+        shading: The best for the lights.
+        weight: Of each entry.
+        samples: Sum over about so many, evenly chosen, in place of all.
+    """
+    batch, views, rank = lights.shape
+    stride = max(1, shading.shape[2] // samples) if samples else 1
+    some = problem.replace(
+        radiance=problem.radiance[:, :, ::stride],
+        prior=None if problem.prior is None else problem.prior[:, :, ::stride],
+    )
+    shading, weight = shading[:, :, ::stride], weight[:, :, ::stride]
+    # (w_fk n_k n_k^T) on the diagonal blocks, one a view.
+    products = (shading[:, :, None] * shading[:, None]).flatten(1, 2)
+    blocks = (weight @ products.mT).reshape(batch, views, rank, rank)
+    normal = lights.new_zeros(batch, views, rank, views, rank)
+    index = torch.arange(views, device=lights.device)
     normal[:, index, :, index] = blocks.transpose(0, 1)
-    normal = normal.reshape(batch, rows * rank, rows * rank)
-    # C_k^-1 l_f w_fk, so that products over the rank are w_fk l_f^T A_k^-1 l_g w_gk.
-    white = factored.whiten(left[..., None] * weight[:, :, None])
-    size = max(1, _CHUNK_ENTRIES // (batch * rows * rank * rank))
-    for first in range(0, matrix.shape[2], size):
-        some = slice(first, first + size)
-        spread = white[:, :, None, :, some] * right[:, None, :, None, some]
-        spread = spread.reshape(batch, rows * rank, -1)
+    normal = normal.reshape(batch, views * rank, views * rank)
+    white = _whitened(some, lights, shading, weight)
+    size = max(1, _CHUNK_ENTRIES // (batch * views * rank * white.shape[2]))
+    for first in range(0, shading.shape[2], size):
+        part = slice(first, first + size)
+        spread = white[:, :, None, :, part] * shading[:, None, :, None, part]
+        spread = spread.reshape(batch, views * rank, -1)
         normal = normal - spread @ spread.mT
-    return normal, descent
+    pull = problem.pull[..., None].expand(-1, -1, rank).flatten(1)
+    return stride * normal + torch.diag_embed(pull)
 
 
-def _move(
-    normal: Float[Tensor, "batch unknown unknown"],
-    descent: Float[Tensor, "batch row rank"],
-    damping: Float[Tensor, " batch"],
-) -> Float[Tensor, "batch row rank"]:
+def _step(
+    problem: Bilinear,
+    state: _State,
+    tolerance: float,
+    small_steps: int,
+    curvature_samples: int | None,
+) -> tuple[_State, Int[Tensor, " patch"]]:
+    moved = state.lights + _move(state)
+    shading = state.shading
+    if _is_free(problem):
+        moved = torch.linalg.qr(moved).Q
+    else:
+        moved, shading = keep_scale(problem, state.lights, moved, shading)
+    equations = equations_of_samples(problem, moved, state.weight)
+    shading = follow(problem, *equations, shading, _FOLLOWING)
+    after, slope = evaluate(problem, moved, shading, state.weight)
+    better = after < state.cost
+    gain = (state.cost - after) / state.cost.clamp_min(torch.finfo(after.dtype).tiny)
+    small = torch.where(gain < tolerance, state.small + 1, 0)
+    small = torch.where(better, small, state.small)
+    limit = torch.finfo(after.dtype).eps
+    damping = state.damping * torch.where(better, _LESS, _MORE).to(after)
+    exact = state.cost <= (_ROUNDINGS * limit) ** 2 * state.energy
+    stalled = (damping > 1 / limit) & ~exact
+    state = state.replace(small=small, damping=damping.clamp_min(limit))
+    if bool(better.any()):
+        keep = better[:, None, None]
+        state = state.replace(
+            lights=torch.where(keep, moved, state.lights),
+            shading=torch.where(keep, shading, state.shading),
+            cost=torch.where(better, after, state.cost),
+            slope=torch.where(keep, slope, state.slope),
+        )
+        state = _reweighed(problem, state)
+        state = state.replace(curvature=_curvature(problem, state, curvature_samples))
+    cause = torch.where(stalled, int(StopCause.STALLED), RUNNING)
+    return state, torch.where(exact | (small >= small_steps), int(StopCause.CONVERGED), cause)
+
+
+def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
+    lights = torch.linalg.qr(problem.lights).Q if _is_free(problem) else problem.lights
+    weight = reweigh(problem, lights, problem.shading)
+    equations = equations_of_samples(problem, lights, weight)
+    shading = follow(problem, *equations, problem.shading, _FOLLOWING)
+    cost, slope = evaluate(problem, lights, shading, weight)
+    seen = (weight * problem.radiance).flatten(1)
+    state = _State(
+        lights=lights,
+        shading=shading,
+        weight=weight,
+        energy=torch.linalg.vecdot(seen, problem.radiance.flatten(1)),
+        cost=cost,
+        slope=slope,
+        curvature=lights.new_zeros(len(lights), 0, 0),
+        damping=torch.full_like(cost, _FIRST_DAMPING),
+        small=torch.zeros_like(cost).long(),
+    )
+    return state.replace(curvature=_curvature(problem, state, curvature_samples))
+
+
+def _curvature(
+    problem: Bilinear, state: _State, samples: int | None
+) -> Float[Tensor, "patch unknown unknown"]:
+    return curvature_of_lights(problem, state.lights, state.shading, state.weight, samples)
+
+
+def _reweighed(problem: Bilinear, state: _State) -> _State:
+    """Let robust weights follow the residuals, and the objective them."""
+    if isinstance(problem.loss, Squares):
+        return state
+    weight = reweigh(problem, state.lights, state.shading)
+    cost, slope = evaluate(problem, state.lights, state.shading, weight)
+    return state.replace(weight=weight, cost=cost, slope=slope)
+
+
+def _whitened(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+    weight: Float[Tensor, "patch view sample"],
+) -> Float[Tensor, "patch view tangent sample"]:
+    """Give ``C_k^-1 B_k^T l_f w_fk``, with ``C C^T`` the sample's own normal equations.
+
+    Products of such vectors over the tangents are what eliminating the sample subtracts.
+    """
+    packed, _ = equations_of_samples(problem, lights, weight)
+    size = lights.shape[2]
+    if isinstance(problem.manifold, Free):
+        slopes = lights[..., None] * weight[:, :, None]
+    else:
+        columns = problem.manifold.tangents(shading)
+        size = len(columns)
+        packed = congruence(packed, columns)
+        slopes = torch.stack([(lights @ column) * weight for column in columns], dim=2)
+    packed = packed.clone()
+    packed[:, diagonal(size)] += 1e-12 * packed[:, diagonal(size)].sum(dim=1, keepdim=True)
+    return PackedCholesky(packed[:, None], size).whiten(slopes).to(lights)
+
+
+def _move(state: _State) -> Float[Tensor, "patch view rank"]:
     """Solve for the damped step."""
-    diagonal = normal.diagonal(dim1=1, dim2=2)
-    ridge = damping[:, None] * diagonal.mean(dim=1, keepdim=True).clamp_min(1e-300)
-    damped = normal + torch.diag_embed(ridge.expand_as(diagonal))
-    return torch.linalg.solve(damped, descent.flatten(1)[..., None]).reshape(descent.shape)
+    normal = state.curvature.double()
+    diagonals = normal.diagonal(dim1=1, dim2=2)
+    ridge = state.damping[:, None] * diagonals.mean(dim=1, keepdim=True).clamp_min(1e-300)
+    damped = normal + torch.diag_embed(ridge.expand_as(diagonals))
+    rhs = state.slope.double().flatten(1)[..., None]
+    return torch.linalg.solve(damped, rhs).reshape(state.slope.shape).to(state.slope)
+
+
+def _is_free(problem: Bilinear) -> bool:
+    """Tell whether lights are free up to any invertible matrix."""
+    return isinstance(problem.manifold, Free) and not bool((problem.pull > 0).any())

@@ -9,6 +9,7 @@ from pimper_torch.records.patches import (
     PhotometricPatches,
     Photometry,
     Registered,
+    StopCause,
     Surface,
     Templates,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "Registered",
     "SparseScene",
     "StageReport",
+    "StopCause",
     "Surface",
     "Templates",
     "Truth",

@@ -8,6 +8,7 @@ plane z = 0 and its outward normal is -z. A depth on the template is a coordinat
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -95,6 +96,19 @@ class PatchViews(Record):
     buckets: tuple[Registered, ...]
 
 
+class StopCause(IntEnum):
+    """Why an iteration ended."""
+
+    CONVERGED = 0
+    """Its steps became smaller than the tolerance."""
+    STALLED = 1
+    """No step descends any more, as rounding is reached."""
+    LIMIT = 2
+    """The limit of iterations stopped it."""
+    EMPTY = 3
+    """There was nothing to fit."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Convergence(Record):
     """How an iteration ended, one entry a problem of the batch.
@@ -102,12 +116,17 @@ class Convergence(Record):
     Attributes:
         iterations: Taken until it stopped.
         residual: Root mean square over what was observed, in the units of the data.
-        converged: False where the limit of iterations stopped it.
+        cause: A :class:`StopCause` each.
     """
 
     iterations: Int[Tensor, " patch"]
     residual: Float[Tensor, " patch"]
-    converged: Bool[Tensor, " patch"]
+    cause: Int[Tensor, " patch"]
+
+    @property
+    def converged(self) -> Bool[Tensor, " patch"]:
+        """Whether a minimum was reached: neither the limit nor lack of data stopped it."""
+        return self.cause <= int(StopCause.STALLED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -11,7 +11,7 @@ from pimper_torch.config import require
 from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.records import Convergence, DepthPatches, PatchSet, Surface
+from pimper_torch.records import Convergence, DepthPatches, PatchSet, StopCause, Surface
 from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull
 from pimper_torch.refinement.union import Union, ray_directions, unite
 
@@ -94,7 +94,7 @@ class Refine(nn.Module):
             convergence=Convergence(
                 iterations=torch.ones(1, dtype=torch.long, device=points.device),
                 residual=apart.square().sum(dim=-1).mean().sqrt()[None].to(points),
-                converged=torch.ones(1, dtype=torch.bool, device=points.device),
+                cause=torch.full((1,), int(StopCause.CONVERGED), device=points.device),
             ),
         )
 

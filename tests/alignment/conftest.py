@@ -102,7 +102,9 @@ def _blank(patches):
                 valid=templates.inside,
                 confidence=templates.inside.to(like),
                 determined=one > 0,
-                convergence=Convergence(iterations=one.long(), residual=0 * one, converged=one > 0),
+                convergence=Convergence(
+                    iterations=one.long(), residual=0 * one, cause=0 * one.long()
+                ),
             )
         )
     return PhotometricPatches(patches=patches, buckets=tuple(buckets))

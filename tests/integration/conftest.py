@@ -61,7 +61,7 @@ def photographed():
                     confidence=valid.to(x),
                     determined=one > 0,
                     convergence=Convergence(
-                        iterations=one.long(), residual=0 * one, converged=one > 0
+                        iterations=one.long(), residual=0 * one, cause=0 * one.long()
                     ),
                 )
             )

@@ -32,7 +32,7 @@ def sheet(side=SIDE, confidence=None):
         convergence=Convergence(
             iterations=torch.ones(1, dtype=torch.long),
             residual=torch.zeros(1, dtype=torch.float64),
-            converged=torch.ones(1, dtype=torch.bool),
+            cause=torch.zeros(1, dtype=torch.long),
         ),
     )
 

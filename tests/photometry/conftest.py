@@ -60,9 +60,7 @@ def problem(generator: torch.Generator) -> Callable[..., tuple[Bilinear, Tensor,
             lights=start,
             anchor=start,
             shading=from_shading,
-            normals=n.mT,
             pull=torch.zeros(patches, views, dtype=torch.float64),
-            geometry=torch.zeros(patches, dtype=torch.float64),
         )
         return given, lights, shading
 

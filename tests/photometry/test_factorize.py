@@ -46,7 +46,7 @@ def test_the_mesh_starts_at_the_truth_and_stays_when_it_is_the_truth(scene):
     assert ratio.std() / ratio.mean() < 1e-3  # one scale for all patches and channels
 
 
-@pytest.mark.parametrize("solver", ["balm", "descent"])
+@pytest.mark.parametrize("solver", ["variable-projection", "alternation", "balm", "descent"])
 def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
     true = scene(bumps=0.2)
     start = torch.cat(
@@ -69,7 +69,12 @@ def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
 def test_the_published_method_fixes_its_ambiguity_by_the_mesh(scene):
     true = scene(bumps=0.3)
     paper = FactorizeConfig(
-        start="svd", light_coupling=0.0, geometry_weight=0.0, robust=False, max_iterations=200
+        start="svd",
+        light_coupling=0.0,
+        geometry_weight=0.0,
+        loss="squares",
+        solver="balm",
+        max_iterations=200,
     )
     assert median_error(Factorize(paper)(true.seen), true) < 5  # the bumps have 17 degrees
 
@@ -206,7 +211,7 @@ def test_what_is_handed_in_is_left_alone(scene):
     [
         {"light_coupling": -1.0},
         {"geometry_weight": -0.1},
-        {"robust_scale": 0.0},
+        {"loss_scale": 0.0},
         {"min_views": 2},
         {"min_light_variation": 1.0},
         {"max_iterations": 0},

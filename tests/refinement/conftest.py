@@ -106,7 +106,7 @@ def _exact(templates, height):
         convergence=Convergence(
             iterations=torch.ones(count, dtype=torch.long),
             residual=torch.zeros(count, dtype=torch.float64),
-            converged=torch.ones(count, dtype=torch.bool),
+            cause=torch.zeros(count, dtype=torch.long),
         ),
     )
     identity = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64).expand(count, 4)

@@ -1,0 +1,74 @@
+"""Alternating least squares: all shading vectors with lights given, then the other way round.
+
+Every step has a closed form and the objective never rises, but where lights and shading mimic
+each other the steps crawl: the rival of the other solvers, and their first steps.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.photometry.bilinear import (
+    REWEIGH_EVERY,
+    Bilinear,
+    Factors,
+    equations_of_samples,
+    equations_of_views,
+    finish,
+    follow,
+    keep_scale,
+    objective,
+    reweigh,
+)
+from pimper_torch.photometry.iteration import RUNNING, iterate
+from pimper_torch.photometry.quadratics import solve_packed
+from pimper_torch.photometry.robust import Squares
+from pimper_torch.records import Record, StopCause
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _State(Record):
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    weight: Float[Tensor, "patch view sample"]
+    cost: Float[Tensor, " patch"]
+
+
+def solve_alternation(problem: Bilinear, max_iterations: int, tolerance: float) -> Factors:
+    """Factorize a batch of patches by alternating least squares.
+
+    Args:
+        problem: With its start.
+        max_iterations: Steps at most.
+        tolerance: A patch is done when a step lowered its objective by less than this share.
+
+    On a curved manifold the samples take one Gauss-Newton step along it in their turn. Without
+    ``pull`` the scale between albedo and light is kept where it started. Constant to autograd.
+    Patches do not influence one another.
+    """
+
+    def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
+        weight, cost = state.weight, state.cost
+        if step % REWEIGH_EVERY == 0 and step and not isinstance(work.loss, Squares):
+            weight = reweigh(work, state.lights, state.shading)
+            cost = objective(work, state.lights, state.shading, weight)
+        lights = solve_packed(*equations_of_views(work, state.shading, weight)).mT
+        lights, shading = keep_scale(work, state.lights, lights, state.shading)
+        shading = follow(work, *equations_of_samples(work, lights, weight), shading)
+        after = objective(work, lights, shading, weight)
+        done = (cost - after <= tolerance * cost) & (step >= REWEIGH_EVERY)
+        cause = torch.where(done, int(StopCause.CONVERGED), RUNNING)
+        return _State(lights=lights, shading=shading, weight=weight, cost=after), cause
+
+    with torch.no_grad():
+        weight = reweigh(problem, problem.lights, problem.shading)
+        start = _State(
+            lights=problem.lights,
+            shading=problem.shading,
+            weight=weight,
+            cost=objective(problem, problem.lights, problem.shading, weight),
+        )
+        state, taken, cause = iterate(problem, start, advance, max_iterations)
+        return finish(problem, state.lights, state.shading, state.weight, taken, cause)

@@ -1,0 +1,68 @@
+"""A batch of problems, each iterated until it is done."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import TypeVar
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from pimper_torch.photometry.bilinear import Bilinear, select
+from pimper_torch.records import Record, StopCause
+
+State = TypeVar("State", bound=Record)
+
+# What a step answers for a patch that is to go on.
+RUNNING = -1
+
+# Patches that are done leave the batch when they are this share of it.
+_COMPACT_SHARE = 0.25
+
+
+def iterate(
+    problem: Bilinear,
+    state: State,
+    advance: Callable[[Bilinear, State, int], tuple[State, Int[Tensor, " patch"]]],
+    max_iterations: int,
+) -> tuple[State, Int[Tensor, " patch"], Int[Tensor, " patch"]]:
+    """Take steps until every patch is done; what is done leaves the batch.
+
+    Args:
+        problem: All patches.
+        state: Where they start; its tensors all lead with the patch.
+        advance: One step of the patches that are left: problem, state and number of the step
+            to the next state and, for each patch, a :class:`StopCause` or ``RUNNING``.
+        max_iterations: Steps at most.
+
+    Returns:
+        Every patch's state when it was done, its iterations, and the causes.
+    """
+    patches = torch.arange(len(problem.radiance), device=problem.radiance.device)
+    taken = torch.full_like(patches, max_iterations)
+    causes = torch.full_like(patches, int(StopCause.LIMIT))
+    running = torch.ones_like(patches, dtype=torch.bool)
+    names = [field.name for field in dataclasses.fields(state)]
+    final = state.replace(**{name: getattr(state, name).clone() for name in names})
+    for step in range(max_iterations):
+        state, cause = advance(problem, state, step)
+        ended = running & (cause != RUNNING)
+        _store(final, state, names, patches, ended)
+        taken[patches[ended]] = step + 1
+        causes[patches[ended]] = cause[ended]
+        running = running & ~ended
+        if not bool(running.any()):
+            return final, taken, causes
+        if float((~running).double().mean()) >= _COMPACT_SHARE:
+            keep = running.nonzero()[:, 0]
+            state, problem, patches = select(state, keep), select(problem, keep), patches[keep]
+            running = running[keep]
+    _store(final, state, names, patches, running)
+    return final, taken, causes
+
+
+def _store(
+    final: Record, state: Record, names: list[str], patches: Int[Tensor, " patch"], rows: Tensor
+) -> None:
+    for name in names:
+        getattr(final, name)[patches[rows]] = getattr(state, name)[rows]

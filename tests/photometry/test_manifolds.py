@@ -1,0 +1,133 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.alternation import solve_alternation
+from pimper_torch.photometry.balm import solve_balm
+from pimper_torch.photometry.bilinear import Bilinear
+from pimper_torch.photometry.descent import solve_descent
+from pimper_torch.photometry.manifolds import Cone, Free, SecondOrder, second_order
+from pimper_torch.photometry.quadratics import apply_packed
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.records import StopCause
+
+MANIFOLDS = pytest.mark.parametrize("manifold", [Free(), Cone(), SecondOrder()])
+
+
+def draw(generator, *shape):
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def some(manifold, count, generator):
+    normals = normalize(draw(generator, count, 3), dim=-1)
+    albedo = 0.5 + draw(generator, count).abs()
+    return manifold.join(albedo, normals), albedo, normals
+
+
+@MANIFOLDS
+def test_albedo_and_normal_are_joined_and_split(manifold, generator):
+    vectors, albedo, normals = some(manifold, 30, generator)
+    assert vectors.shape == (30, manifold.rank)
+    found = manifold.split(vectors)
+    assert_close(found[0], albedo)
+    assert_close(found[1], normals)
+    assert_close(manifold.project(vectors), vectors)
+    assert_close(manifold.retract(vectors), vectors)
+
+
+def test_nine_harmonics_have_the_same_length_for_every_normal(generator):
+    normals = normalize(draw(generator, 30, 3), dim=-1)
+    basis = second_order(normals)
+    assert_close(basis[:, :1].square().sum(dim=1), torch.ones(30).double())
+    assert_close(basis[:, 1:4].square().sum(dim=1), torch.ones(30).double())
+    assert_close(basis[:, 4:].square().sum(dim=1), torch.ones(30).double())
+    many = second_order(normalize(draw(generator, 200_000, 3), dim=-1))
+    moments = many.T @ many / len(many)
+    assert_close(moments, moments.diagonal().diag(), rtol=0, atol=0.01)  # orthogonal
+
+
+def test_projection_finds_the_nearest_second_order_vector(generator):
+    vectors = draw(generator, 40, 9)
+    vectors[0, 1:4] = 0  # two normals are equally near
+    found = SecondOrder().project(vectors)
+    rays = second_order(normalize(draw(generator, 20_000, 3), dim=-1))
+    best = (vectors @ rays.T).clamp_min(0) / 3  # least squares along a ray of length sqrt(3)
+    rivals = (vectors[:, None] - best[..., None] * rays).norm(dim=-1).amin(dim=1)
+    distance = (found - vectors).norm(dim=-1)
+    assert (distance <= rivals + 1e-9).all()
+    assert (distance >= rivals - 1e-2).all()  # as near as the rays lie to one another
+
+
+@MANIFOLDS
+def test_tangents_are_derivatives_of_albedo_and_of_turns_of_the_normal(manifold, generator):
+    vectors, albedo, _ = some(manifold, 20, generator)
+    for place, column in enumerate(manifold.tangents(vectors.mT)):
+        ahead = manifold.retract(vectors + 1e-6 * column.mT)
+        assert_close((ahead - vectors) / 1e-6, column.mT, rtol=0, atol=1e-5)
+        moved, turned = manifold.split(ahead)
+        angle = (turned - manifold.split(vectors)[1]).norm(dim=-1)
+        assert_close(
+            moved - albedo, torch.full_like(albedo, 1e-6 * (place == 0)), rtol=0, atol=1e-11
+        )
+        assert_close(
+            angle, torch.full_like(albedo, 1e-6 * (place > 0)) / albedo, rtol=0, atol=1e-11
+        )
+
+
+@MANIFOLDS
+def test_what_bends_away_from_a_normal_costs_its_square(manifold, generator):
+    vectors, albedo, normals = some(manifold, 20, generator)
+    other = normalize(draw(generator, 20, 3), dim=-1)
+    form = manifold.bend(other.mT)
+    cost = (vectors.mT * apply_packed(form, vectors.mT)).sum(dim=0)
+    if manifold.rank == 3:
+        across = torch.linalg.cross(normals, other).square().sum(dim=1)
+        assert_close(cost, albedo**2 * across)
+    else:
+        assert_close(cost, albedo**2 * (normals - other).square().sum(dim=1))
+
+
+def test_vectors_without_a_normal_are_refused(generator):
+    with pytest.raises(InputError, match="rank 5"):
+        Free(rank=5).split(draw(generator, 2, 5))
+
+
+@pytest.mark.parametrize(
+    ("solve", "tolerance"),
+    [
+        (solve_alternation, 3e-3),
+        (solve_balm, 1e-6),
+        (solve_descent, 1e-8),
+        (solve_variable_projection, 1e-12),
+    ],
+)
+@MANIFOLDS
+def test_every_solver_explains_the_data_on_every_manifold(solve, tolerance, manifold, generator):
+    vectors = torch.stack([some(manifold, 120, generator)[0].mT for _ in range(2)])
+    lights = draw(generator, 2, 25, manifold.rank)
+    weight = (torch.rand(2, 25, 120, generator=generator) > 0.3).double()
+    weight[1] = 0
+    start = lights + 0.03 * draw(generator, *lights.shape)
+    near = manifold.project((vectors + 0.03 * draw(generator, *vectors.shape)).mT).mT
+    problem = Bilinear(
+        radiance=weight * (lights @ vectors),
+        weight=weight,
+        lights=start,
+        anchor=start,
+        shading=near,
+        pull=torch.zeros(2, 25, dtype=torch.float64),
+        manifold=manifold,
+    )
+    found = solve(problem, 600, tolerance)
+    # Of radiances about 2. With nine harmonics lights and shading mimic each other so well that
+    # alternation crawls: it is the one that runs into the limit.
+    assert found.convergence.residual[0] < 3e-3
+    crawls = solve is solve_alternation and manifold.rank == 9
+    expected = StopCause.LIMIT if crawls else StopCause.CONVERGED
+    assert found.convergence.cause.tolist() == [expected, StopCause.EMPTY]
+    assert_close(manifold.project(found.shading.mT).mT, found.shading)
+    stopped = solve(problem, 2, tolerance)
+    assert stopped.convergence.cause[0] == StopCause.LIMIT
+    assert not stopped.convergence.converged.any()
