@@ -17,13 +17,13 @@ def vertex_components(
     Every other vertex is a component alone.
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    return _components(edges[among[edges].all(dim=1)], len(among))
+    return graph_components(edges[among[edges].all(dim=1)], len(among))
 
 
 def face_components(faces: Int[Tensor, "face 3"]) -> Int[Tensor, " face"]:
     """Label faces that hang together by edges with exactly two faces; a vertex is not enough."""
     pairs, _ = face_pairs(faces)
-    return _components(pairs, len(faces))
+    return graph_components(pairs, len(faces))
 
 
 def vertex_fans(
@@ -45,14 +45,15 @@ def vertex_fans(
         3 * pairs + (faces[pairs] == end[:, None, None]).long().argmax(dim=2)
         for end in ends.unbind(dim=1)
     ]
-    label = _components(torch.cat(corners), 3 * len(faces))
+    label = graph_components(torch.cat(corners), 3 * len(faces))
     old = torch.empty_like(label[: int(label.max()) + 1]).scatter(0, label, faces.flatten())
     order = old.argsort(stable=True)
     rank = torch.empty_like(order).scatter(0, order, torch.arange(len(order)).to(order))
     return old[order], rank[label].reshape(-1, 3)
 
 
-def _components(links: Int[Tensor, "link 2"], count: int) -> Int[Tensor, " node"]:
+def graph_components(links: Int[Tensor, "link 2"], count: int) -> Int[Tensor, " node"]:
+    """Label the nodes of a graph that links connect."""
     one, other = links.cpu().numpy().T
     graph = coo_array((one >= 0, (one, other)), shape=(count, count))
     _, label = connected_components(graph, directed=False)

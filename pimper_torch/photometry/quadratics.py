@@ -28,6 +28,18 @@ def diagonal(size: int) -> list[int]:
     return [place for place, pair in enumerate(zip(rows, columns, strict=True)) if len({*pair}) < 2]
 
 
+def unpacked(
+    packed: Float[Tensor, "*batch packed item"], size: int
+) -> Float[Tensor, "*batch item size size"]:
+    """Write matrices out, one an item."""
+    rows, columns = _triangle(size)
+    index = torch.zeros(size, size, dtype=torch.long, device=packed.device)
+    place = torch.arange(len(rows), device=packed.device)
+    index[rows, columns] = place
+    index[columns, rows] = place
+    return packed.mT[..., index]
+
+
 def apply_packed(
     packed: Float[Tensor, "*batch packed item"], vectors: Float[Tensor, "*batch size item"]
 ) -> Float[Tensor, "*batch size item"]:

@@ -1,0 +1,184 @@
+"""Factorization of all patches together, the lights of neighbours coupled."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.photometry.bilinear import (
+    REWEIGH_EVERY,
+    Bilinear,
+    Factors,
+    equations_of_samples,
+    equations_of_views,
+    finish,
+    follow,
+    objective,
+    reweigh,
+)
+from pimper_torch.photometry.coupling import couple_lights, disagreement
+from pimper_torch.photometry.harmonics import rotate_lights
+from pimper_torch.photometry.quadratics import unpacked
+from pimper_torch.photometry.robust import Squares
+from pimper_torch.records import Record, StopCause
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Chunk(Record):
+    """Patches that are solved in one batch.
+
+    Attributes:
+        problem: Theirs; its ``anchor`` is the light that neighbours should differ from alike.
+        patch_from_world: Rigid.
+        facet: Of each patch.
+    """
+
+    problem: Bilinear
+    patch_from_world: Float[Tensor, "patch 4 4"]
+    facet: Int[Tensor, " patch"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _State(Record):
+    lights: Float[Tensor, "patch view 4"]
+    shading: Float[Tensor, "patch 4 sample"]
+    weight: Float[Tensor, "patch view sample"]
+
+
+def solve_coupled(
+    chunks: Sequence[Chunk],
+    pairs: Int[Tensor, "pair 2"],
+    coupling: float,
+    max_iterations: int,
+    tolerance: float,
+) -> tuple[Factors, ...]:
+    r"""Factorize patches whose lights hold to their neighbours', by alternation.
+
+    The objective of every patch, and :math:`s_g \sum \lVert x_\mu - x_{\mu'} \rVert^2` over
+    views g and neighbours, where ``x`` is what a light differs from its anchor by, in the world
+    frame. In turn all samples are brought to their minimum, and all lights by one sparse solve
+    a view; neither raises the objective.
+
+    Args:
+        chunks: All patches.
+        pairs: Facets that are neighbours.
+        coupling: ``s_g`` in units of what a patch's samples say of that view's light, in the
+            mean over the patches; infinity for one difference from the anchor for all.
+        max_iterations: Turns at most.
+        tolerance: A patch is done when its shading vectors changed by less than this share of
+            their length; all go on until the last is.
+
+    Constant to autograd.
+    """
+    with torch.no_grad():
+        states = [_start(chunk.problem) for chunk in chunks]
+        pairs = _patches_of(chunks, pairs)
+        information, _ = _equations(chunks, states)
+        known = information[..., 0, 0] - torch.cat([chunk.problem.pull for chunk in chunks])
+        count = (known > 0).sum(dim=0).clamp_min(1)
+        strength = coupling * known.sum(dim=0) / count
+        strength = torch.where(known.sum(dim=0) > 0, strength, 1.0)
+        taken = max_iterations
+        for step in range(max_iterations):
+            lights = couple_lights(*_equations(chunks, states), pairs, strength)
+            moved, change = _follow(chunks, states, lights, step)
+            states = moved
+            if step >= REWEIGH_EVERY and bool((torch.cat(change) <= tolerance).all()):
+                taken = step + 1
+                break
+        return tuple(
+            _finished(chunk.problem, state, part, taken, tolerance)
+            for chunk, state, part in zip(chunks, states, change, strict=True)
+        )
+
+
+def coupled_objective(
+    chunks: Sequence[Chunk],
+    factors: Sequence[Factors],
+    pairs: Int[Tensor, "pair 2"],
+    strength: Float[Tensor, " view"],
+) -> Float[Tensor, ""]:
+    """Evaluate what :func:`solve_coupled` minimises, for finite ``s_g``."""
+    own = [
+        objective(chunk.problem, found.lights, found.shading, found.weight).sum()
+        for chunk, found in zip(chunks, factors, strict=True)
+    ]
+    apart = [
+        _to_world(chunk, found.lights - chunk.problem.anchor)
+        for chunk, found in zip(chunks, factors, strict=True)
+    ]
+    across = disagreement(torch.cat(apart), _patches_of(chunks, pairs))
+    return torch.stack(own).sum() + (strength * across).sum()
+
+
+def _start(problem: Bilinear) -> _State:
+    weight = reweigh(problem, problem.lights, problem.shading)
+    return _State(lights=problem.lights, shading=problem.shading, weight=weight)
+
+
+def _patches_of(chunks: Sequence[Chunk], pairs: Int[Tensor, "pair 2"]) -> Int[Tensor, "pair 2"]:
+    """Turn pairs of facets into pairs of patches, as they stand in the chunks."""
+    facets = torch.cat([chunk.facet for chunk in chunks])
+    place = torch.full((int(facets.max()) + 1,), -1, device=facets.device)
+    place[facets] = torch.arange(len(facets), device=facets.device)
+    inside = (pairs < len(place)).all(dim=1)
+    found = place[pairs[inside]]
+    return found[(found >= 0).all(dim=1)]
+
+
+def _equations(
+    chunks: Sequence[Chunk], states: Sequence[_State]
+) -> tuple[Float[Tensor, "patch view 4 4"], Float[Tensor, "patch view 4"]]:
+    """Give what every patch says of its lights' difference from the anchor, world frame."""
+    matrices, sides = [], []
+    for chunk, state in zip(chunks, states, strict=True):
+        packed, rhs = equations_of_views(chunk.problem, state.shading, state.weight)
+        A = unpacked(packed, 4).double()
+        short = rhs.mT - (A @ chunk.problem.anchor.double()[..., None])[..., 0]
+        turn = torch.eye(4, dtype=A.dtype, device=A.device).repeat(len(A), 1, 1, 1)
+        turn[:, 0, 1:, 1:] = chunk.patch_from_world[:, :3, :3]
+        matrices.append(turn.mT @ A @ turn)
+        sides.append((turn.mT @ short[..., None])[..., 0])
+    return torch.cat(matrices), torch.cat(sides)
+
+
+def _to_world(chunk: Chunk, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:
+    return rotate_lights(chunk.patch_from_world.to(lights).mT, lights)
+
+
+def _follow(
+    chunks: Sequence[Chunk],
+    states: Sequence[_State],
+    lights_world: Float[Tensor, "all view 4"],
+    step: int,
+) -> tuple[list[_State], list[Tensor]]:
+    """Bring the samples to their minimum for lights that differ from the anchor so much."""
+    moved, change, first = [], [], 0
+    for chunk, state in zip(chunks, states, strict=True):
+        problem = chunk.problem
+        apart = lights_world[first : first + len(chunk.facet)].to(problem.anchor)
+        first += len(chunk.facet)
+        lights = problem.anchor + rotate_lights(chunk.patch_from_world.to(apart), apart)
+        weight = state.weight
+        equations = equations_of_samples(problem, lights, weight)
+        shading = follow(problem, *equations, state.shading)
+        if step % REWEIGH_EVERY == 0 and not isinstance(problem.loss, Squares):
+            weight = reweigh(problem, lights, shading)
+        size = shading.flatten(1).norm(dim=1).clamp_min(torch.finfo(shading.dtype).tiny ** 0.5)
+        change.append((shading - state.shading).flatten(1).norm(dim=1) / size)
+        moved.append(_State(lights=lights, shading=shading, weight=weight))
+    return moved, change
+
+
+def _finished(
+    problem: Bilinear,
+    state: _State,
+    change: Float[Tensor, " patch"],
+    taken: int,
+    tolerance: float,
+) -> Factors:
+    iterations = torch.full_like(change, taken).long()
+    limit = torch.where(change <= tolerance, int(StopCause.CONVERGED), int(StopCause.LIMIT))
+    return finish(problem, state.lights, state.shading, state.weight, iterations, limit)
