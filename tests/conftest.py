@@ -103,7 +103,7 @@ def reconstruction():
         lights_patch=lights_patch,
         valid=ones > 0,
         confidence=ones,
-        determined=torch.tensor([True, False]),
+        verdict=torch.tensor([0, 4]),
         convergence=Convergence(
             iterations=torch.tensor([12, 40]),
             residual=torch.tensor([0.1, 0.3]),

@@ -26,7 +26,7 @@ from pimper_torch.records import Record, StopCause
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Chunk(Record):
+class Batch(Record):
     """Patches that are solved in one batch.
 
     Attributes:
@@ -48,7 +48,7 @@ class _State(Record):
 
 
 def solve_coupled(
-    chunks: Sequence[Chunk],
+    batches: Sequence[Batch],
     pairs: Int[Tensor, "pair 2"],
     coupling: float,
     max_iterations: int,
@@ -62,7 +62,7 @@ def solve_coupled(
     a view; neither raises the objective.
 
     Args:
-        chunks: All patches.
+        batches: All patches.
         pairs: Facets that are neighbours.
         coupling: ``s_g`` in units of what a patch's samples say of that view's light, in the
             mean over the patches; infinity for one difference from the anchor for all.
@@ -73,43 +73,43 @@ def solve_coupled(
     Constant to autograd.
     """
     with torch.no_grad():
-        states = [_start(chunk.problem) for chunk in chunks]
-        pairs = _patches_of(chunks, pairs)
-        information, _ = _equations(chunks, states)
-        known = information[..., 0, 0] - torch.cat([chunk.problem.pull for chunk in chunks])
+        states = [_start(batch.problem) for batch in batches]
+        pairs = _patches_of(batches, pairs)
+        information, _ = _equations(batches, states)
+        known = information[..., 0, 0] - torch.cat([batch.problem.pull for batch in batches])
         count = (known > 0).sum(dim=0).clamp_min(1)
         strength = coupling * known.sum(dim=0) / count
         strength = torch.where(known.sum(dim=0) > 0, strength, 1.0)
         taken = max_iterations
         for step in range(max_iterations):
-            lights = couple_lights(*_equations(chunks, states), pairs, strength)
-            moved, change = _follow(chunks, states, lights, step)
+            lights = couple_lights(*_equations(batches, states), pairs, strength)
+            moved, change = _follow(batches, states, lights, step)
             states = moved
             if step >= REWEIGH_EVERY and bool((torch.cat(change) <= tolerance).all()):
                 taken = step + 1
                 break
         return tuple(
-            _finished(chunk.problem, state, part, taken, tolerance)
-            for chunk, state, part in zip(chunks, states, change, strict=True)
+            _finished(batch.problem, state, part, taken, tolerance)
+            for batch, state, part in zip(batches, states, change, strict=True)
         )
 
 
 def coupled_objective(
-    chunks: Sequence[Chunk],
+    batches: Sequence[Batch],
     factors: Sequence[Factors],
     pairs: Int[Tensor, "pair 2"],
     strength: Float[Tensor, " view"],
 ) -> Float[Tensor, ""]:
     """Evaluate what :func:`solve_coupled` minimises, for finite ``s_g``."""
     own = [
-        objective(chunk.problem, found.lights, found.shading, found.weight).sum()
-        for chunk, found in zip(chunks, factors, strict=True)
+        objective(batch.problem, found.lights, found.shading, found.weight).sum()
+        for batch, found in zip(batches, factors, strict=True)
     ]
     apart = [
-        _to_world(chunk, found.lights - chunk.problem.anchor)
-        for chunk, found in zip(chunks, factors, strict=True)
+        _to_world(batch, found.lights - batch.problem.anchor)
+        for batch, found in zip(batches, factors, strict=True)
     ]
-    across = disagreement(torch.cat(apart), _patches_of(chunks, pairs))
+    across = disagreement(torch.cat(apart), _patches_of(batches, pairs))
     return torch.stack(own).sum() + (strength * across).sum()
 
 
@@ -118,9 +118,9 @@ def _start(problem: Bilinear) -> _State:
     return _State(lights=problem.lights, shading=problem.shading, weight=weight)
 
 
-def _patches_of(chunks: Sequence[Chunk], pairs: Int[Tensor, "pair 2"]) -> Int[Tensor, "pair 2"]:
-    """Turn pairs of facets into pairs of patches, as they stand in the chunks."""
-    facets = torch.cat([chunk.facet for chunk in chunks])
+def _patches_of(batches: Sequence[Batch], pairs: Int[Tensor, "pair 2"]) -> Int[Tensor, "pair 2"]:
+    """Turn pairs of facets into pairs of patches, as they stand in the batches."""
+    facets = torch.cat([batch.facet for batch in batches])
     place = torch.full((int(facets.max()) + 1,), -1, device=facets.device)
     place[facets] = torch.arange(len(facets), device=facets.device)
     inside = (pairs < len(place)).all(dim=1)
@@ -129,38 +129,38 @@ def _patches_of(chunks: Sequence[Chunk], pairs: Int[Tensor, "pair 2"]) -> Int[Te
 
 
 def _equations(
-    chunks: Sequence[Chunk], states: Sequence[_State]
+    batches: Sequence[Batch], states: Sequence[_State]
 ) -> tuple[Float[Tensor, "patch view 4 4"], Float[Tensor, "patch view 4"]]:
     """Give what every patch says of its lights' difference from the anchor, world frame."""
     matrices, sides = [], []
-    for chunk, state in zip(chunks, states, strict=True):
-        packed, rhs = equations_of_views(chunk.problem, state.shading, state.weight)
+    for batch, state in zip(batches, states, strict=True):
+        packed, rhs = equations_of_views(batch.problem, state.shading, state.weight)
         A = unpacked(packed, 4).double()
-        short = rhs.mT - (A @ chunk.problem.anchor.double()[..., None])[..., 0]
+        short = rhs.mT - (A @ batch.problem.anchor.double()[..., None])[..., 0]
         turn = torch.eye(4, dtype=A.dtype, device=A.device).repeat(len(A), 1, 1, 1)
-        turn[:, 0, 1:, 1:] = chunk.patch_from_world[:, :3, :3]
+        turn[:, 0, 1:, 1:] = batch.patch_from_world[:, :3, :3]
         matrices.append(turn.mT @ A @ turn)
         sides.append((turn.mT @ short[..., None])[..., 0])
     return torch.cat(matrices), torch.cat(sides)
 
 
-def _to_world(chunk: Chunk, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:
-    return rotate_lights(chunk.patch_from_world.to(lights).mT, lights)
+def _to_world(batch: Batch, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:
+    return rotate_lights(batch.patch_from_world.to(lights).mT, lights)
 
 
 def _follow(
-    chunks: Sequence[Chunk],
+    batches: Sequence[Batch],
     states: Sequence[_State],
     lights_world: Float[Tensor, "all view 4"],
     step: int,
 ) -> tuple[list[_State], list[Tensor]]:
     """Bring the samples to their minimum for lights that differ from the anchor so much."""
     moved, change, first = [], [], 0
-    for chunk, state in zip(chunks, states, strict=True):
-        problem = chunk.problem
-        apart = lights_world[first : first + len(chunk.facet)].to(problem.anchor)
-        first += len(chunk.facet)
-        lights = problem.anchor + rotate_lights(chunk.patch_from_world.to(apart), apart)
+    for batch, state in zip(batches, states, strict=True):
+        problem = batch.problem
+        apart = lights_world[first : first + len(batch.facet)].to(problem.anchor)
+        first += len(batch.facet)
+        lights = problem.anchor + rotate_lights(batch.patch_from_world.to(apart), apart)
         weight = state.weight
         equations = equations_of_samples(problem, lights, weight)
         shading = follow(problem, *equations, state.shading)

@@ -129,6 +129,23 @@ class Convergence(Record):
         return self.cause <= int(StopCause.STALLED)
 
 
+class PatchVerdict(IntEnum):
+    """Whether light told a patch's shape, or what kept it from that."""
+
+    DETERMINED = 0
+    """Normals and albedo come from the photographs."""
+    UNSEEN = 1
+    """No view has a valid sample: all are masked, hidden, too dark or saturated."""
+    NOT_FINITE = 2
+    """Every radiance that views have there is NaN or infinite."""
+    FEW_VIEWS = 3
+    """No sample is lit in as many views as it has unknowns."""
+    CONSTANT_LIGHT = 4
+    """The light varied too little between the views, such as under one lamp."""
+    FAILED = 5
+    """The solver's answer is not finite or has no albedo anywhere."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Photometry(Record):
     """A bucket of factorized patches.
@@ -140,8 +157,8 @@ class Photometry(Record):
             the patch frame, constants folded in. A view without samples has zeros.
         valid: True where the sample was determined by the photographs.
         confidence: In [0, 1]; 0 where not valid.
-        determined: False for a patch whose light varied too little to tell shape from
-            shading; its normals are those of the coarse mesh.
+        verdict: A :class:`PatchVerdict` each. The normals of a patch that is not determined
+            are those of the coarse mesh, and none of its samples is valid.
         convergence: Of the factorization.
     """
 
@@ -150,8 +167,13 @@ class Photometry(Record):
     lights_patch: Float[Tensor, "patch view 4"]
     valid: Bool[Tensor, "patch height width"]
     confidence: Float[Tensor, "patch height width"]
-    determined: Bool[Tensor, " patch"]
+    verdict: Int[Tensor, " patch"]
     convergence: Convergence
+
+    @property
+    def determined(self) -> Bool[Tensor, " patch"]:
+        """Whether light told the patch's shape."""
+        return self.verdict == int(PatchVerdict.DETERMINED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

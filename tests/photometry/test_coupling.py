@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.photometry.bilinear import select
-from pimper_torch.photometry.coupled import Chunk, coupled_objective, solve_coupled
+from pimper_torch.photometry.coupled import Batch, coupled_objective, solve_coupled
 from pimper_torch.photometry.coupling import couple_lights
 from pimper_torch.photometry.harmonics import rotate_lights
 from pimper_torch.photometry.variable_projection import solve_variable_projection
@@ -79,7 +79,7 @@ def test_gradients_are_those_of_the_solution(told, strength):
 
 
 @pytest.fixture
-def chunks(problem, generator):
+def batches(problem, generator):
     """Four patches in frames of their own, two a chunk, that share lights in the world."""
     given, _, shading = problem(patches=4, samples=60)
     turn = torch.linalg.qr(torch.randn(4, 3, 3, generator=generator, dtype=torch.float64)).Q
@@ -93,7 +93,7 @@ def chunks(problem, generator):
         radiance=lights @ shading + noise, lights=lights, anchor=lights, pull=pull
     )
     return [
-        Chunk(
+        Batch(
             problem=select(given, torch.tensor(part)),
             patch_from_world=frames[part],
             facet=torch.tensor(part),
@@ -102,35 +102,37 @@ def chunks(problem, generator):
     ]
 
 
-def test_zero_coupling_ends_where_patches_by_themselves_do(chunks):
-    found = solve_coupled(chunks, CHAIN, 0.0, 200, 1e-7)
-    for chunk, factors in zip(chunks, found, strict=True):
-        alone = solve_variable_projection(chunk.problem, 300, 1e-12)
+def test_zero_coupling_ends_where_patches_by_themselves_do(batches):
+    found = solve_coupled(batches, CHAIN, 0.0, 200, 1e-7)
+    for batch, factors in zip(batches, found, strict=True):
+        alone = solve_variable_projection(batch.problem, 300, 1e-12)
         assert_close(factors.lights, alone.lights, rtol=0, atol=1e-4)
         assert_close(factors.shading, alone.shading, rtol=0, atol=1e-4)
 
 
-def test_infinite_coupling_gives_one_light_in_the_world(chunks):
-    found = solve_coupled(chunks, CHAIN, math.inf, 50, 1e-6)
+def test_infinite_coupling_gives_one_light_in_the_world(batches):
+    found = solve_coupled(batches, CHAIN, math.inf, 50, 1e-6)
     world = [
-        rotate_lights(invert_rigid(chunk.patch_from_world), factors.lights)
-        for chunk, factors in zip(chunks, found, strict=True)
+        rotate_lights(invert_rigid(batch.patch_from_world), factors.lights)
+        for batch, factors in zip(batches, found, strict=True)
     ]
     one = torch.cat(world)
     assert_close(one, one[:1].expand_as(one))
 
 
-def test_coupling_in_between_lowers_its_objective_and_is_at_a_minimum(chunks):
-    known = torch.cat([(c.problem.weight @ c.problem.shading[:, 0, :, None] ** 2) for c in chunks])
+def test_coupling_in_between_lowers_its_objective_and_is_at_a_minimum(batches):
+    known = torch.cat([(c.problem.weight @ c.problem.shading[:, 0, :, None] ** 2) for c in batches])
     strength = 0.3 * known[..., 0].mean(dim=0)
-    found = solve_coupled(chunks, CHAIN, 0.3, 200, 1e-7)
-    least = coupled_objective(chunks, found, CHAIN, strength)
+    found = solve_coupled(batches, CHAIN, 0.3, 200, 1e-7)
+    least = coupled_objective(batches, found, CHAIN, strength)
     costs = [
-        float(coupled_objective(chunks, solve_coupled(chunks, CHAIN, 0.3, n, 0.0), CHAIN, strength))
+        float(
+            coupled_objective(batches, solve_coupled(batches, CHAIN, 0.3, n, 0.0), CHAIN, strength)
+        )
         for n in (1, 2, 5)
     ]
     assert costs[0] > costs[1] > costs[2] > least
     lights = [factors.lights.clone().requires_grad_() for factors in found]
     moved = [f.replace(lights=light) for f, light in zip(found, lights, strict=True)]
-    slopes = torch.autograd.grad(coupled_objective(chunks, moved, CHAIN, strength), lights)
+    slopes = torch.autograd.grad(coupled_objective(batches, moved, CHAIN, strength), lights)
     assert max(float(slope.abs().max()) for slope in slopes) < 1e-4 * float(least)

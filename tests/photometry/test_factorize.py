@@ -5,10 +5,11 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, PimperWarning
+from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.rows import coarse_normals
-from pimper_torch.records import PatchViews
+from pimper_torch.records import PatchVerdict, PatchViews
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
 
@@ -70,7 +71,7 @@ def test_the_published_method_fixes_its_ambiguity_by_the_mesh(scene):
     true = scene(bumps=0.3)
     paper = FactorizeConfig(
         start="svd",
-        light_coupling=0.0,
+        light_pull=0.0,
         geometry_weight=0.0,
         loss="squares",
         solver="balm",
@@ -93,13 +94,53 @@ def test_samples_lit_by_few_have_no_say(scene):
     assert found.valid[1, 8:].any()
 
 
+def test_a_patch_that_few_views_see_is_told_from_one_that_none_sees(scene):
+    true = scene()
+    first = true.seen.buckets[0]
+    valid = first.valid.clone()
+    valid[1, 3:] = False
+    seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
+    with pytest.warns(PimperWarning, match="1 are nowhere seen lit in 4 views"):
+        found = Factorize()(seen).buckets[0]
+    assert found.verdict.tolist() == [0, PatchVerdict.FEW_VIEWS, 0, 0, 0]
+    assert (found.lights_patch[1, 3:] == 0).all()
+    assert found.convergence.residual.isfinite().all()
+
+
+@pytest.mark.parametrize("coupling", [3.0, math.inf])
+def test_coupled_lights_agree_in_the_world_and_keep_the_normals(scene, coupling):
+    true = scene()
+    free, coupled = (
+        Factorize(
+            FactorizeConfig(
+                light="soft", light_coupling=strength, light_pull=0.1, geometry_weight=0.0
+            )
+        )(true.seen)
+        for strength in (0.0, coupling)
+    )
+
+    def scatter(found):
+        world = torch.cat(
+            [
+                rotate_lights(invert_rigid(templates.patch_from_world), bucket.lights_patch)
+                for bucket, templates in zip(found.buckets, true.seen.patches.buckets, strict=True)
+            ]
+        )
+        return (world - world.mean(dim=0)).norm() / world.norm()
+
+    assert scatter(coupled) < 0.3 * scatter(free)
+    if math.isinf(coupling):
+        assert scatter(coupled) < 1e-6
+    assert median_error(coupled, true) < median_error(free, true)
+
+
 def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(lights=light * torch.linspace(0.5, 1.5, 12, dtype=torch.float64)[:, None])
     with pytest.warns(PimperWarning, match="8 of 8 patches keep the normals of the coarse mesh"):
         found = Factorize()(true.seen)
     for bucket, templates in zip(found.buckets, true.seen.patches.buckets, strict=True):
-        assert not bucket.determined.any()
+        assert (bucket.verdict == PatchVerdict.CONSTANT_LIGHT).all()
         assert not bucket.valid.any()
         coarse = coarse_normals(true.seen.patches.coarse, templates)
         assert_close(bucket.normals_patch, coarse)
@@ -127,6 +168,8 @@ def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how)
     with pytest.warns(PimperWarning):
         plain = Factorize()(without)
     bad, good = found.buckets[0], plain.buckets[0]
+    reason = PatchVerdict.UNSEEN if how == "masked" else PatchVerdict.NOT_FINITE
+    assert bad.verdict[2] == reason
     assert not bad.determined[2]
     assert not bad.valid[2].any()
     for name in ("normals_patch", "albedo", "lights_patch", "confidence"):
@@ -153,7 +196,7 @@ def test_nothing_seen_at_all_is_told_not_raised(scene):
         each.replace(radiance=0 * each.radiance, valid=torch.zeros_like(each.valid))
         for each in true.seen.buckets
     )
-    with pytest.warns(PimperWarning, match="8 are nowhere seen lit in 4 views"):
+    with pytest.warns(PimperWarning, match="8 have no valid sample in any view"):
         found = Factorize()(true.seen.replace(buckets=buckets))
     for bucket in found.buckets:
         assert bucket.normals_patch.isfinite().all()
@@ -209,6 +252,7 @@ def test_what_is_handed_in_is_left_alone(scene):
 @pytest.mark.parametrize(
     "wrong",
     [
+        {"light_pull": -1.0},
         {"light_coupling": -1.0},
         {"geometry_weight": -0.1},
         {"loss_scale": 0.0},
