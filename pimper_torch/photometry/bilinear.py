@@ -116,7 +116,7 @@ def reweigh(
     if isinstance(problem.loss, Squares):
         return problem.weight
     residual = problem.radiance - lights @ shading
-    deviation = _spread(problem, residual)
+    deviation = deviation_of(problem, residual)
     return problem.weight * problem.loss.weights(residual, deviation[:, None, None])
 
 
@@ -276,9 +276,10 @@ def _dot(
     return total
 
 
-def _spread(
+def deviation_of(
     problem: Bilinear, residual: Float[Tensor, "patch view sample"]
 ) -> Float[Tensor, " patch"]:
+    """Estimate the standard deviation of each patch's residuals, outliers apart."""
     some = residual[:, :, :: problem.stride].flatten(1)
     seen = problem.weight[:, :, :: problem.stride].flatten(1) > 0
     count = problem.weight.sum(dim=(1, 2)).clamp_min(1)

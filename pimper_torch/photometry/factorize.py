@@ -20,6 +20,7 @@ from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold
 from pimper_torch.photometry.coupled import Batch, solve_coupled
 from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
+from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.light_field import LightField, faces_lamp
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.mesh_light import light_of_mesh
@@ -179,9 +180,10 @@ class Factorize(nn.Module):
     that sees nothing of a patch has the light zero there. NaN and infinity in the radiance
     count as missing.
 
-    Differentiable in the radiance through the last step (see
-    :func:`~pimper_torch.photometry.certainty.refine_on_manifold`) and the albedo, with lights,
-    weights and gauge held constant.
+    Differentiable in the radiance: lights by the implicit function at the optimum (see
+    :mod:`~pimper_torch.photometry.implicit`), then every sample by its exact last step and its
+    albedo. The light field, robust weights of the last step and the gauge are held constant; so
+    are coupled lights.
     """
 
     def __init__(self, config: FactorizeConfig | None = None) -> None:
@@ -240,6 +242,8 @@ class Factorize(nn.Module):
 
     def _conclude(self, chunk: _Chunk, posed: _Posed, factors: Factors) -> Photometry:
         rows, normals = posed.rows, chunk.normals
+        if posed.problem.radiance.requires_grad and self.config.light_coupling == 0:
+            factors = differentiable(posed.problem, factors)
         found = refine_on_manifold(posed.problem, factors)
         sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
         lit = rows.seen.sum(dim=1) >= self.config.min_views

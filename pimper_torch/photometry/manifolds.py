@@ -50,6 +50,14 @@ class Free:
         """Bring back what a small step along the tangents has left: nothing."""
         return shading
 
+    def curvature(
+        self,
+        shading: Float[Tensor, "*batch rank sample"],
+        slope: Float[Tensor, "*batch rank sample"],
+    ) -> Float[Tensor, "*batch sample rank rank"]:
+        """Give the manifold's part of second derivatives: flat, it has none."""
+        return slope.new_zeros(*slope.shape[:-2], slope.shape[-1], self.rank, self.rank)
+
     def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
         """Span the tangent space: all of it. With rank three albedo first, then two turns."""
         if self.rank == 3:
@@ -104,6 +112,18 @@ class Cone:
     def tangents(self, shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
         """Span the tangent space at each column; see :func:`tangent_columns`."""
         return tangent_columns(shading)
+
+    def curvature(
+        self, shading: Float[Tensor, "*batch 4 sample"], slope: Float[Tensor, "*batch 4 sample"]
+    ) -> Float[Tensor, "*batch sample 3 3"]:
+        r"""Give the manifold's part of the second derivatives by the tangents' coordinates.
+
+        Of a function with gradient ``slope``, :math:`g \cdot \partial^2 s`.
+        """
+        albedo, normal = self.split(shading.mT)
+        first, second = tangents(normal)
+        along = [(slope[..., 1:, :].mT * part).sum(dim=-1) for part in (normal, first, second)]
+        return _bending(-along[0], along[1], along[2], torch.zeros_like(albedo), albedo)
 
     def split(
         self, shading: Float[Tensor, "*batch 4"]
@@ -184,6 +204,30 @@ class SecondOrder:
             columns.append(torch.cat([nothing, turn, _differential(normal, turn)], dim=-1))
         return [column.mT for column in columns]
 
+    def curvature(
+        self, shading: Float[Tensor, "*batch 9 sample"], slope: Float[Tensor, "*batch 9 sample"]
+    ) -> Float[Tensor, "*batch sample 3 3"]:
+        r"""Give the manifold's part of the second derivatives; see :meth:`Cone.curvature`."""
+        albedo, normal = self.split(shading.mT)
+        g = slope.mT
+        turns = tangents(normal)
+        outward = (g[..., 1:4] * normal).sum(dim=-1)
+        outward = outward + (g[..., 4:] * _differential(normal, normal)).sum(dim=-1)
+        mixed = [
+            (g[..., 1:4] * turn).sum(dim=-1)
+            + (g[..., 4:] * _differential(normal, turn)).sum(dim=-1)
+            for turn in turns
+        ]
+        twice = {
+            (a, b): (g[..., 4:] * _differential(turns[a], turns[b])).sum(dim=-1)
+            for a, b in ((0, 0), (0, 1), (1, 1))
+        }
+        flat = _bending(-outward, mixed[0], mixed[1], twice[0, 1], albedo)
+        safe = torch.where(albedo > 0, albedo, 1)
+        bend = torch.zeros_like(flat)
+        bend[..., 1, 1], bend[..., 2, 2] = twice[0, 0] / safe, twice[1, 1] / safe
+        return flat + bend
+
     def split(
         self, shading: Float[Tensor, "*batch 9"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
@@ -232,6 +276,20 @@ def second_order(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"
     return torch.cat(
         [torch.ones_like(normals[..., :1]), normals, torch.stack(degree, dim=-1)], dim=-1
     )
+
+
+def _bending(
+    square: Float[Tensor, "*batch"],
+    first: Float[Tensor, "*batch"],
+    second: Float[Tensor, "*batch"],
+    across: Float[Tensor, "*batch"],
+    albedo: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch 3 3"]:
+    """Put second derivatives by albedo and two turns together, over albedo."""
+    none = torch.zeros_like(square)
+    rows = [[none, first, second], [first, square, across], [second, across, square]]
+    matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    return matrix / torch.where(albedo > 0, albedo, 1)[..., None, None]
 
 
 def _quadratic(degree: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 3 3"]:

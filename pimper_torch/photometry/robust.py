@@ -19,6 +19,12 @@ class Squares:
         """Weigh all residuals by 1."""
         return torch.ones_like(residual)
 
+    def curvatures(
+        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Give the second derivative of the loss."""
+        return torch.ones_like(residual)
+
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
@@ -38,6 +44,13 @@ class Cauchy:
     ) -> Float[Tensor, "*batch"]:
         """Weigh residuals for iterated least squares, by 1 at 0."""
         return cauchy_weights(residual, self.scale * deviation)
+
+    def curvatures(
+        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Give the second derivative of the loss, negative for outliers."""
+        weight = self.weights(residual, deviation)
+        return weight * (2 * weight - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +75,13 @@ class GemanMcClure:
     ) -> Float[Tensor, "*batch"]:
         """Weigh residuals for iterated least squares, by 1 at 0."""
         return cauchy_weights(residual, self.scale * deviation).square()
+
+    def curvatures(
+        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Give the second derivative of the loss, negative for outliers."""
+        root = cauchy_weights(residual, self.scale * deviation)
+        return root.square() * (4 * root - 3)
 
 
 Loss = Squares | Cauchy | GemanMcClure
