@@ -178,6 +178,7 @@ class Method:
         resolvers: What it can resolve by; the first is the default.
         calibrated: Whether it needs lights.
         perspective: Whether it needs intrinsics.
+        robust: Whether shadows and highlights lose weight by default.
     """
 
     solve: Callable[[Problem, str], Solution]
@@ -185,12 +186,13 @@ class Method:
     resolvers: tuple[str, ...] = ()
     calibrated: bool = False
     perspective: bool = False
+    robust: bool = True
 
 
 METHODS = {
     "calibrated": Method(solve=_calibrated, unknowns=3, calibrated=True),
     "hayakawa": Method(solve=_hayakawa, unknowns=3, resolvers=("equal_strength", "equal_albedo")),
     "integrability": Method(solve=_integrability, unknowns=3, resolvers=tuple(RESOLVERS)),
-    "four_harmonics": Method(solve=_four_harmonics, unknowns=4),
-    "nine_harmonics": Method(solve=_nine_harmonics, unknowns=9),
+    "four_harmonics": Method(solve=_four_harmonics, unknowns=4, robust=False),
+    "nine_harmonics": Method(solve=_nine_harmonics, unknowns=9, robust=False),
 }

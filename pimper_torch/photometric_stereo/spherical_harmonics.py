@@ -31,9 +31,12 @@ from pimper_torch.photometry.cone import project_to_cone, split_shading
 from pimper_torch.photometry.spectral import upgrade_to_cone
 from pimper_torch.records import Record
 
-# Random Lorentz transformations from which the integrable one is looked for; boosts of a rapidity
-# beyond 1 flatten the normals of a sphere to a cap of 30 degrees.
-_STARTS, _RAPIDITY = 48, 0.7
+# Random Lorentz transformations from which the integrable one is looked for: boosts of this
+# rapidity from where the mean of all shading vectors has no direction.
+_STARTS, _RAPIDITY = 48, 1.0
+# Boosts without end make all normals the same, and every field of one normal is integrable. The
+# mean normal of a visible half ball has a Lorentz factor of 1.3, of normals within 20 degrees 6.
+_LORENTZ_FACTOR = 6.0
 _STEPS, _ROUNDS = 40, 5
 _NUDGE = 1e-6  # of forward differences in float64
 _LEAST_GAIN = 1e-6  # a step that gains less of the misfit is the last
@@ -76,7 +79,7 @@ def four_harmonic_stereo(
     mask: Bool[Tensor, "height width"],
     generator: torch.Generator,
     *,
-    robust: bool = True,
+    robust: bool = False,
 ) -> Harmonic:
     """Recover shading and lights from photographs under first-order light; convex.
 
@@ -94,12 +97,16 @@ def four_harmonic_stereo(
         weight: Not negative; 0 where missing.
         mask: Where the pixels are.
         generator: Of the starts; on the CPU.
-        robust: Whether highlights and shadows lose weight.
+        robust: Whether what harmonics do not explain loses weight: highlights, but also what
+            lamps leave in attached shadow, so leave it for soft light.
 
     Raises:
         InputError: Fewer than four views, or too few pixels for integrability.
 
-    Fails where shadows are cast, which no harmonics of the normal make. Constant to autograd.
+    Fails where shadows are cast, which no harmonics of the normal make; where all lights come
+    from a narrow cone, as lamps without shadows are of rank three and leave the quadric free;
+    and for a surface of revolution seen along its axis, where boosts along the axis are
+    integrable too. Constant to autograd.
     """
     with torch.no_grad():
         found = factorize_photographs(radiance, weight, 4, robust=robust, shadows="none")
@@ -124,7 +131,7 @@ def nine_harmonic_stereo(
     mask: Bool[Tensor, "height width"],
     generator: torch.Generator,
     *,
-    robust: bool = True,
+    robust: bool = False,
 ) -> Harmonic:
     r"""Refine the first-order solution by light of second order; convex.
 
@@ -231,7 +238,8 @@ def _upright(
     generator: torch.Generator,
 ) -> tuple[Ambiguity, float]:
     """Find the Lorentz transformation after which normals are a convex surface's."""
-    matrix, curl = _surface(curls(cone, weight, mask, noise), generator)
+    mean = (weight * cone).sum(dim=1)
+    matrix, curl = _surface(curls(cone, weight, mask, noise), mean, generator)
     signs = torch.ones(4).to(matrix)
     # Slopes may change their sign with n_z, or with n_x and n_y: integrability cannot tell.
     signs[3] = torch.where((weight * (matrix @ cone)[3].sign()).sum() > 0, -1.0, 1.0)
@@ -239,20 +247,29 @@ def _upright(
     return Ambiguity(matrix=signs[:, None] * matrix), curl
 
 
-def _surface(equations: Curls, generator: torch.Generator) -> tuple[Float[Tensor, "4 4"], float]:
-    """Find the Lorentz transformation whose space rows are integrable; Gauss-Newton, batched."""
+def _surface(
+    equations: Curls, mean: Float[Tensor, " 4"], generator: torch.Generator
+) -> tuple[Float[Tensor, "4 4"], float]:
+    """Find the Lorentz transformation whose space rows are integrable; Gauss-Newton, batched.
+
+    Args:
+        equations: Of integrability.
+        mean: Of the shading vectors.
+        generator: Of the starts.
+    """
     drawn = torch.randn(_STARTS, 6, generator=generator, dtype=torch.float64)
     drawn[:, :3] *= _RAPIDITY
     drawn[:, 3:] *= 2.0  # rotations of any angle
     drawn[0] = 0
-    matrix = lorentz(drawn).to(equations.weight)
+    at_rest = lorentz(drawn).to(mean) @ _to_rest(mean)
+    matrix = torch.cat([torch.eye(4).to(mean)[None], at_rest])
     weighed = equations
     metric = both_ways(equations.noise)
     for turn in range(_ROUNDS):
         full, terms = moments(weighed)
         values, vectors = torch.linalg.eigh(full)
         root = values.clamp_min(0).sqrt()[:, None] * vectors.mT
-        matrix, cost = _descend(matrix, root, metric)
+        matrix, cost = _descend(matrix, root, metric, mean)
         best = int(cost.argmin())
         solution = _bivectors(matrix[best])
         weighed = equations.replace(weight=reweighed(equations, solution))
@@ -263,18 +280,29 @@ def _surface(equations: Curls, generator: torch.Generator) -> tuple[Float[Tensor
     return matrix[best], float(share.clamp_min(0).sqrt())
 
 
+def _to_rest(vector: Float[Tensor, " 4"]) -> Float[Tensor, "4 4"]:
+    """Give the boost after which a vector inside the cone has no space part; else nothing."""
+    length = vector[1:].norm()
+    if not bool((length > 0) & (length < vector[0])):
+        return torch.eye(4).to(vector)
+    rapidity = torch.atanh(length / vector[0])
+    still = torch.zeros_like(vector[1:])
+    return lorentz(torch.cat([-rapidity * vector[1:] / length, still]))
+
+
 def _descend(
     matrix: Float[Tensor, "start 4 4"],
     root: Float[Tensor, "row both"],
     metric: Float[Tensor, "both both"],
+    mean: Float[Tensor, " 4"],
 ) -> tuple[Float[Tensor, "start 4 4"], Float[Tensor, " start"]]:
     nudges = lorentz(_NUDGE * torch.eye(6).to(matrix))
     eye = torch.eye(6).to(matrix)
     damping = torch.full_like(matrix[:, 0, 0], 1e-2)
-    residual = _residual(matrix, root, metric)
+    residual = _residual(matrix, root, metric, mean)
     cost = residual.square().sum(dim=-1)
     for _ in range(_STEPS):
-        nudged = _residual(nudges @ matrix[:, None], root, metric)
+        nudged = _residual(nudges @ matrix[:, None], root, metric, mean)
         J = (nudged - residual[:, None]) / _NUDGE  # start, generator, row
         normal = J @ J.mT
         ridge = damping * normal.diagonal(dim1=1, dim2=2).mean(dim=1) + 1e-300
@@ -282,7 +310,7 @@ def _descend(
         step = torch.linalg.solve(normal + ridge[:, None, None] * eye, rhs)[..., 0]
         step = step * (1 / step.norm(dim=1, keepdim=True).clamp_min(1e-30)).clamp_max(1)
         moved = lorentz(step) @ matrix
-        after = _residual(moved, root, metric)
+        after = _residual(moved, root, metric, mean)
         better = after.square().sum(dim=-1) < cost
         matrix = torch.where(better[:, None, None], moved, matrix)
         residual = torch.where(better[:, None], after, residual)
@@ -295,11 +323,16 @@ def _residual(
     matrix: Float[Tensor, "*batch 4 4"],
     root: Float[Tensor, "row both"],
     metric: Float[Tensor, "both both"],
+    mean: Float[Tensor, " 4"],
 ) -> Float[Tensor, "*batch row"]:
-    """Give the equations' sums in units of what noise would make of them."""
+    """Give the equations' sums in units of what noise would make of them, dearer with boosts."""
     both = _bivectors(matrix)
     noise = ((both @ metric) * both).sum(dim=-1, keepdim=True)
-    return (both @ root.mT) / noise.sqrt()
+    moved = matrix @ mean
+    time, space = moved[..., :1], moved[..., 1:]
+    mass = (time.square() - space.square().sum(dim=-1, keepdim=True)).abs().clamp_min(1e-300)
+    factor = time.square() / mass
+    return (both @ root.mT) / noise.sqrt() * (1 + factor / _LORENTZ_FACTOR**2).sqrt()
 
 
 def _bivectors(matrix: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch both"]:

@@ -67,7 +67,7 @@ def photometric_stereo(
     intrinsics: Float[Tensor, "3 3"] | None = None,
     weight: Float[Tensor, "..."] | None = None,
     generator: torch.Generator | None = None,
-    robust: bool = True,
+    robust: bool | None = None,
     ambient: bool = False,
 ) -> PhotometricStereo:
     """Recover normals and albedo from photographs of one viewpoint under changing light.
@@ -80,7 +80,8 @@ def photometric_stereo(
                               albedo (``resolve``)
     ``integrability``         lamps                                         bas-relief, chosen
                                                                             by ``resolve``
-    ``four_harmonics``        any, without cast shadows                     convex or concave
+    ``four_harmonics``        any, from all sides of the viewer, without    convex or concave
+                              cast shadows
     ``nine_harmonics``        the same, more exactly                        convex or concave
     ========================  ============================================  =================
 
@@ -99,7 +100,8 @@ def photometric_stereo(
         weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
             known to be in shadow.
         generator: On the CPU; for harmonics only, by default with the seed 0.
-        robust: Whether shadows and highlights lose weight.
+        robust: Whether shadows and highlights lose weight; by default with lamps, but not with
+            harmonics, which explain attached shadows.
         ambient: For ``calibrated``: whether each pixel has a radiance of its own.
 
     Raises:
@@ -136,7 +138,7 @@ def photometric_stereo(
             lights=None if lights is None else lights[used].double(),
             intrinsics=None if intrinsics is None else intrinsics.double(),
             generator=torch.Generator().manual_seed(0) if generator is None else generator,
-            robust=robust,
+            robust=chosen.robust if robust is None else robust,
             ambient=ambient,
         )
         if problem.lights is not None:

@@ -69,7 +69,7 @@ def test_soft_light_is_explained_by_harmonics(bumpy, patchwork, generator, angle
     lights[:, 3] -= 0.4
     shade = lights[:, :1] + lights[:, 1:] @ bumpy.columns
     images = COLOURS[:, None, None] * bumpy.raster(patchwork(bumpy) * shade)
-    found = photometric_stereo(images, bumpy.mask, method=method, robust=False)
+    found = photometric_stereo(images, bumpy.mask, method=method)
     assert found.lights.shape == (15, 4 if method == "four_harmonics" else 9)
     assert angles_deg(found.normals[bumpy.mask].mT, bumpy.columns).mean() < 1
     ratio = found.albedo[bumpy.mask] / (COLOURS * patchwork(bumpy)[:, None])
