@@ -132,7 +132,8 @@ def measure(scene: Scene, methods: list[str]) -> None:
                 **settings,
             )
         except PimperError as error:
-            say(f"| {name} | {label} | {resolve or ''} | {error} |" + " |" * 6)
+            refusal = str(error).split(";")[0]
+            say(f"| {name} | {label} | {resolve or ''} | {refusal} |" + " |" * 6)
             continue
         seconds = time.perf_counter() - began
         cells = figures(found, truth, scene.lights)
@@ -143,6 +144,8 @@ def figures(found: PhotometricStereo, truth: Tensor, lights: Tensor) -> list[str
     """Compare normals and lights with the truth, and once more with the best ambiguity."""
     known = (truth != 0).any(dim=-1)
     both = found.valid & known
+    if not both.any():
+        return ["0.0", *["-"] * 5]
     normals, true = found.normals[both].mT.double(), truth[both].mT.double()
     off = angles_deg(normals, true)
     cells = [

@@ -40,7 +40,7 @@ _LORENTZ_FACTOR = 6.0
 _STEPS, _ROUNDS = 40, 5
 _NUDGE = 1e-6  # of forward differences in float64
 _LEAST_GAIN = 1e-6  # a step that gains less of the misfit is the last
-_MAX_PIXELS = 2000  # for the map from nine dimensions to normals, which has 27 numbers
+_MAX_PIXELS = 1000  # for the map from nine dimensions to normals, which has 27 numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
