@@ -1,0 +1,183 @@
+r"""Radiance on known lights, pixel by pixel: plain least squares, and indifferent to outliers.
+
+A pixel's radiance under lights ``l`` is :math:`x_v = l_v^\top b`; the rows of the lights may
+be directions, harmonics, or the left factor of a factorization, of which only the product
+with ``b`` has a meaning.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.photometry.lights import CAUCHY_TUNING
+from pimper_torch.photometry.quadratics import PackedCholesky, diagonal, outer
+from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.records import Record
+
+# Of the rounds of re-weighting: the scale starts this many times too wide and narrows to its own
+# value, so that a bad start does not decide which samples are outliers.
+_WIDEST, _NARROWING = 4.0, 0.7
+# Residuals below this share of the brightness are never outliers: 8 bits have 4e-3 steps.
+_LEAST_SCALE = 1e-4
+
+Shadows = Literal["attached", "none"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Regressed(Record):
+    """What a regression found.
+
+    Attributes:
+        shading: ``b`` of every pixel; zero where nothing was seen.
+        weight: What each sample was given in the end; 0 where it lies in shadow.
+        base: What every view of a pixel has in common besides ``l . b``; zero if not asked for.
+    """
+
+    shading: Float[Tensor, "unknown pixel"]
+    weight: Float[Tensor, "view pixel"]
+    base: Float[Tensor, " pixel"]
+
+
+def regress(
+    radiance: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    lights: Float[Tensor, "view unknown"],
+    *,
+    robust: bool = True,
+    shadows: Shadows = "attached",
+    base: bool = False,
+    rounds: int = 15,
+) -> Regressed:
+    r"""Fit each pixel's shading vector to its radiance.
+
+    Plain: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
+    weights, whose scale is 2.385 spreads of the residuals of all pixels together; a view whose
+    light would fall on the back (:math:`l_v^\top b \le 0`) says nothing, if shadows are
+    attached. The start trusts samples by their brightness, up to the pixel's median: shadows
+    are dark.
+
+    Args:
+        radiance: Linear, gray. Samples without weight do not matter.
+        weight: Not negative; 0 where missing.
+        lights: One row a view.
+        robust: Whether to re-weight.
+        shadows: What a light from behind leaves: ``attached`` nothing, ``none`` less than nothing.
+        base: Whether radiance has a part that all views of a pixel share, such as ambient light.
+        rounds: Of re-weighting.
+
+    Returns:
+        In float64. A pixel with less to go on than it has unknowns takes one of its best fits;
+        see :func:`determined`. Constant to autograd.
+
+    Source: Holland & Welsch 1977 for the weights; that they replace thresholds on shadows and
+    highlights is common practice since Ikehata et al., CVPR 2012.
+    """
+    with torch.no_grad():
+        seen = weight > 0
+        x = torch.where(seen, radiance, 0).double()
+        given = weight.double()
+        rows = lights.double()
+        if not robust:
+            return _fit(x, given, torch.zeros_like(given), rows, base)
+        found = _fit(x, given * brightness(x, seen, base), torch.zeros_like(given), rows, base)
+        for turn in range(rounds):
+            direct = rows @ found.shading
+            trust, lit = reweigh(
+                x - found.base, given, direct, max(1.0, _WIDEST * _NARROWING**turn), shadows
+            )
+            found = _fit(x, trust * lit, trust * ~lit, rows, base)
+        return found
+
+
+def reweigh(
+    radiance: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    predicted: Float[Tensor, "view pixel"],
+    widen: float,
+    shadows: Shadows,
+) -> tuple[Float[Tensor, "view pixel"], Bool[Tensor, "view pixel"]]:
+    """Give samples the weights that their residuals deserve.
+
+    Args:
+        radiance: What was seen.
+        weight: What was given.
+        predicted: What a fit expects, below zero for lights from behind.
+        widen: Times the scale.
+        shadows: Whether lights from behind leave darkness.
+
+    Returns:
+        The weights, and whether a light comes from the front.
+    """
+    lit = predicted > 0 if shadows == "attached" else torch.ones_like(weight, dtype=torch.bool)
+    residual = torch.where(lit, radiance - predicted, radiance)
+    seen = (weight > 0) & lit
+    level = radiance[seen].abs().mean() if seen.any() else radiance.new_ones(())
+    scale = CAUCHY_TUNING * spread(residual.flatten(), seen.flatten())
+    return weight * cauchy_weights(residual, widen * scale.maximum(_LEAST_SCALE * level)), lit
+
+
+def brightness(
+    radiance: Float[Tensor, "view pixel"], seen: Bool[Tensor, "view pixel"], base: bool = False
+) -> Float[Tensor, "view pixel"]:
+    """Trust samples by their brightness, up to the median of the pixel."""
+    x = torch.where(seen, radiance, torch.nan)
+    if base:
+        x = x - x.nan_to_num(nan=torch.inf).amin(dim=0)
+    middle = x.nanmedian(dim=0).values.nan_to_num(nan=0.0)
+    middle = torch.where(middle > 0, middle, x.nan_to_num(nan=0.0).amax(dim=0))
+    share = x.nan_to_num(nan=0.0).clamp_min(0) / torch.where(middle > 0, middle, 1)
+    return share.clamp_max(1)
+
+
+def determined(
+    weight: Float[Tensor, "view pixel"],
+    lights: Float[Tensor, "view unknown"],
+    least: float = 1e-4,
+) -> tuple[Bool[Tensor, " pixel"], Bool[Tensor, " pixel"]]:
+    """Tell which pixels have as many samples as unknowns, and lights that span them.
+
+    Args:
+        weight: Of the samples, as a regression left them.
+        lights: The scale of each column does not matter.
+        least: Variance of the best direction over that of the worst. Below 1e-4, noise of 1 %
+            in the images is as large as the answer.
+
+    Returns:
+        Enough samples with a tenth of the largest weight or more; lights that span.
+    """
+    count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
+    size = lights.double().norm(dim=0)
+    basis = lights.double() / torch.where(size > 0, size, 1)
+    unknowns = lights.shape[1]
+    packed = (outer(basis.mT) @ weight.double()).mT
+    rows, columns = torch.triu_indices(unknowns, unknowns)
+    full = packed.new_zeros(len(packed), unknowns, unknowns)
+    full[:, rows, columns] = packed
+    full[:, columns, rows] = packed
+    values = torch.linalg.eigvalsh(full)
+    spanned = values[:, 0] > least * values[:, -1]
+    return count >= unknowns, spanned & (values[:, -1] > 0)
+
+
+def _fit(
+    x: Float[Tensor, "view pixel"],
+    lit: Float[Tensor, "view pixel"],
+    dark: Float[Tensor, "view pixel"],
+    rows: Float[Tensor, "view unknown"],
+    base: bool,
+) -> Regressed:
+    """Solve the normal equations; samples in the dark inform the base only."""
+    if base:
+        rows = torch.cat([rows, torch.ones_like(rows[:, :1])], dim=1)
+    packed = outer(rows.mT) @ lit
+    rhs = rows.mT @ (lit * x)
+    if base:
+        packed[diagonal(rows.shape[1])[-1]] += dark.sum(dim=0)
+        rhs[-1] += (dark * x).sum(dim=0)
+    solution = PackedCholesky(packed, rows.shape[1]).solve(rhs)
+    if base:
+        return Regressed(shading=solution[:-1], weight=lit, base=solution[-1])
+    return Regressed(shading=solution, weight=lit, base=torch.zeros_like(solution[0]))
