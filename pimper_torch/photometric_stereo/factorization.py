@@ -17,7 +17,7 @@ from pimper_torch.photometric_stereo.regression import (
     regress,
     reweigh,
 )
-from pimper_torch.photometry.low_rank import random_left
+from pimper_torch.photometry.low_rank import low_rank_problem, random_left
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
 
@@ -120,13 +120,11 @@ def _best_start(
         assert generator is not None
         begin.append(random_left(1, len(x), rank, generator)[0].to(x))
     count = len(begin)
-    solved = solve_variable_projection(
-        x.expand(count, -1, -1),
-        weight.expand(count, -1, -1),
-        torch.stack(begin),
-        max_iterations=_FIRST_STEPS,
+    problem = low_rank_problem(
+        x.expand(count, -1, -1), weight.expand(count, -1, -1), torch.stack(begin)
     )
-    return solved.left[int(solved.convergence.residual.argmin())]
+    solved = solve_variable_projection(problem, _FIRST_STEPS)
+    return solved.lights[int(solved.convergence.residual.argmin())]
 
 
 def _settle(
@@ -139,12 +137,11 @@ def _settle(
     """Alternate weights and factors, weights from wide to their own scale."""
     weight = first
     for turn in range(_TURNS):
-        solved = solve_variable_projection(
-            x[None], weight[None], left[None], max_iterations=_NEXT_STEPS
-        )
-        left = solved.left[0]
+        problem = low_rank_problem(x[None], weight[None], left[None])
+        solved = solve_variable_projection(problem, _NEXT_STEPS)
+        left = solved.lights[0]
         widen = max(1.0, _WIDEST * _NARROWING**turn)
-        trust, lit = reweigh(x, given, left @ solved.right[0], widen, shadows)
+        trust, lit = reweigh(x, given, left @ solved.shading[0], widen, shadows)
         weight = trust * lit
     return left
 
