@@ -306,7 +306,7 @@ def _best_shading(matrix: Matrix, lights: Float[Tensor, "view 4"]) -> Float[Tens
     for part in chunks(matrix.seen.shape[1]):
         some = matrix.take(part)
         shading = start_from_mesh(
-            some.radiance[None], some.seen[None], lights[None], some.normals[None]
+            some.radiance[None], some.seen[None], lights[None], harmonics(some.normals).mT[None]
         )
         parts.append(shading[0])
     return torch.cat(parts, dim=1)

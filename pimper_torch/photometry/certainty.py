@@ -61,20 +61,30 @@ def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
 
 def fit_albedo(
     radiance: Float[Tensor, "patch view channel sample"],
-    weight: Float[Tensor, "patch view sample"],
-    shading: Float[Tensor, "patch view sample"],
+    weight: Float[Tensor, "patch view light sample"],
+    lights: Float[Tensor, "patch view light rank"],
+    basis: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch channel sample"]:
-    """Give every channel's albedo in closed form, shading ``l . (1, n)`` given.
+    """Give every channel's albedo in closed form, lights and normals given.
+
+    Args:
+        radiance: Linear.
+        weight: Of each entry.
+        lights: One for all channels, or one each; so the weights.
+        basis: What albedo 1 makes of the normals.
 
     Not negative; zero where nothing is lit. Differentiable.
     """
-    lit = weight * shading
-    square = (lit * shading).sum(dim=1)
-    product = torch.einsum("pfk,pfck->pck", lit, radiance)
-    some = square > torch.finfo(square.dtype).tiny ** 0.5
-    return torch.where(some[:, None], product / torch.where(some, square, 1)[:, None], 0).clamp_min(
-        0
-    )
+    channels = []
+    for channel in range(radiance.shape[2]):
+        light = channel % lights.shape[2]
+        shading = lights[:, :, light] @ basis
+        lit = weight[:, :, light] * shading
+        square = (lit * shading).sum(dim=1)
+        product = (lit * radiance[:, :, channel]).sum(dim=1)
+        some = square > torch.finfo(square.dtype).tiny ** 0.5
+        channels.append(torch.where(some, product / torch.where(some, square, 1), 0))
+    return torch.stack(channels, dim=1).clamp_min(0)
 
 
 def light_varies(

@@ -17,12 +17,13 @@ from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver, select
 from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold
+from pimper_torch.photometry.colour import solve_in_colour, split_colours
 from pimper_torch.photometry.coupled import Batch, solve_coupled
 from pimper_torch.photometry.descent import solve_descent
-from pimper_torch.photometry.harmonics import harmonics, rotate_lights
+from pimper_torch.photometry.harmonics import rotate_lights
 from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.light_field import LightField, faces_lamp
-from pimper_torch.photometry.manifolds import Cone
+from pimper_torch.photometry.manifolds import Cone, Free, Manifold, SecondOrder
 from pimper_torch.photometry.mesh_light import light_of_mesh
 from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Loss, Squares
 from pimper_torch.photometry.rows import Rows, coarse_normals, on_raster, rows_of
@@ -52,6 +53,8 @@ LEAST_PULL = 1e-6
 
 # The Gauss-Newton matrix of a patch's lights is summed over about this many samples.
 CURVATURE_SAMPLES = 512
+
+MANIFOLDS: dict[int, Manifold] = {3: Free(), 4: Cone(), 9: SecondOrder()}
 
 SOLVERS: dict[str, Solver] = {
     "variable-projection": partial(
@@ -83,6 +86,9 @@ class FactorizeConfig:
         light: What is fitted to the coarse mesh: ``"soft"``, one first-order light a view all
             over the scene; ``"lamp"``, an ambient term and a lamp at some place, with attached
             shadows; ``"auto"``, the one of them that explains the photographs better.
+        rank: Of the light: 3, a distant lamp and nothing else; 4, first order; 9, second order.
+        colour: Whether every channel has lights of its own, with normals shared: for lamps of
+            different colours. Takes several times as long.
         start: Where lights and normals start: ``"mesh"``, lights fitted to the coarse
             mesh; ``"svd"``, the data's own factors, whose Lorentz ambiguity is then fixed by
             the lights that the mesh gives.
@@ -110,6 +116,8 @@ class FactorizeConfig:
     """
 
     light: Literal["auto", "soft", "lamp"] = "auto"
+    rank: Literal[3, 4, 9] = 4
+    colour: bool = False
     start: Literal["mesh", "svd"] = "mesh"
     solver: Literal["variable-projection", "alternation", "balm", "descent"] = "variable-projection"
     light_pull: float = 1.0
@@ -125,6 +133,12 @@ class FactorizeConfig:
     def __post_init__(self) -> None:
         models = ("auto", "soft", "lamp")
         require(self.light in models, "factorize.light", self.light, "auto, soft or lamp")
+        require(self.rank in MANIFOLDS, "factorize.rank", self.rank, "3, 4 or 9")
+        plain = self.rank == 4 and not self.colour
+        one = plain or self.light_coupling == 0
+        require(one, "factorize.light_coupling", self.light_coupling, "0 unless gray, of rank 4")
+        four = self.rank == 4 or self.start == "mesh"
+        require(four, "factorize.start", self.start, "mesh unless rank 4")
         require(self.start in ("mesh", "svd"), "factorize.start", self.start, "mesh or svd")
         require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
         require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
@@ -154,7 +168,7 @@ class _Posed(Record):
     """Their factorization, ready to be solved."""
 
     rows: Rows
-    anchor: Float[Tensor, "patch view 4"]
+    anchor: Float[Tensor, "patch view rank"]
     verdict: Int[Tensor, " patch"]
     problem: Bilinear
 
@@ -213,8 +227,8 @@ class Factorize(nn.Module):
         found = []
         for place, chunk in enumerate(track(everything)):
             posed = self._pose(chunk, field)
-            factors = self._solve(posed.problem) if coupled is None else coupled[place]
-            found.append(self._conclude(chunk, posed, factors))
+            solved = self._solve(posed) if coupled is None else (posed.problem, coupled[place])
+            found.append(self._conclude(chunk, posed, *solved))
         rest = iter(found)
         buckets = [_joined([next(rest) for _ in bucket]) for bucket in chunks]
         warn_of_verdicts(buckets, config.min_views, config.min_light_variation)
@@ -224,7 +238,7 @@ class Factorize(nn.Module):
         config = self.config
         patch_from_world = chunk.templates.patch_from_world.to(chunk.normals)
         middle = invert_rigid(patch_from_world)[:, :3, 3]
-        anchor = rotate_lights(patch_from_world, field.lights_at(middle))
+        anchor = _of_rank(rotate_lights(patch_from_world, field.lights_at(middle)), config.rank)
         lamp = rotate(patch_from_world, field.lamp_at(middle))
         rows = rows_of(chunk.templates, chunk.registered, chunk.normals)
         rows = rows.replace(seen=rows.seen & faces_lamp(lamp, rows.normals))
@@ -240,11 +254,13 @@ class Factorize(nn.Module):
         problem = self._problem(rows, anchor, raster)
         return _Posed(rows=rows, anchor=anchor, verdict=verdict, problem=problem)
 
-    def _conclude(self, chunk: _Chunk, posed: _Posed, factors: Factors) -> Photometry:
+    def _conclude(
+        self, chunk: _Chunk, posed: _Posed, problem: Bilinear, factors: Factors
+    ) -> Photometry:
         rows, normals = posed.rows, chunk.normals
-        if posed.problem.radiance.requires_grad and self.config.light_coupling == 0:
-            factors = differentiable(posed.problem, factors)
-        found = refine_on_manifold(posed.problem, factors)
+        if problem.radiance.requires_grad and self.config.light_coupling == 0:
+            factors = differentiable(problem, factors)
+        found = refine_on_manifold(problem, factors)
         sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
         lit = rows.seen.sum(dim=1) >= self.config.min_views
         sound = factors.lights.isfinite().flatten(1).all(dim=1) & (sure & lit).any(dim=1)
@@ -252,36 +268,45 @@ class Factorize(nn.Module):
         verdict = torch.where(failed, int(PatchVerdict.FAILED), posed.verdict)
         determined = verdict == int(PatchVerdict.DETERMINED)
         valid = lit & determined[:, None] & sure & (found.normals[..., 2] < 0)
-        lights = torch.where(determined[:, None, None], factors.lights, posed.anchor)
-        lights = lights * rows.seen.any(dim=2)[..., None]
+        # In colour every channel is a view of the problem.
+        channels = problem.radiance.shape[1] // rows.seen.shape[1]
+        anchor = posed.anchor.repeat_interleave(channels, dim=1)
+        lights = torch.where(determined[:, None, None], factors.lights, anchor)
+        by_channel = (len(lights), rows.seen.shape[1], channels, -1)
+        lights = lights.reshape(by_channel) * rows.seen.any(dim=2)[..., None, None]
         chosen = torch.where(valid[..., None], found.normals, rows.normals)
-        weight = torch.where(determined[:, None, None], factors.weight, posed.problem.weight)
-        albedo = fit_albedo(rows.radiance, weight, lights @ harmonics(chosen).mT)
+        weight = torch.where(determined[:, None, None], factors.weight, problem.weight)
+        basis = problem.manifold.join(torch.ones_like(chosen[..., 0]), chosen).mT
+        albedo = fit_albedo(rows.radiance, weight.reshape(by_channel), lights, basis)
         nothing = torch.zeros_like(chunk.registered.valid[:, 0])
         blank = torch.zeros_like(normals[..., 0])
         black = blank[..., None].expand(-1, -1, -1, albedo.shape[1])
         return Photometry(
             normals_patch=on_raster(chosen, rows.place, normals),
             albedo=on_raster(albedo.mT, rows.place, black),
-            lights_patch=lights,
+            lights_patch=_with_ambient(lights.mean(dim=2)),
             valid=on_raster(valid, rows.place, nothing),
             confidence=on_raster(found.confidence * valid, rows.place, blank),
             verdict=verdict,
             convergence=factors.convergence,
         )
 
-    def _problem(self, rows: Rows, anchor: Float[Tensor, "patch view 4"], raster: int) -> Bilinear:
+    def _problem(
+        self, rows: Rows, anchor: Float[Tensor, "patch view rank"], raster: int
+    ) -> Bilinear:
         config = self.config
         gray = rows.radiance.mean(dim=2)
         with torch.no_grad():
             weight = rows.seen.to(gray.dtype)
-            shading = start_from_mesh(gray, rows.seen, anchor, rows.normals)
+            manifold = MANIFOLDS[config.rank]
+            basis = manifold.join(torch.ones_like(rows.normals[..., 0]), rows.normals).mT
+            shading = start_from_mesh(gray, rows.seen, anchor, basis)
             lights = anchor
             if config.start == "svd":
                 lights, shading = start_from_data(gray, rows.seen, anchor, shading)
             if config.light_pull == 0 and config.light_coupling == 0:
                 anchor = lights
-            square = shading[:, 0] ** 2
+            square = manifold.split(shading.mT)[0] ** 2
             count = (square > 0).sum(dim=1).clamp_min(1)
             seen_square = (weight @ square[..., None])[..., 0]
             borrowed = BORROWED_SAMPLES * square.sum(dim=1) / count
@@ -291,7 +316,7 @@ class Factorize(nn.Module):
             prior = None
             if config.geometry_weight > 0:
                 gamma = config.geometry_weight * level
-                prior = gamma[:, None, None] * Cone().bend(rows.normals.mT)
+                prior = gamma[:, None, None] * manifold.bend(rows.normals.mT)
         return Bilinear(
             radiance=gray,
             weight=weight,
@@ -300,13 +325,26 @@ class Factorize(nn.Module):
             shading=shading,
             pull=pull,
             prior=prior,
+            manifold=manifold,
             loss=LOSSES[config.loss](config.loss_scale),
             stride=max(1, raster // SPREAD_SAMPLES),
         )
 
-    def _solve(self, problem: Bilinear) -> Factors:
+    def _solve(self, posed: _Posed) -> tuple[Bilinear, Factors]:
+        problem, config = posed.problem, self.config
         data = problem.replace(radiance=problem.radiance.detach())
-        return SOLVERS[self.config.solver](data, self.config.max_iterations, self.config.tolerance)
+        solve, limits = SOLVERS[config.solver], (config.max_iterations, config.tolerance)
+        if not config.colour:
+            return problem, solve(data, *limits)
+        radiance = posed.rows.radiance
+        found = solve_in_colour(data, radiance.detach(), solve, *limits)
+        factors = Factors(
+            lights=found.lights.flatten(1, 2),
+            shading=found.shading,
+            weight=found.weight.flatten(1, 2),
+            convergence=found.convergence,
+        )
+        return split_colours(problem, radiance, found.chroma), factors
 
     def _coupled(
         self, seen: PatchViews, chunks: list[_Chunk], field: LightField
@@ -326,6 +364,20 @@ class Factorize(nn.Module):
         return solve_coupled(
             batches, pairs, config.light_coupling, config.max_iterations, config.tolerance
         )
+
+
+def _of_rank(lights: Float[Tensor, "*batch 4"], rank: int) -> Float[Tensor, "*batch rank"]:
+    """Leave the ambient part out, or add the second order, zero."""
+    if rank == 3:
+        return lights[..., 1:]
+    return torch.cat([lights, lights.new_zeros(*lights.shape[:-1], rank - 4)], dim=-1)
+
+
+def _with_ambient(lights: Float[Tensor, "*batch rank"]) -> Float[Tensor, "..."]:
+    """Give lights without an ambient part the part zero."""
+    if lights.shape[-1] > 3:
+        return lights
+    return torch.cat([torch.zeros_like(lights[..., :1]), lights], dim=-1)
 
 
 def _parts(templates: Templates, num_views: int) -> list[Int[Tensor, " some"]]:

@@ -6,18 +6,16 @@ from torch import Tensor
 
 from pimper_torch.photometry.ambiguity import Ambiguity, align_factorizations
 from pimper_torch.photometry.cone import project_to_cone
-from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.photometry.spectral import factorize_rank_four, upgrade_to_cone
 
 
 def start_from_mesh(
     radiance: Float[Tensor, "patch view sample"],
     seen: Bool[Tensor, "patch view sample"],
-    lights: Float[Tensor, "patch view 4"],
-    normals: Float[Tensor, "patch sample 3"],
-) -> Float[Tensor, "patch 4 sample"]:
-    """Give shading vectors with the mesh's normals and the albedo that fits them best."""
-    basis = harmonics(normals).mT
+    lights: Float[Tensor, "patch view rank"],
+    basis: Float[Tensor, "patch rank sample"],
+) -> Float[Tensor, "patch rank sample"]:
+    """Give shading vectors along a basis, that of the mesh's normals, with the best albedo."""
     shading = lights @ basis
     weight = seen.to(radiance.dtype)
     square = (weight * shading**2).sum(dim=1)

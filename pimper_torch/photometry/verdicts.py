@@ -17,7 +17,7 @@ def judge_data(
     templates: Templates,
     registered: Registered,
     seen: Bool[Tensor, "patch view sample"],
-    lights: Float[Tensor, "patch view 4"],
+    lights: Float[Tensor, "patch view rank"],
     min_views: int,
     min_light_variation: float,
 ) -> Int[Tensor, " patch"]:

@@ -134,6 +134,46 @@ def test_coupled_lights_agree_in_the_world_and_keep_the_normals(scene, coupling)
     assert median_error(coupled, true) < median_error(free, true)
 
 
+@pytest.mark.parametrize("rank", [3, 9])
+def test_other_orders_of_light_find_the_bumps_too(scene, rank):
+    true = scene()
+    # Without ambient light in the photographs rank three explains them, and nine more than so.
+    lights = true.lights * torch.tensor([0.0 if rank == 3 else 1.0, 1, 1, 1])
+    true = scene(lights=lights, views=12)
+    config = FactorizeConfig(rank=rank, light="soft", loss="squares", geometry_weight=1e-3)
+    found = Factorize(config)(true.seen)
+    coarse = [coarse_normals(true.seen.patches.coarse, each) for each in true.seen.patches.buckets]
+    before = torch.cat(
+        [
+            angles_deg(mesh, truth, bucket.valid)
+            for bucket, mesh, truth in zip(found.buckets, coarse, true.normals, strict=True)
+        ]
+    ).median()
+    assert median_error(found, true) < 0.6 * before
+    assert found.buckets[0].lights_patch.shape[-1] == max(rank, 4)
+
+
+def test_lamps_of_different_colours_are_told_from_colours_of_the_surface(scene, generator):
+    true = scene()
+    tint = 0.5 + torch.rand(12, 3, generator=generator, dtype=torch.float64)
+    seen = true.seen.replace(
+        buckets=tuple(
+            each.replace(radiance=each.radiance * tint[:, :, None, None])
+            for each in true.seen.buckets
+        )
+    )
+    gray, colour = (
+        Factorize(FactorizeConfig(light="soft", geometry_weight=1e-3, colour=use))(seen)
+        for use in (False, True)
+    )
+    assert median_error(colour, true) < median_error(gray, true)
+    for found, worst in ((colour, 0.05), (gray, 1.0)):
+        bucket, truth = found.buckets[0], true.albedo[0]
+        ratio = (bucket.albedo / truth)[bucket.valid]
+        ratio = ratio / ratio.median(dim=0).values
+        assert (ratio - 1).abs().median() < worst
+
+
 def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(lights=light * torch.linspace(0.5, 1.5, 12, dtype=torch.float64)[:, None])
@@ -254,6 +294,9 @@ def test_what_is_handed_in_is_left_alone(scene):
     [
         {"light_pull": -1.0},
         {"light_coupling": -1.0},
+        {"light_coupling": 1.0, "rank": 9},
+        {"light_coupling": 1.0, "colour": True},
+        {"start": "svd", "rank": 3},
         {"geometry_weight": -0.1},
         {"loss_scale": 0.0},
         {"min_views": 2},
@@ -267,7 +310,7 @@ def test_impossible_settings_are_refused(wrong):
         FactorizeConfig(**wrong)
 
 
-@pytest.mark.parametrize("field", ["start", "solver"])
+@pytest.mark.parametrize("field", ["start", "solver", "loss", "light"])
 def test_unknown_ways_are_refused(field):
     config = FactorizeConfig()
     object.__setattr__(config, field, "random")  # past the type checker of the tests
