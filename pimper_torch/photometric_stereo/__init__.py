@@ -1,0 +1,1 @@
+"""Photometric stereo from one viewpoint."""
