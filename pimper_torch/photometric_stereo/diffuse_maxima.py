@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import conv2d, max_pool2d, pad
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometric_stereo.factors import (
@@ -36,6 +36,8 @@ from pimper_torch.records import Record
 # Maxima whose pairs are tried; pairs are half their square.
 _MOST_MAXIMA = 120
 _REFINEMENTS = 30
+# Share of a view's brightest value below which a pixel may be in shadow.
+_SHADOW = 0.05
 # Maxima that are where the surface faces the lamp: a tenth to a third on textured surfaces.
 _RIGHT = 0.2
 # From the standard form hardly a surface is flatter than this, and none as steep.
@@ -138,21 +140,17 @@ def find_maxima(
             be about Euclidean.
         radius: Of the square.
     """
-    values = images.double().sum(dim=1)
-    bright = values > 0.05 * values.flatten(1).amax(dim=1)[:, None, None]
-    good = (mask & bright).double()[:, None]
-    side = 2 * radius + 1
-    inside = -max_pool2d(-_bordered(good, radius), side, stride=1) > 0
-    smooth = _smoothed(values[:, None])
-    top = max_pool2d(smooth, side, stride=1, padding=radius) == smooth
-    view, row, column = (top & inside)[:, 0].nonzero().mT
-    raster = values.new_zeros(3, *mask.shape)
+    found = [_tops(image.sum(dim=0), mask, radius) for image in images]
+    counts = torch.tensor([len(tops) for tops in found], device=mask.device)
+    view = torch.arange(len(images), device=mask.device).repeat_interleave(counts)
+    row, column = torch.cat(found).mT
+    raster = torch.zeros(3, *mask.shape, dtype=torch.float64, device=mask.device)
     raster[:, mask] = shading.double().nan_to_num()
-    y, x = _offsets(radius, values)
+    y, x = _offsets(radius, mask)
     rows, columns = row[:, None] + y, column[:, None] + x
-    near = values[view[:, None], rows, columns]
-    one = torch.ones_like(x).to(values)
-    u, v = x.to(values), y.to(values)
+    near = images[view[:, None], :, rows, columns].double().sum(dim=-1)
+    u, v = x.double(), y.double()
+    one = torch.ones_like(u)
     basis = torch.stack([one, u, v, u * u / 2, u * v, v * v / 2], dim=1)
     fitted = torch.linalg.lstsq(basis, near.mT).solution
     _, gx, gy, hxx, hxy, hyy = fitted
@@ -260,17 +258,20 @@ def _angles(
     return torch.atan2(cross, (normal * lamp).sum(dim=-2))
 
 
-def _smoothed(values: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 1 height width"]:
-    """Blur by the binomial kernel of five, so that noise makes few maxima of its own."""
-    kernel = values.new_tensor([1.0, 4, 6, 4, 1]) / 16
-    kernel = (kernel[:, None] * kernel)[None, None]
-    return torch.nn.functional.conv2d(values, kernel, padding=2)
+def _tops(
+    image: Float[Tensor, "height width"], mask: Bool[Tensor, "height width"], radius: int
+) -> Int[Tensor, "top 2"]:
+    """Find rows and columns of largest values, their squares inside the mask and out of shadow.
 
-
-def _bordered(
-    good: Float[Tensor, "view 1 height width"], radius: int
-) -> Float[Tensor, "view 1 taller wider"]:
-    return torch.nn.functional.pad(good, (radius,) * 4)
+    The image is blurred by the binomial kernel of five first, as noise makes maxima of its own.
+    """
+    kernel = image.new_tensor([1.0, 4, 6, 4, 1]) / 16
+    smooth = conv2d(image[None, None], (kernel[:, None] * kernel)[None, None], padding=2)
+    side = 2 * radius + 1
+    good = (mask & (image > _SHADOW * image.max())).to(image)
+    inside = -max_pool2d(-pad(good, (radius,) * 4)[None, None], side, stride=1) > 0
+    top = max_pool2d(smooth, side, stride=1, padding=radius) == smooth
+    return (top & inside)[0, 0].nonzero()
 
 
 def _offsets(radius: int, like: Tensor) -> tuple[Int[Tensor, " place"], Int[Tensor, " place"]]:
