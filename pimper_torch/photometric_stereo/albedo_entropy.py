@@ -22,14 +22,14 @@ from pimper_torch.photometry.bas_relief import BasRelief
 _FLATTEST, _STEEPEST, _LAMBDAS = 0.125, 4.0, 23
 _MOST_TILT, _TILTS = 1.0, 17
 
-# The kernel's width in logarithm of albedo at first. Wider ones hide the right minimum: of 16
-# balls and bumps in five albedos, 0.1 on half this grid missed 4, 0.07 missed 2, this 1.
+# The kernel's width in logarithm of albedo at first. A wider one smooths the right minimum away
+# where albedos are close, a narrower one needs a finer grid.
 _FIRST_WIDTH = 0.03
 # How far from the mean, a factor of 20, the histogram reaches.
 _REACH = 3.0
 # Places of the grid that are followed, half of them to the next kernel; pixels looked at meanwhile.
 _FOLLOWED, _FEW_PIXELS = 200, 1000
-# Pixels by candidates at a time: what stays in the cache is four times as quick as millions.
+# Pixels by candidates at a time: few enough to stay in a processor's cache.
 _CHUNK_ENTRIES = 250_000
 
 

@@ -9,6 +9,8 @@ become one.
 Source: Shi, Matsushita, Wei, Xu & Tan, Self-calibrating photometric stereo, CVPR 2010.
 """
 
+import warnings
+
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
@@ -16,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.photometric_stereo.factors import (
     cast,
@@ -34,6 +36,8 @@ _COMPARED = 1000
 # Pairs of pixels with one normal that link two groups; fewer may be chance.
 _LINKING = 20
 _JOININGS = 3
+# Spread of albedo within groups above which paints were mixed: noise of shading is well below.
+_UNEVEN = 0.1
 _STEPS = 50
 
 
@@ -71,8 +75,8 @@ def resolve_by_colour_profiles(
     Returns:
         The transformation with lambda above zero: hills stay hills. Constant to autograd.
 
-    Fails where paints of one colour differ in brightness, as greys do, or where each paint
-    covers normals that lie on a cone: those have one albedo under several reliefs.
+    Fails where paints of one colour differ in brightness, as greys do, of which it warns, or
+    where each paint covers normals on a cone: those have one albedo under several reliefs.
 
     Raises:
         InputError: Grey images, sizes that do not fit, or no group that holds 10 pixels.
@@ -101,6 +105,16 @@ def resolve_by_colour_profiles(
             joined, log_ratio = join_groups(pairs, log_albedo, labels)
             found = _resolved(relief.on_shading(b / log_ratio.exp()), joined).after(relief)
             log_albedo = _log_albedo(b, found)
+        off = _residual(b / log_ratio.exp(), joined, found)
+        left = float(spread(off, torch.ones_like(joined, dtype=torch.bool)))
+        if left > _UNEVEN:
+            warnings.warn(
+                f"within groups of one colour albedo still varies by {100 * left:.0f} %; the "
+                "relief is doubtful. Paints of one colour but different brightness call for "
+                "`resolve_by_albedo_entropy`.",
+                PimperWarning,
+                stacklevel=2,
+            )
         return cast(found, shading)
 
 

@@ -38,7 +38,7 @@ _MOST_MAXIMA = 120
 _REFINEMENTS = 30
 # Share of a view's brightest value below which a pixel may be in shadow.
 _SHADOW = 0.05
-# Maxima that are where the surface faces the lamp: a tenth to a third on textured surfaces.
+# Share of the maxima that are expected where the surface faces the lamp; on one paint more are.
 _RIGHT = 0.2
 # From the standard form hardly a surface is flatter than this, and none as steep.
 _MOST_LOG_LAMBDA = 2.0

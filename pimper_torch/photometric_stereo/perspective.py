@@ -30,8 +30,7 @@ _COLUMNS = 4000
 # Equations for nine unknowns up to scale; with fewer than this many the noise decides.
 _FEWEST = 50
 _REWEIGHTINGS = 4
-# Noise on a ball leaves misfits that differ by up to 10 %; on other scenes, at 1 % of noise, the
-# second is four times the least and more.
+# On a ball noise leaves two misfits that are the same but for chance.
 _DISTINCT = 1.5
 
 

@@ -52,7 +52,7 @@ def test_noise_and_a_second_cue_of_colour(generator):
 
 
 def test_colour_finds_what_brightness_misses():
-    # Without colour the search ends 18 degrees off here: five albedos within a factor of 1.7.
+    # Five albedos within a factor of 1.7, among which the search without colour goes astray.
     generator = torch.Generator().manual_seed(3)
     normals, mask = bumps(48, generator)
     normals, albedo = normals[mask].mT, regions(48, generator)[mask].mT

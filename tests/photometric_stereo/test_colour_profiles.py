@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.photometric_stereo.chromaticity import chromaticities, chromaticity_groups
 from pimper_torch.photometric_stereo.colour_profiles import (
     join_groups,
@@ -113,6 +113,13 @@ def test_linked_groups_resolve_what_none_of_them_can_alone(generator):
     b, lights = HIDDEN.on_shading(made.shading), HIDDEN.on_lights(made.lights)
     found = resolve_by_colour_profiles(made.images, made.mask, b, lights)
     assert error_deg(found.on_shading(b), made.normals) < 0.1
+
+
+def test_greys_are_warned_of(generator):
+    made = seen(generator)
+    grey = made.images.mean(dim=1, keepdim=True).expand_as(made.images)
+    with pytest.warns(PimperWarning, match="still varies"):
+        resolve_by_colour_profiles(grey, made.mask, made.shading, made.lights)
 
 
 def test_what_does_not_fit_is_refused(generator):
