@@ -4,9 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
+from pimper_torch.photometric_stereo.chromaticity import chromaticity_groups
+from pimper_torch.photometric_stereo.colour_profiles import resolve_by_colour_profiles
+from pimper_torch.photometric_stereo.diffuse_maxima import resolve_by_diffuse_maxima
 from pimper_torch.photometric_stereo.factorization import factorize_photographs
 from pimper_torch.photometric_stereo.hayakawa import (
     metric_from_albedo,
@@ -15,6 +19,7 @@ from pimper_torch.photometric_stereo.hayakawa import (
     relief_from_strength,
 )
 from pimper_torch.photometric_stereo.integrability import integrable, turn_to_surface
+from pimper_torch.photometric_stereo.perspective import factorize_in_perspective
 from pimper_torch.photometric_stereo.problem import Problem, Solution, Surfaced
 from pimper_torch.photometric_stereo.regression import determined
 from pimper_torch.photometric_stereo.relief import bulge, rounded_relief
@@ -27,6 +32,39 @@ from pimper_torch.photometric_stereo.woodham import calibrated_stereo, chromatic
 from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.photometry.harmonics import harmonics
 
+
+def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
+    images, mask = _trusted(given, found)
+    groups = chromaticity_groups(images, mask) if images.shape[1] > 1 else None
+    return resolve_by_albedo_entropy(found.shading[:, found.trust > 0], groups)
+
+
+def _by_profiles(given: Problem, found: Surfaced) -> BasRelief:
+    images, mask = _trusted(given, found)
+    return resolve_by_colour_profiles(images, mask, found.shading[:, found.trust > 0], found.lights)
+
+
+def _by_maxima(given: Problem, found: Surfaced) -> BasRelief:
+    images, mask = _trusted(given, found)
+    return resolve_by_diffuse_maxima(images, mask, found.shading[:, found.trust > 0], found.lights)
+
+
+def _trusted(
+    given: Problem, found: Surfaced
+) -> tuple[Float[Tensor, "view channel height width"], Bool[Tensor, "height width"]]:
+    """Give the photographs, and the pixels that are trusted."""
+    mask = torch.zeros_like(given.mask)
+    mask[given.mask] = found.trust > 0
+    return _without_holes(given), mask
+
+
+def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]:
+    """Give the photographs with missing samples black."""
+    images = torch.zeros_like(given.images, dtype=torch.float64)
+    images[:, :, given.mask] = given.radiance
+    return images
+
+
 # How a bas-relief transformation is chosen. "rounded" is a convention; the others measure.
 RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "rounded": lambda given, found: rounded_relief(found.shading, found.trust, given.mask),
@@ -34,6 +72,9 @@ RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "equal_strength": lambda given, found: relief_from_strength(
         found.lights, found.shading, found.trust, given.mask
     ),
+    "albedo_entropy": _by_entropy,
+    "colour_profiles": _by_profiles,
+    "diffuse_maxima": _by_maxima,
 }
 _FACTOR = "a factor between albedo and light"
 
@@ -94,6 +135,21 @@ def _integrability(given: Problem, resolve: str) -> Solution:
         shading=applied.on_shading(surfaced.shading), lights=applied.on_lights(surfaced.lights)
     )
     return _lambertian(given, moved, applied, free)
+
+
+def _perspective(given: Problem, resolve: str) -> Solution:
+    assert given.intrinsics is not None
+    shading, lights = factorize_in_perspective(
+        _without_holes(given), given.mask, given.intrinsics, given.weight > 0
+    )
+    shading, lights = shading.double(), lights.double()
+    found = Surfaced(
+        shading=shading,
+        lights=lights,
+        trust=(shading != 0).any(dim=0).double(),
+        weight=given.weight,
+    )
+    return _lambertian(given, found, None, _FACTOR)
 
 
 def _four_harmonics(given: Problem, resolve: str) -> Solution:
@@ -193,6 +249,7 @@ METHODS = {
     "calibrated": Method(solve=_calibrated, unknowns=3, calibrated=True),
     "hayakawa": Method(solve=_hayakawa, unknowns=3, resolvers=("equal_strength", "equal_albedo")),
     "integrability": Method(solve=_integrability, unknowns=3, resolvers=tuple(RESOLVERS)),
+    "perspective": Method(solve=_perspective, unknowns=3, perspective=True),
     "four_harmonics": Method(solve=_four_harmonics, unknowns=4, robust=False),
     "nine_harmonics": Method(solve=_nine_harmonics, unknowns=9, robust=False),
 }

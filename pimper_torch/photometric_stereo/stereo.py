@@ -80,13 +80,15 @@ def photometric_stereo(
                               albedo (``resolve``)
     ``integrability``         lamps                                         bas-relief, chosen
                                                                             by ``resolve``
+    ``perspective``           lamps, camera near by (``intrinsics``)        nothing
     ``four_harmonics``        any, from all sides of the viewer, without    convex or concave
                               cast shadows
     ``nine_harmonics``        the same, more exactly                        convex or concave
     ========================  ============================================  =================
 
     Convex is chosen. ``resolve`` is ``rounded`` (a convention: leans nowhere, as deep as a
-    ball), ``equal_albedo`` or ``equal_strength``.
+    ball), ``equal_albedo``, ``equal_strength``, ``albedo_entropy`` (few albedos),
+    ``colour_profiles`` (paints of different hue) or ``diffuse_maxima``.
 
     Args:
         images: Linear radiance from one viewpoint far away. NaN inside the mask is missing.

@@ -1,0 +1,300 @@
+r"""Uncalibrated photometric stereo through a pinhole, which leaves nothing free but scale.
+
+With rays :math:`r = (x, y, 1)` the surface is :math:`z r`, and a vector b along its normal gives
+:math:`(\log z)_x = -b_1 / (b \cdot r)`, :math:`(\log z)_y = -b_2 / (b \cdot r)`. That these are
+the slopes of one function reads
+
+.. math:: (b \times b_x)_1 + (b \times b_y)_2 - x (b \times b_x)_3 - y (b \times b_y)_3 = 0.
+
+For factors known up to an invertible matrix, :math:`b = A \hat b`, cross products turn by the
+cofactors of A: :math:`b \times b_x = P (\hat b \times \hat b_x)`, P proportional to the inverse
+of A's transpose. This is an equation a pixel, linear in all nine entries of P. Without the last
+two terms, which grow with the field of view, the last row of P stays free: that is the bas-relief
+ambiguity. On some surfaces, balls and all quadrics among them, a second P solves them even so.
+
+Source: Papadhimitri & Favaro, A new perspective on uncalibrated photometric stereo, CVPR 2013.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import conv2d, pad
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.photometry.bilinear import equations_of_samples
+from pimper_torch.photometry.low_rank import low_rank_problem
+from pimper_torch.photometry.quadratics import solve_packed
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+
+# Columns on which missing entries are filled in; the lights' span needs no more.
+_COLUMNS = 4000
+# Equations for nine unknowns up to scale; with fewer than this many the noise decides.
+_FEWEST = 50
+_REWEIGHTINGS = 4
+# On a ball noise leaves two misfits that are the same but for chance.
+_DISTINCT = 1.5
+
+
+def factorize_in_perspective(
+    images: Float[Tensor, "view channel height width"],
+    mask: Bool[Tensor, "height width"],
+    intrinsics: Float[Tensor, "3 3"],
+    seen: Bool[Tensor, "view pixel"] | None = None,
+    *,
+    radius: int = 3,
+) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "view 3"]]:
+    r"""Find albedo times normal and the lights from one viewpoint's photographs alone.
+
+    The images, channels added, are factored to rank three; the integrability of vectors made
+    unit, which is a matter of their direction only, gives the matrix between the factors.
+    Derivatives are those of cubics fitted to squares. Their noise bends the least squares
+    solution, so the equations' moment is compared with the moment that noise alone would have:
+    the generalised eigenvector of least ratio.
+
+    Args:
+        images: Linear radiance.
+        mask: Where the surface is, without breaks in depth.
+        intrinsics: Pinhole K in pixels, centre of the top-left pixel at (0.5, 0.5).
+        seen: Which values count, pixels in raster order; shadows and highlights do not. All
+            without it.
+        radius: Of the squares, which lie inside the mask.
+
+    Returns:
+        Shading and lights in the camera frame, right up to one factor between them, which is set
+        so that lights are 1 in the root mean square. The factors leave one sign, which is fixed
+        by normals facing the viewer; hills and valleys are told apart. Pixels seen in fewer
+        than three views have the vector zero. Constant to autograd.
+
+    Fails where the field of view is so small that noise drowns the perspective: the error grows
+    with its inverse. Then only a bas-relief transformation separates the result from the truth,
+    and the methods that resolve it apply. On a ball, as on some other surfaces, the images do not
+    determine the result; with noise that is noticed, without it need not be.
+
+    Raises:
+        InputError: Fewer than three views, ``seen`` or intrinsics that do not fit, fewer than 50
+            squares inside the mask, or a second surface that explains the images.
+
+    Source: Papadhimitri & Favaro, CVPR 2013, for the idea; the cofactors' form, unit vectors and
+    the account of noise are ours.
+    """
+    _check(images, mask, intrinsics, seen)
+    with torch.no_grad():
+        radiance = images.double().sum(dim=1)[:, mask]
+        weight = torch.ones_like(radiance) if seen is None else seen.double()
+        left, right = _rank_three(radiance, weight)
+        known = (weight > 0).sum(dim=0) >= 3
+        known = known & (right.norm(dim=0) > 0)
+        right = torch.where(known, right, 0)
+        inside = torch.zeros_like(mask)
+        inside[mask] = known
+        matrix = _between(right, known, mask, inside, intrinsics.double(), radius)
+        rays = _rays(mask, intrinsics.double())[mask].mT
+        towards = ((matrix @ right) * rays).sum()
+        matrix = torch.where(towards > 0, -matrix, matrix)
+        lights = left @ torch.linalg.inv(matrix)
+        scale = lights.square().sum(dim=1).mean().sqrt()
+        return (scale * (matrix @ right)).to(images), (lights / scale).to(images)
+
+
+def integrability_equations(
+    vectors: Float[Tensor, "3 pixel"],
+    along_x: Float[Tensor, "3 pixel"],
+    along_y: Float[Tensor, "3 pixel"],
+    rays: Float[Tensor, "3 pixel"],
+) -> Float[Tensor, "pixel 9"]:
+    """Give the coefficients of the integrability constraint by the entries of P, row by row.
+
+    Args:
+        vectors: Along normals, up to an invertible matrix.
+        along_x: Their derivatives by the normalised image coordinates.
+        along_y: The same for y.
+        rays: ``(x, y, 1)``.
+    """
+    cross_x = torch.linalg.cross(vectors, along_x, dim=0)
+    cross_y = torch.linalg.cross(vectors, along_y, dim=0)
+    x, y, _ = rays
+    return torch.cat([cross_x, cross_y, -x * cross_x - y * cross_y]).mT
+
+
+def _rank_three(
+    radiance: Float[Tensor, "view pixel"], weight: Float[Tensor, "view pixel"]
+) -> tuple[Float[Tensor, "view 3"], Float[Tensor, "3 pixel"]]:
+    filled = torch.where(weight > 0, radiance, 0)
+    start = torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -3:]
+    if bool((weight > 0).all()):
+        return start, start.mT @ radiance
+    full = ((weight > 0).sum(dim=0) > 3).nonzero()[:, 0]
+    some = full[:: max(1, -(-len(full) // _COLUMNS))]
+    if len(some) < 3:
+        raise InputError(
+            f"{len(some)} pixels are seen in four views or more; needed: three at least. Mark "
+            "fewer values as shadow."
+        )
+    few = low_rank_problem(radiance[None, :, some], weight[None, :, some], start[None])
+    left = solve_variable_projection(few).lights
+    every = low_rank_problem(radiance[None], weight[None], left)
+    right = solve_packed(*equations_of_samples(every, left, every.weight))
+    return left[0], right[0]
+
+
+def _between(
+    right: Float[Tensor, "3 pixel"],
+    known: Bool[Tensor, " pixel"],
+    mask: Bool[Tensor, "height width"],
+    inside: Bool[Tensor, "height width"],
+    intrinsics: Float[Tensor, "3 3"],
+    radius: int,
+) -> Float[Tensor, "3 3"]:
+    """Find the matrix under which the vectors are normals times albedo, up to a factor."""
+    moment = right @ right.mT / known.sum().clamp_min(1)
+    values, axes = torch.linalg.eigh(moment)
+    if float(values[0]) <= 1e-12 * float(values[-1]):
+        raise InputError(
+            "the images have rank two or less; needed: three lamps that are not in one plane, and "
+            "a curved surface."
+        )
+    white = axes.mT / values.sqrt()[:, None]
+    vectors = white @ right
+    size = vectors.norm(dim=0).clamp_min(1e-30)
+    raster = right.new_zeros(3, *mask.shape)
+    raster[:, mask] = vectors / size
+    size_raster = right.new_ones(mask.shape)
+    size_raster[mask] = size
+    value, along_u, along_v = _derivatives(raster, radius)
+    side = 2 * radius + 1
+    whole = conv2d(
+        pad(inside.double(), (radius,) * 4)[None, None], right.new_ones(1, 1, side, side)
+    )
+    whole = (whole[0, 0] > side * side - 0.5) & inside
+    if int(whole.sum()) < _FEWEST:
+        raise InputError(
+            f"{int(whole.sum())} squares of {side} x {side} pixels lie inside the mask and are "
+            f"seen in three views; needed: {_FEWEST}. Lower `radius`, or enlarge the mask."
+        )
+    b, bu, bv = value[:, whole], along_u[:, whole], along_v[:, whole]
+    rays = _rays(mask, intrinsics)[whole].mT
+    (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
+    rows = integrability_equations(b, fx * bu, skew * bu + fy * bv, rays)
+    spread = _noise_of_crosses(b, size_raster[whole], white @ white.mT)
+    by_u, by_v = _by_derivatives(rays, intrinsics)
+    weight = torch.ones_like(b[0])
+    for _ in range(_REWEIGHTINGS):
+        cofactors, ratio = _least(rows, weight, spread, by_u, by_v)
+        turned_u, turned_v = by_u @ cofactors, by_v @ cofactors
+        variance = torch.einsum("pi,pij,pj->p", turned_u, spread, turned_u)
+        variance = variance + torch.einsum("pi,pij,pj->p", turned_v, spread, turned_v)
+        weight = 1 / variance.clamp_min(1e-3 * variance.median())
+        weight = weight / weight.mean()
+    if ratio < _DISTINCT:
+        raise InputError(
+            f"a second surface explains the images as well (its misfit is {ratio:.2f} times the "
+            "least); needed: a surface unlike a ball or any quadric, or less noise. Raise "
+            "`radius`, or factorize without perspective and resolve the bas-relief ambiguity."
+        )
+    inverse, trouble = torch.linalg.inv_ex(cofactors)
+    if int(trouble) != 0 or not bool(inverse.isfinite().all()):
+        raise InputError(
+            "the integrability of the surface determines no invertible matrix; needed: a curved "
+            "surface and three lamps at least that are not in one plane."
+        )
+    return inverse.mT @ white
+
+
+def _least(
+    rows: Float[Tensor, "pixel 9"],
+    weight: Float[Tensor, " pixel"],
+    spread: Float[Tensor, "pixel 3 3"],
+    by_u: Float[Tensor, "pixel 3"],
+    by_v: Float[Tensor, "pixel 3"],
+) -> tuple[Float[Tensor, "3 3"], float]:
+    """Find the cofactors whose residual is least beside what noise makes it.
+
+    Returns:
+        The cofactors, and the second least ratio over the least.
+    """
+    both = by_u[:, :, None] * by_u[:, None] + by_v[:, :, None] * by_v[:, None]
+    both = both * weight[:, None, None]
+    noise = torch.einsum("pij,pkl->ikjl", both, spread).reshape(9, 9)
+    root = torch.linalg.cholesky(noise + 1e-12 * noise.trace() * torch.eye(9).to(noise))
+    moment = (weight[:, None] * rows).mT @ rows
+    reduced = torch.linalg.solve_triangular(root, moment, upper=False)
+    reduced = torch.linalg.solve_triangular(root, reduced.mT, upper=False)
+    ratios, vectors = torch.linalg.eigh((reduced + reduced.mT) / 2)
+    least = torch.linalg.solve_triangular(root.mT, vectors[:, :1], upper=True)
+    return least.reshape(3, 3), float(ratios[1] / ratios[0].clamp_min(1e-300))
+
+
+def _noise_of_crosses(
+    b: Float[Tensor, "3 pixel"], size: Float[Tensor, " pixel"], covariance: Float[Tensor, "3 3"]
+) -> Float[Tensor, "pixel 3 3"]:
+    """Give the covariance of the cross product of each vector with noise.
+
+    Noise of the images is even over the factors; whitened, it has the covariance given, and
+    making vectors unit divides it by their size.
+    """
+    zero = torch.zeros_like(b[0])
+    x, y, z = b
+    cross = torch.stack(
+        [
+            torch.stack([zero, -z, y], dim=-1),
+            torch.stack([z, zero, -x], dim=-1),
+            torch.stack([-y, x, zero], dim=-1),
+        ],
+        dim=-2,
+    )
+    return cross @ covariance @ cross.mT / size.square()[:, None, None]
+
+
+def _by_derivatives(
+    rays: Float[Tensor, "3 pixel"], intrinsics: Float[Tensor, "3 3"]
+) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
+    """Give the weights with which noise of b_u and of b_v enters, for each row of P."""
+    (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
+    x, y, _ = rays
+    by_u = torch.stack([fx + 0 * x, skew + 0 * x, -x * fx - y * skew], dim=1)
+    by_v = torch.stack([0 * x, fy + 0 * x, -y * fy], dim=1)
+    return by_u, by_v
+
+
+def _derivatives(
+    raster: Float[Tensor, "channel height width"], radius: int
+) -> tuple[Float[Tensor, "channel height width"], ...]:
+    """Fit a cubic to the square round each pixel: its value, and derivatives by column and row."""
+    side = torch.arange(-radius, radius + 1).to(raster)
+    v, u = torch.meshgrid(side, side, indexing="ij")
+    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+    basis = torch.stack([u.flatten() ** i * v.flatten() ** j for i, j in powers], dim=1)
+    fit = torch.linalg.pinv(basis)
+    kernels = fit[[powers.index(term) for term in ((0, 0), (1, 0), (0, 1))]]
+    found = conv2d(raster[:, None], kernels.reshape(3, 1, *u.shape), padding=radius)
+    return found[:, 0], found[:, 1], found[:, 2]
+
+
+def _rays(
+    mask: Bool[Tensor, "height width"], intrinsics: Float[Tensor, "3 3"]
+) -> Float[Tensor, "height width 3"]:
+    pixels = pixel_centers(mask.shape[1], mask.shape[0], intrinsics)
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
+    return homogeneous @ torch.linalg.inv(intrinsics).mT
+
+
+def _check(
+    images: Float[Tensor, "view channel height width"],
+    mask: Bool[Tensor, "height width"],
+    intrinsics: Float[Tensor, "3 3"],
+    seen: Bool[Tensor, "view pixel"] | None,
+) -> None:
+    if len(images) < 3:
+        raise InputError(f"{len(images)} views; needed: three at least, each under another lamp.")
+    if seen is not None and seen.shape[1] != int(mask.sum()):
+        raise InputError(
+            f"seen tells of {seen.shape[1]} pixels, and {int(mask.sum())} are inside the mask; "
+            "needed: one column a pixel."
+        )
+    last = intrinsics.new_tensor([0.0, 0, 1])
+    if not bool((intrinsics[2] == last).all() and intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0):
+        raise InputError(
+            f"intrinsics are {intrinsics.tolist()}; needed: focal lengths above zero on the "
+            "diagonal and (0, 0, 1) in the last row."
+        )

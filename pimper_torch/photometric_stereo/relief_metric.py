@@ -1,0 +1,62 @@
+r"""The matrix ``M = G^T G`` by which a factorization measures albedo.
+
+For a bas-relief transformation ``G`` and shading ``b``, albedo is :math:`\lVert G b \rVert`, so
+its square :math:`b^\top M b` is linear in the four entries that ``M`` has:
+
+.. math:: M = s^2 \begin{pmatrix} \lambda^2 & 0 & -\lambda\mu \\ 0 & \lambda^2 & -\lambda\nu \\
+          -\lambda\mu & -\lambda\nu & 1 + \mu^2 + \nu^2 \end{pmatrix}
+          = \begin{pmatrix} m_0 & 0 & m_1 \\ 0 & m_0 & m_2 \\ m_1 & m_2 & m_3 \end{pmatrix}.
+
+``M`` is the same for ``G`` and for ``G`` with hills turned into valleys (all of lambda, mu and
+nu negated): nothing that only measures albedo, or angles, can tell the two apart.
+
+Source: Belhumeur, Kriegman & Yuille, IJCV 35(1), 1999, for ``G``; the rest follows.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.photometry.bas_relief import BasRelief
+
+# Squares of parallel vectors in float32 differ by about this share.
+_FLAT = 1e-12
+
+
+def metric_row(shading: Float[Tensor, "3 pixel"]) -> Float[Tensor, "pixel 4"]:
+    """Give the coefficients of the square of albedo, ``b^T M b``, by the entries of ``M``."""
+    x, y, z = shading
+    return torch.stack([x * x + y * y, 2 * x * z, 2 * y * z, z * z], dim=-1)
+
+
+def relief_of_metric(metric: Float[Tensor, "*batch 4"]) -> BasRelief:
+    """Give the transformation, with lambda above zero, that a metric belongs to.
+
+    Entries may have any common factor; where they are no metric, all three of the result are
+    not a number.
+    """
+    metric = metric * metric[..., :1].sign()
+    m0, m1, m2, m3 = metric.unbind(dim=-1)
+    square = m3 - (m1 * m1 + m2 * m2) / m0
+    scale = torch.where((m0 > 0) & (square > 0), square, torch.nan).sqrt()
+    root = m0.sqrt()
+    lam = root / scale
+    return BasRelief(mu=-m1 / (root * scale), nu=-m2 / (root * scale), lam=lam)
+
+
+def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
+    r"""Find the transformation to the form all bas-reliefs of a surface share.
+
+    After it :math:`\sum x z = \sum y z = 0` and :math:`\sum x^2 + y^2 = \sum z^2`: the surface
+    faces the viewer on the whole, and normals lean by 45 degrees in the mean. What starts from
+    here gives one answer whichever relief it was handed. Lambda is above zero.
+
+    Not a number where all normals are parallel. Differentiable.
+    """
+    x, y, z = shading.double()
+    depth = (z * z).sum()
+    lean_x, lean_y = (x * z).sum() / depth, (y * z).sum() / depth
+    slant = (x - lean_x * z).square().sum() + (y - lean_y * z).square().sum()
+    curved = slant > _FLAT * (depth + (x * x + y * y).sum())
+    lam = (depth / torch.where(curved, slant, torch.nan)).sqrt()
+    return BasRelief(mu=lam * lean_x, nu=lam * lean_y, lam=lam)

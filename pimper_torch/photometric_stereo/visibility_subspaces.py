@@ -1,0 +1,265 @@
+r"""Which lamps light which pixels, told by the subspaces that pixels lie in.
+
+Pixels lit by the same lamps have brightness :math:`V L b`, with V the diagonal of ones and zeros
+of those lamps: they lie in one subspace of three dimensions, which has zeros for the lamps in
+shadow. Each set of lamps has its own, and random samples find those that many pixels share.
+
+Source: Sunkavalli, Zickler & Pfister, Visibility subspaces: uncalibrated photometric stereo with
+shadows, ECCV 2010.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.quadratics import outer, solve_packed
+from pimper_torch.records import Record
+
+# Triples of pixels tried for each subspace, and how far apart their pixels are.
+_TRIALS, _NEIGHBOURHOOD = 300, 4
+# Pixels on which triples are compared.
+_COMPARED = 3000
+# A pixel lies in a subspace if its distance is below this many times what noise makes it.
+_TOLERANCE = 1.5
+# A value departs from its prediction, or from zero, by more than this many deviations.
+_DEVIATIONS = 3.0
+_REFITS, _RECLASSIFICATIONS = 4, 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class VisibilitySubspaces(Record):
+    """What the subspaces of a scene tell.
+
+    Attributes:
+        lit: Whether a lamp lights a pixel.
+        lights: Up to an invertible 3 x 3 matrix, orthonormal columns: where a factorization with
+            shadows masked may start. Zero for lamps that no subspace sees.
+        subspace: The one that each pixel lies in, largest first; -1 for none.
+        visibility: Lamps by subspaces.
+    """
+
+    lit: Bool[Tensor, "view pixel"]
+    lights: Float[Tensor, "view 3"]
+    subspace: Int[Tensor, " pixel"]
+    visibility: Bool[Tensor, "view subspace"]
+
+
+def visibility_subspaces(
+    images: Float[Tensor, "view channel height width"],
+    mask: Bool[Tensor, "height width"],
+    generator: torch.Generator,
+    *,
+    noise: float = 0.01,
+) -> Bool[Tensor, "view pixel"]:
+    """Tell which views light each pixel; see :func:`find_subspaces`."""
+    return find_subspaces(images, mask, generator, noise=noise).lit
+
+
+def find_subspaces(
+    images: Float[Tensor, "view channel height width"],
+    mask: Bool[Tensor, "height width"],
+    generator: torch.Generator,
+    *,
+    noise: float = 0.01,
+    smallest: float = 0.01,
+    most: int = 30,
+) -> VisibilitySubspaces:
+    r"""Find the subspaces of pixels lit by the same lamps, and what they tell of all pixels.
+
+    Triples of neighbouring pixels, which mostly share their lamps, propose subspaces; the one
+    with the most pixels is refitted to them, taken out, and the search goes on. Bases
+    :math:`Q_k`, orthonormal and zero where lamps are out, are :math:`V_k L` up to a matrix each.
+    Lights that all agree with are the three least eigenvectors of
+
+    .. math:: \sum_k m_k (V_k - Q_k Q_k^\top)
+
+    for :math:`m_k` pixels. With them each pixel is fitted to the views of its subspace, or to its
+    brightest ones if it has none, then to those that its fit explains, the lights following.
+
+    Args:
+        images: Linear radiance without ambient light; channels are added.
+        mask: Pixels that count, in raster order.
+        generator: On the CPU.
+        noise: Standard deviation of a value, as a share of the brightest.
+        smallest: Share of the pixels that a subspace must hold.
+        most: Subspaces.
+
+    Returns:
+        Lit or not, with subspaces and lights. A value that does not fit, because it is too dark,
+        too bright or near zero, counts as not lit, and so do all of a pixel of which fewer than
+        four fit. Constant to autograd.
+
+    Fails where every pixel has its own set of lamps, where lamps have no subspace in common, and
+    where indirect light keeps shadows brighter than noise: a whole subspace is then taken for lit.
+
+    Raises:
+        InputError: Fewer than four views, noise that is not above zero, or no subspace found.
+
+    Source: Sunkavalli, Zickler & Pfister, ECCV 2010, for subspaces and their search; the
+    eigenvalue problem for the lights, and that every value is judged by itself, are our reading.
+    """
+    if len(images) < 4 or noise <= 0:
+        raise InputError(
+            f"{len(images)} views and noise of {noise}; needed: four views at least, as three "
+            "always lie in a subspace of three dimensions, and noise above zero."
+        )
+    with torch.no_grad():
+        values = images.double().sum(dim=1)[:, mask]
+        deviation = noise * float(values.max())
+        row, column = mask.nonzero().mT
+        place = torch.full_like(mask, -1, dtype=torch.int64)
+        place[mask] = torch.arange(values.shape[1], device=mask.device)
+        subspace = torch.full_like(row, -1)
+        bases, visible, counts = list[Tensor](), list[Tensor](), list[float]()
+        fewest = max(8, int(smallest * values.shape[1]))
+        bright = values.norm(dim=0) > _DEVIATIONS * deviation * len(values) ** 0.5
+        while len(bases) < most:
+            free = bright & (subspace < 0)
+            triples = _triples(free, row, column, place, generator)
+            found = _largest(values, free, triples, deviation)
+            if found is None or int(found[1].sum()) < fewest:
+                break
+            basis, inside = found
+            lit = values[:, inside].square().mean(dim=1).sqrt() > _DEVIATIONS * deviation
+            subspace[inside] = len(bases)
+            if int(lit.sum()) >= 4:
+                bases.append(torch.linalg.qr(basis * lit[:, None]).Q)
+                visible.append(lit)
+                counts.append(float(inside.sum()))
+            else:
+                subspace[inside] = -2  # seen, and of no use
+        if not bases:
+            raise InputError(
+                f"no {fewest} of {values.shape[1]} pixels lie in one subspace; needed: a matt "
+                "surface and distant lamps. Raise `noise`, or lower `smallest`."
+            )
+        visibility = torch.stack(visible, dim=1)
+        lights, covered = _common_lights(bases, visibility, values.new_tensor(counts))
+        half = max(4, -(-len(values) // 2))
+        lit = values.argsort(dim=0, descending=True).argsort(dim=0) < half
+        inside = subspace >= 0
+        lit[:, inside] = visibility[:, subspace[inside]]
+        lit, lights = _explained(values, lights, covered, lit, deviation)
+        return VisibilitySubspaces(
+            lit=lit,
+            lights=lights.to(images),
+            subspace=subspace.clamp_min(-1),
+            visibility=visibility,
+        )
+
+
+def _triples(
+    free: Bool[Tensor, " pixel"],
+    row: Int[Tensor, " pixel"],
+    column: Int[Tensor, " pixel"],
+    place: Int[Tensor, "height width"],
+    generator: torch.Generator,
+) -> Int[Tensor, "triple 3"]:
+    """Draw neighbouring pixels that are in no subspace yet."""
+    pool = free.nonzero()[:, 0]
+    if len(pool) == 0:
+        return pool.new_zeros(0, 3)
+    draws = 4 * _TRIALS
+    first = pool[torch.randint(len(pool), (draws,), generator=generator).to(pool.device)]
+    side = 2 * _NEIGHBOURHOOD + 1
+    offset = torch.randint(side, (2, 2, draws), generator=generator) - _NEIGHBOURHOOD
+    offset = offset.to(pool.device)
+    height, width = place.shape
+    y = (row[first] + offset[0]).clamp(0, height - 1)
+    x = (column[first] + offset[1]).clamp(0, width - 1)
+    other = place[y, x]
+    usable = (other >= 0).all(dim=0) & free[other.clamp_min(0)].all(dim=0)
+    return torch.cat([first[None], other])[:, usable][:, :_TRIALS].mT
+
+
+def _largest(
+    values: Float[Tensor, "view pixel"],
+    free: Bool[Tensor, " pixel"],
+    triples: Int[Tensor, "triple 3"],
+    deviation: float,
+) -> tuple[Float[Tensor, "view 3"], Bool[Tensor, " pixel"]] | None:
+    """Take the subspace of the triple that most free pixels lie in, refitted to them."""
+    if len(triples) == 0:
+        return None
+    views = len(values)
+    proposed = values[:, triples].permute(1, 0, 2)
+    basis, triangle = torch.linalg.qr(proposed)
+    # Pixels of nearly one direction span a subspace that noise chose.
+    sound = triangle.diagonal(dim1=1, dim2=2).abs().amin(dim=1) > 4 * deviation
+    basis = basis[sound]
+    if len(basis) == 0:
+        return None
+    pool = values[:, free]
+    some = pool[:, :: max(1, -(-pool.shape[1] // _COMPARED))]
+    limit = (_TOLERANCE * deviation) ** 2 * (views - 3)
+    off = some.square().sum(dim=0) - (basis.mT @ some).square().sum(dim=1)
+    # The triple's own noise adds to that of the pixel.
+    votes = (off < 4 * limit).sum(dim=1)
+    best = basis[int(votes.argmax())]
+    inside = free.clone()
+    factor = 4.0
+    for _ in range(_REFITS):
+        off = values.square().sum(dim=0) - (best.mT @ values).square().sum(dim=0)
+        inside = free & (off < factor * limit)
+        if int(inside.sum()) < 3:
+            return None
+        members = values[:, inside]
+        best = torch.linalg.eigh(members @ members.mT).eigenvectors[:, -3:]
+        factor = 1.0
+    off = values.square().sum(dim=0) - (best.mT @ values).square().sum(dim=0)
+    return best, free & (off < limit)
+
+
+def _common_lights(
+    bases: list[Float[Tensor, "view 3"]],
+    visibility: Bool[Tensor, "view subspace"],
+    counts: Float[Tensor, " subspace"],
+) -> tuple[Float[Tensor, "view 3"], Bool[Tensor, " view"]]:
+    """Find the lights whose parts lie in all subspaces, and which views have one."""
+    total = bases[0].new_zeros(len(visibility), len(visibility))
+    for basis, lit, count in zip(bases, visibility.mT, counts, strict=True):
+        total = total + count * (torch.diag(lit.to(basis)) - basis @ basis.mT)
+    covered = visibility.any(dim=1)
+    inner = total[covered][:, covered]
+    lights = torch.zeros_like(bases[0])
+    lights[covered] = torch.linalg.eigh(inner).eigenvectors[:, :3]
+    return lights, covered
+
+
+def _explained(
+    values: Float[Tensor, "view pixel"],
+    lights: Float[Tensor, "view 3"],
+    covered: Bool[Tensor, " view"],
+    start: Bool[Tensor, "view pixel"],
+    deviation: float,
+) -> tuple[Bool[Tensor, "view pixel"], Float[Tensor, "view 3"]]:
+    """Tell which values of each pixel one vector explains, lights being fitted in turn.
+
+    Views that no subspace covers have no lights; there what is not dark counts as lit.
+    """
+    known, L = values[covered], lights[covered]
+    lit = start[covered] & (known > _DEVIATIONS * deviation)
+    for _ in range(_RECLASSIFICATIONS):
+        vectors = _fitted(L, known, lit)
+        predicted = L @ vectors
+        fits = (known - predicted).abs() < _DEVIATIONS * deviation
+        lit = fits & (predicted > _DEVIATIONS * deviation)
+        # Three values are always explained.
+        lit = lit & (lit.sum(dim=0) >= 4)
+        L = torch.linalg.qr(_fitted(vectors.mT, known.mT, lit.mT).mT).Q
+    found = values > _DEVIATIONS * deviation
+    found[covered] = lit
+    lights = torch.zeros_like(lights)
+    lights[covered] = L
+    return found, lights
+
+
+def _fitted(
+    left: Float[Tensor, "row 3"], values: Float[Tensor, "row item"], used: Bool[Tensor, "row item"]
+) -> Float[Tensor, "3 item"]:
+    """Solve each column for its three coefficients by the values that are used."""
+    weight = used.to(values)
+    return solve_packed(outer(left.mT) @ weight, left.mT @ (weight * values))
