@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometric_stereo.relief import bulge
+from pimper_torch.photometric_stereo.relief import convex
 from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.photometry.lights import CAUCHY_TUNING
 from pimper_torch.photometry.quadratics import diagonal, outer
@@ -108,7 +108,8 @@ def relief_from_albedo(
     size = _typical(shading, weight)
     begin = [[depth / size, 0.0, 0.0, 1 / size] for depth in _DEPTHS]
     lam, mu, nu, scale = _fitted(curve, weight, x.new_tensor(begin), "pixels of equal albedo")
-    return _convex(lam / scale, mu / scale, nu / scale, shading, weight, mask)
+    found = BasRelief(mu=mu / scale, nu=nu / scale, lam=lam / scale)
+    return convex(found, shading, weight, mask)
 
 
 def relief_from_strength(
@@ -148,21 +149,8 @@ def relief_from_strength(
     across, tilt_x, tilt_y, along = _fitted(
         curve, known, x.new_tensor(begin), "lamps of equal strength"
     )
-    return _convex(along / across, tilt_x / across, tilt_y / across, shading, weight, mask)
-
-
-def _convex(
-    lam: Float[Tensor, ""],
-    mu: Float[Tensor, ""],
-    nu: Float[Tensor, ""],
-    shading: Float[Tensor, "3 pixel"],
-    weight: Float[Tensor, " pixel"],
-    mask: Bool[Tensor, "height width"],
-) -> BasRelief:
-    """Choose between a transformation and its mirror image, which explain lengths alike."""
-    found = BasRelief(mu=mu.to(shading), nu=nu.to(shading), lam=lam.to(shading))
-    sign = bulge(found.on_shading(shading)[:2], weight.to(shading), mask)
-    return BasRelief(mu=sign * found.mu, nu=sign * found.nu, lam=sign * found.lam)
+    found = BasRelief(mu=tilt_x / across, nu=tilt_y / across, lam=along / across)
+    return convex(found, shading, weight, mask)
 
 
 def _form(

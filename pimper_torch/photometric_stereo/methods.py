@@ -22,7 +22,7 @@ from pimper_torch.photometric_stereo.integrability import integrable, turn_to_su
 from pimper_torch.photometric_stereo.perspective import factorize_in_perspective
 from pimper_torch.photometric_stereo.problem import Problem, Solution, Surfaced
 from pimper_torch.photometric_stereo.regression import determined
-from pimper_torch.photometric_stereo.relief import bulge, rounded_relief
+from pimper_torch.photometric_stereo.relief import bulge, convex, rounded_relief
 from pimper_torch.photometric_stereo.spherical_harmonics import (
     four_harmonic_stereo,
     nine_harmonic_stereo,
@@ -36,17 +36,22 @@ from pimper_torch.photometry.harmonics import harmonics
 def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
     images, mask = _trusted(given, found)
     groups = chromaticity_groups(images, mask) if images.shape[1] > 1 else None
-    return resolve_by_albedo_entropy(found.shading[:, found.trust > 0], groups)
+    relief = resolve_by_albedo_entropy(found.shading[:, found.trust > 0], groups)
+    return convex(relief, found.shading, found.trust, given.mask)
 
 
 def _by_profiles(given: Problem, found: Surfaced) -> BasRelief:
     images, mask = _trusted(given, found)
-    return resolve_by_colour_profiles(images, mask, found.shading[:, found.trust > 0], found.lights)
+    known = found.shading[:, found.trust > 0]
+    relief = resolve_by_colour_profiles(images, mask, known, found.lights)
+    return convex(relief, found.shading, found.trust, given.mask)
 
 
 def _by_maxima(given: Problem, found: Surfaced) -> BasRelief:
     images, mask = _trusted(given, found)
-    return resolve_by_diffuse_maxima(images, mask, found.shading[:, found.trust > 0], found.lights)
+    known = found.shading[:, found.trust > 0]
+    relief = resolve_by_diffuse_maxima(images, mask, known, found.lights)
+    return convex(relief, found.shading, found.trust, given.mask)
 
 
 def _trusted(

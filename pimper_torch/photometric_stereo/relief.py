@@ -37,6 +37,26 @@ def rounded_relief(
     return BasRelief(mu=lam * mu, nu=lam * nu, lam=lam)
 
 
+def convex(
+    relief: BasRelief,
+    shading: Float[Tensor, "3 pixel"],
+    weight: Float[Tensor, " pixel"],
+    mask: Bool[Tensor, "height width"],
+) -> BasRelief:
+    """Choose between a transformation and its mirror image, which albedo and lights fit alike.
+
+    Args:
+        relief: Either of them.
+        shading: What it applies to, raster order.
+        weight: Not negative.
+        mask: Where the pixels are.
+    """
+    mu, nu, lam = (part.to(shading) for part in (relief.mu, relief.nu, relief.lam))
+    found = BasRelief(mu=mu, nu=nu, lam=lam)
+    sign = bulge(found.on_shading(shading)[:2], weight.to(shading), mask)
+    return BasRelief(mu=sign * mu, nu=sign * nu, lam=sign * lam)
+
+
 def bulge(
     sideways: Float[Tensor, "2 pixel"],
     weight: Float[Tensor, " pixel"],

@@ -52,7 +52,7 @@ BORROWED_SAMPLES = 16.0
 LEAST_PULL = 1e-6
 
 # The Gauss-Newton matrix of a patch's lights is summed over about this many samples.
-CURVATURE_SAMPLES = 512
+CURVATURE_SAMPLES = 256
 
 MANIFOLDS: dict[int, Manifold] = {3: Free(), 4: Cone(), 9: SecondOrder()}
 

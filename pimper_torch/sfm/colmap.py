@@ -4,7 +4,10 @@ pycolmap is loaded when a function needs it, so that importing this package stay
 Photographs go by their number here: the file ``000007.png`` is view 7.
 """
 
+import signal
+import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -102,7 +105,7 @@ def extract_features(
     Returns:
         How many features each file has.
     """
-    import pycolmap
+    pycolmap = _loaded()
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -142,7 +145,7 @@ def set_focals(database: Path, focals_px: dict[str, float]) -> None:
         database: With its images.
         focals_px: By file. A camera shared by several photographs gets their median.
     """
-    import pycolmap
+    pycolmap = _loaded()
 
     with pycolmap.Database.open(database) as stored:
         known: dict[int, list[float]] = {}
@@ -161,7 +164,7 @@ def set_focals(database: Path, focals_px: dict[str, float]) -> None:
 
 def match_features(database: Path, settings: MatchSettings) -> None:
     """Match every photograph with every other and verify the matches."""
-    import pycolmap
+    pycolmap = _loaded()
 
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -187,7 +190,7 @@ def map_views(database: Path, images: Path, settings: MapSettings) -> list[Spars
     Returns:
         One model a component, the one with most views first. Names are files of ``images``.
     """
-    import pycolmap
+    pycolmap = _loaded()
 
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 3
@@ -211,7 +214,7 @@ def read_model(folder: Path) -> SparseModel:
     Raises:
         InputError: The folder holds no model, or one that COLMAP cannot read.
     """
-    import pycolmap
+    pycolmap = _loaded()
 
     parts = ("cameras", "images", "points3D")
     complete = any(
@@ -302,7 +305,7 @@ def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
 
 
 def _camera_of(lens: Lens) -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    import pycolmap
+    pycolmap = _loaded()
 
     camera = pycolmap.Camera.create_from_model_name(
         lens.camera, lens.model, 1.0, lens.width, lens.height
@@ -351,7 +354,7 @@ def _lens_of(camera: Any) -> Lens:  # noqa: ANN401 - see _camera_of
 
 
 def _reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> Any:  # noqa: ANN401
-    import pycolmap
+    pycolmap = _loaded()
 
     reconstruction = pycolmap.Reconstruction()
     for lens in {lens.camera: lens for lens in model.lenses}.values():
@@ -380,10 +383,20 @@ def _reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> 
     return reconstruction
 
 
+def _loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
+    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace."""
+    fresh = "pycolmap" not in sys.modules
+    import pycolmap
+
+    if fresh and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    return pycolmap
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     # COLMAP's log goes to stderr line by line; what matters comes back as results or exceptions.
-    import pycolmap
+    pycolmap = _loaded()
 
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
