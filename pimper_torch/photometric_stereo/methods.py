@@ -71,13 +71,15 @@ def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]
 
 
 # How a bas-relief transformation is chosen. "rounded" is a convention; the others measure.
+# Entropy comes first, as the default: nearest to known lights on the rendered objects and, with
+# diffuse maxima, on the photographs (benchmarks/photometric_stereo.py).
 RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
+    "albedo_entropy": _by_entropy,
     "rounded": lambda given, found: rounded_relief(found.shading, found.trust, given.mask),
     "equal_albedo": lambda given, found: relief_from_albedo(found.shading, found.trust, given.mask),
     "equal_strength": lambda given, found: relief_from_strength(
         found.lights, found.shading, found.trust, given.mask
     ),
-    "albedo_entropy": _by_entropy,
     "colour_profiles": _by_profiles,
     "diffuse_maxima": _by_maxima,
 }

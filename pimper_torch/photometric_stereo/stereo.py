@@ -94,7 +94,7 @@ def photometric_stereo(
         images: Linear radiance from one viewpoint far away. NaN inside the mask is missing.
         mask: True on the object; of the size of the images.
         method: See the table.
-        resolve: For ``integrability`` by default ``rounded``, for ``hayakawa`` by default
+        resolve: For ``integrability`` by default ``albedo_entropy``, for ``hayakawa`` by default
             ``equal_strength``; others have nothing to resolve.
         lights: For ``calibrated``, one a view: towards the lamp, as long as it is strong, camera
             frame.

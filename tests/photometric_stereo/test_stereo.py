@@ -153,7 +153,7 @@ def test_impossible_requests_are_refused(bumpy, lamps):
     refuse("cannot tell ambient", method="hayakawa", ambient=True)
     refuse("camera to be far away", lights=lights, intrinsics=torch.eye(3).double())
     refuse("needed: none", lights=lights, resolve="rounded")
-    refuse("needed: rounded, equal_albedo", method="integrability", resolve="entropy")
+    refuse("needed: albedo_entropy, rounded", method="integrability", resolve="entropy")
     refuse("the mask is empty", mask=bumpy.mask & False, lights=lights)
     refuse("Resize the mask", mask=bumpy.mask[:50], lights=lights)
     refuse("5 lights for 6 photographs", lights=lights[:5])
