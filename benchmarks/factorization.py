@@ -12,7 +12,7 @@ from pathlib import Path
 import scipy.io
 import torch
 
-from pimper_torch.photometry.low_rank import low_rank_problem, random_left
+from pimper_torch.photometry.low_rank import low_rank_problem, random_left, singular_left
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 
 # Name, rank, best residual known, starts.
@@ -30,8 +30,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
-    print("| matrix | rank | best known | found | reached by starts | steps | CPU s a start |")  # noqa: T201
-    print("|---|--:|--:|--:|--:|--:|--:|")  # noqa: T201
+    print(  # noqa: T201
+        "| matrix | rank | best known | found | reached by random starts | steps | CPU s a start "
+        "| from singular vectors |"
+    )
+    print("|---|--:|--:|--:|--:|--:|--:|--:|")  # noqa: T201
     for name, rank, known, starts in SETS:
         file = scipy.io.loadmat(folder / f"{name}.mat")
         matrix = torch.tensor(file["M"], dtype=torch.float64)[None]
@@ -45,11 +48,14 @@ def main() -> None:
             residuals.append(float(found.residual))
             iterations.append(int(found.iterations))
         seconds = (time.process_time() - began) / starts
-        best = min(residuals)
+        start = singular_left(matrix, weight, rank)
+        problem = low_rank_problem(matrix, weight, start)
+        singular = float(solve_variable_projection(problem).convergence.residual)
+        best = min(*residuals, singular)
         reached = sum(one <= best * (1 + CLOSE) for one in residuals)
         print(  # noqa: T201
             f"| {name} | {rank} | {known:.6g} | {best:.6g} | {reached} of {starts} "
-            f"| {sum(iterations) / starts:.0f} | {seconds:.2f} |",
+            f"| {sum(iterations) / starts:.0f} | {seconds:.2f} | {singular:.6g} |",
             flush=True,
         )
 

@@ -74,8 +74,9 @@ def main() -> None:
             seconds, cpu = time.perf_counter() - began, time.process_time() - spent
             sweeps = steps / options.patches
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3 - before
+            case = f"{name} | {'held' if hold == 1 else 'free'} | {type(loss).__name__}"
             print(  # noqa: T201
-                f"| {name} | {'held' if hold == 1 else 'free'} | {type(loss).__name__} | {seconds:.1f} | {cpu:.1f} | {sweeps:.1f} "
+                f"| {case} | {seconds:.1f} | {cpu:.1f} | {sweeps:.1f} "
                 f"| {1e3 * seconds / sweeps:.0f} | {1e3 * seconds / sweeps / walk:.0f} "
                 f"| {cost:.0f} | {torch.cat(error).median():.2f} "
                 f"| {limited} | {max(peak, 0) / size:.1f} |",

@@ -11,6 +11,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.photometric_stereo.methods import METHODS, Method
 from pimper_torch.photometric_stereo.problem import Problem, Solution
 from pimper_torch.photometric_stereo.regression import determined
+from pimper_torch.photometric_stereo.visibility_subspaces import visibility_subspaces
 from pimper_torch.photometry.ambiguity import Ambiguity
 from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.records import Record
@@ -68,6 +69,7 @@ def photometric_stereo(
     weight: Float[Tensor, "..."] | None = None,
     generator: torch.Generator | None = None,
     robust: bool | None = None,
+    subspaces: bool = False,
     ambient: bool = False,
 ) -> PhotometricStereo:
     """Recover normals and albedo from photographs of one viewpoint under changing light.
@@ -101,9 +103,12 @@ def photometric_stereo(
         intrinsics: ``K``, for methods of a camera near by; others take it to be far away.
         weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
             known to be in shadow.
-        generator: On the CPU; for harmonics only, by default with the seed 0.
+        generator: On the CPU; for harmonics and subspaces, by default with the seed 0.
         robust: Whether shadows and highlights lose weight; by default with lamps, but not with
             harmonics, which explain attached shadows.
+        subspaces: Whether shadows are found first, as visibility subspaces (see
+            :mod:`~pimper_torch.photometric_stereo.visibility_subspaces`), and left out. For lamps
+            whose shadows are black.
         ambient: For ``calibrated``: whether each pixel has a radiance of its own.
 
     Raises:
@@ -129,6 +134,10 @@ def photometric_stereo(
         samples = images.movedim(1, 0)[..., mask].movedim(0, 1)
         seen = samples.isfinite().all(dim=1)
         heavy = torch.where(seen, given[:, mask], 0).double()
+        generator = torch.Generator().manual_seed(0) if generator is None else generator
+        if subspaces:
+            clean = torch.where(images.isfinite(), images, 0)
+            heavy = heavy * visibility_subspaces(clean, mask, generator)
         used = (heavy > 0).any(dim=1)
         unknowns = chosen.unknowns + int(ambient)
         _refuse_few(int(used.sum()), unknowns, method)
@@ -139,7 +148,7 @@ def photometric_stereo(
             mask=mask,
             lights=None if lights is None else lights[used].double(),
             intrinsics=None if intrinsics is None else intrinsics.double(),
-            generator=torch.Generator().manual_seed(0) if generator is None else generator,
+            generator=generator,
             robust=chosen.robust if robust is None else robust,
             ambient=ambient,
         )

@@ -12,7 +12,7 @@ from pimper_torch.photometry.coupling import couple_lights
 from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.implicit import differentiable
-from pimper_torch.photometry.low_rank import low_rank_problem, random_left
+from pimper_torch.photometry.low_rank import low_rank_problem, random_left, singular_left
 from pimper_torch.photometry.manifolds import Cone, Free, SecondOrder
 from pimper_torch.photometry.restarts import Restarted, factorize_from_many
 from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Squares
@@ -37,6 +37,7 @@ __all__ = [
     "factorize_from_many",
     "low_rank_problem",
     "random_left",
+    "singular_left",
     "solve_alternation",
     "solve_balm",
     "solve_descent",

@@ -57,9 +57,35 @@ def low_rank_problem(
     )
 
 
+def singular_left(
+    matrix: Float[Tensor, "batch row column"],
+    weight: Float[Tensor, "batch row column"],
+    rank: int,
+    fillings: int = 20,
+) -> Float[Tensor, "batch row rank"]:
+    """Start from the data: singular vectors of the matrix with its holes filled in.
+
+    Holes begin as the mean of their row and become, in turn, what the leading singular vectors
+    say. Orthonormal; in float64.
+    """
+    seen = weight > 0
+    known = torch.where(seen, matrix.double(), 0)
+    count = seen.sum(dim=2, keepdim=True).clamp_min(1)
+    filled = torch.where(seen, known, known.sum(dim=2, keepdim=True) / count)
+    left = _leading(filled, rank)
+    for _ in range(fillings):
+        filled = torch.where(seen, known, left @ (left.mT @ filled))
+        left = _leading(filled, rank)
+    return left
+
+
 def random_left(
     batch: int, rows: int, rank: int, generator: torch.Generator
 ) -> Float[Tensor, "batch row rank"]:
     """Draw orthonormal left factors, evenly over all subspaces."""
     drawn = torch.randn(batch, rows, rank, generator=generator, dtype=torch.float64)
     return torch.linalg.qr(drawn).Q
+
+
+def _leading(filled: Float[Tensor, "batch row column"], rank: int) -> Float[Tensor, "..."]:
+    return torch.linalg.eigh(filled @ filled.mT).eigenvectors[..., -rank:]

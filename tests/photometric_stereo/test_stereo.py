@@ -53,10 +53,32 @@ def test_pixels_of_one_albedo_are_enough(bumpy, lamps, generator, angles_deg, me
     assert angles_deg(found.normals[bumpy.mask].mT, bumpy.columns).mean() < 0.7
 
 
+def test_black_shadows_are_left_out_by_visibility_subspaces(bumpy, lamps, patchwork, angles_deg):
+    lights = 1.3 * lamps(16, spread=0.5)
+    images, lit = photographed(bumpy, lights, patchwork(bumpy))
+    cast = torch.zeros_like(images[:, :1], dtype=torch.bool)
+    cast[2:6, :, 10:26, 8:30] = True  # an object that is not seen throws it
+    images = torch.where(cast, 0, images)
+    runs = {
+        use: photometric_stereo(
+            images, bumpy.mask, method="calibrated", lights=lights, robust=False, subspaces=use
+        )
+        for use in (False, True)
+    }
+    off = {
+        use: angles_deg(found.normals[bumpy.mask].mT, bumpy.columns)[found.valid[bumpy.mask]].mean()
+        for use, found in runs.items()
+    }
+    assert off[True] < 0.05
+    assert off[False] > 20 * off[True]
+    dark = ~lit | cast[:, 0, bumpy.mask]
+    assert runs[True].lit[:, bumpy.mask][dark].double().mean() < 0.01
+
+
 def test_without_knowledge_a_convention_is_taken_and_named(ball, lamps, angles_deg):
     lights = lamps(12, spread=0.5)
     images, _ = photographed(ball, lights, torch.ones(ball.columns.shape[1]).double())
-    found = photometric_stereo(images, ball.mask, method="integrability")
+    found = photometric_stereo(images, ball.mask, method="integrability", resolve="rounded")
     assert "bas-relief" in found.free
     assert angles_deg(found.normals[ball.mask].mT, ball.columns).mean() < 2.5
     assert found.applied.lam.isfinite()

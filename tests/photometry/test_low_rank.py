@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.bilinear import equations_of_samples, follow
-from pimper_torch.photometry.low_rank import low_rank_problem, random_left
+from pimper_torch.photometry.low_rank import low_rank_problem, random_left, singular_left
 from pimper_torch.photometry.restarts import factorize_from_many
 from pimper_torch.photometry.variable_projection import (
     curvature_of_lights,
@@ -45,6 +45,13 @@ def test_missing_entries_come_back(product, generator):
     assert (found.convergence.residual < 1e-6).all()
     assert found.convergence.converged.all()
     assert_close(found.lights.mT @ found.lights, torch.eye(3).double().expand(2, 3, 3))
+
+
+def test_singular_vectors_of_the_filled_matrix_are_a_start_near_the_solution(product):
+    X, weight, whole = product(missing=0.1)
+    left = singular_left(X, weight, 3)
+    assert_close(left.mT @ left, torch.eye(3).double().expand(2, 3, 3))
+    assert (left @ (left.mT @ whole) - whole).norm() < 0.05 * whole.norm()
 
 
 def test_matrices_of_a_batch_do_not_influence_one_another(product, generator):
