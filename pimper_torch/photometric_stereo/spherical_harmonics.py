@@ -112,8 +112,8 @@ def four_harmonic_stereo(
         found = factorize_photographs(radiance, weight, 4, robust=robust, shadows="none")
         trust = found.weight.sum(dim=0)
         trust = trust / trust.amax()
-        lights, shading = upgrade_to_cone(found.lights[None], found.shading[None], trust[None])
-        L, S = lights[0], shading[0]
+        upgraded = upgrade_to_cone(found.lights[None], found.shading[None], trust[None])
+        L, S = upgraded.lights[0], upgraded.shading[0]
         applied, curl = _upright(S, trust, mask, torch.linalg.inv(L.mT @ L), generator)
         on_cone = project_to_cone(applied.on_shading(S).mT).mT
         return Harmonic(

@@ -1,15 +1,34 @@
 """A start from the data alone: singular vectors, upgraded to the photometric cone."""
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.photometry.ambiguity import minkowski
 from pimper_torch.photometry.quadratics import diagonal, outer, solve_packed
+from pimper_torch.records import Record
 
 # Filling converges in a few steps to a good start; the alternation after it is exact.
 FILL_STEPS = 20
 ALTERNATIONS = 30
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Upgraded(Record):
+    """Factors equal in product to those given, near the cone up to a Lorentz transformation.
+
+    Attributes:
+        lights: ``L``.
+        shading: ``N``, with albedo positive for most samples.
+        lorentzian: Whether the quadric found had the cone's signature; if not, the factors are
+            on no cone, and a start from elsewhere is better.
+    """
+
+    lights: Float[Tensor, "patch view 4"]
+    shading: Float[Tensor, "patch 4 sample"]
+    lorentzian: Bool[Tensor, " patch"]
 
 
 def factorize_rank_four(
@@ -48,16 +67,13 @@ def upgrade_to_cone(
     lights: Float[Tensor, "patch view 4"],
     shading: Float[Tensor, "patch 4 sample"],
     weight: Float[Tensor, "patch sample"],
-) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
+) -> Upgraded:
     r"""Bring shading vectors as near to the cone as one matrix for all of them can.
 
     All lie on a quadric :math:`s^\top Q s = 0`; the least eigenvector of their quadratic
-    monomials is ``Q``, and :math:`Q = H^\top \eta H` gives the matrix ``H``. Noise can spoil
-    Q's signature (1, 3); the eigenvalue most apart in sign is then taken for albedo.
-
-    Returns:
-        Lights and shading vectors, equal in product to those given, near the cone up to a
-        scaled Lorentz transformation and with albedo positive for most samples.
+    monomials is ``Q``, and :math:`Q = H^\top \eta H` gives the matrix ``H``. Noise, or normals
+    that differ too little, can spoil Q's signature (1, 3), which is told; the eigenvalue most
+    apart in sign is then taken for albedo.
     """
     S, L = shading.double(), lights.double()
     moment = (S * weight[:, None]) @ S.mT
@@ -81,6 +97,7 @@ def upgrade_to_cone(
     flipped = front | ((values[:, 2] > 0) & (values[:, 0].abs() > values[:, 3]))
     values = torch.where(flipped[:, None], -values.flip(1), values)
     vectors = torch.where(flipped[:, None, None], vectors.flip(2), vectors)
+    lorentzian = (values[:, 3] > 0) & (values[:, 2] < 0)
     order = [3, 0, 1, 2]
     roots = values[:, order].abs().clamp_min(1e-6).sqrt()
     H = roots[..., None] * vectors[:, :, order].mT
@@ -89,7 +106,9 @@ def upgrade_to_cone(
     eta = minkowski(S)
     # A time axis of the wrong sign is mended by -1; space axes are the alignment's affair.
     mirror = torch.where(sign < 0, -torch.eye(4, dtype=S.dtype, device=S.device), eta @ eta)
-    return (L @ mirror).to(lights), (mirror @ S).to(shading)
+    return Upgraded(
+        lights=(L @ mirror).to(lights), shading=(mirror @ S).to(shading), lorentzian=lorentzian
+    )
 
 
 def _leading(filled: Float[Tensor, "patch view sample"]) -> Float[Tensor, "patch view 4"]:

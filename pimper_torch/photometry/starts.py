@@ -36,15 +36,18 @@ def start_from_data(
     the one is applied that brings the lights nearest to ``reference``. Normals would be the
     worse reference: those of a mesh are smoother than the true ones, and the transformation
     that fits them best flattens the relief. A patch whose data is not of rank four, such as
-    one that three views see, starts at ``reference`` and ``fallback``.
+    one that three views see, or whose quadric is no cone, starts at ``reference`` and
+    ``fallback``.
     """
     weight = seen.to(radiance.dtype)
     # Samples that fewer than four views see say nothing of the cone.
     told = (weight.sum(dim=1) >= 4).to(radiance.dtype)
     lights, shading = factorize_rank_four(radiance, weight)
-    lights, shading = upgrade_to_cone(lights, shading, told)
+    upgraded = upgrade_to_cone(lights, shading, told)
+    lights, shading = upgraded.lights, upgraded.shading
     enough = (weight.sum(dim=2) > 0).sum(dim=1) >= 4
     sound = lights.isfinite().all(dim=(1, 2)) & shading.isfinite().all(dim=(1, 2)) & enough
+    sound = sound & upgraded.lorentzian
     sound = sound[:, None, None]
     lights, shading = torch.where(sound, lights, reference), torch.where(sound, shading, fallback)
     # L A^-1 = reference, transposed: lights are columns that A^-T moves.
