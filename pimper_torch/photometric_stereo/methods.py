@@ -24,13 +24,14 @@ from pimper_torch.photometric_stereo.problem import Problem, Solution, Surfaced
 from pimper_torch.photometric_stereo.regression import determined
 from pimper_torch.photometric_stereo.relief import bulge, convex, rounded_relief
 from pimper_torch.photometric_stereo.spherical_harmonics import (
+    Harmonic,
     four_harmonic_stereo,
     nine_harmonic_stereo,
-    nine_harmonics,
 )
 from pimper_torch.photometric_stereo.woodham import calibrated_stereo, chromatic_albedo
 from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.manifolds import second_order
 
 
 def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
@@ -160,31 +161,20 @@ def _perspective(given: Problem, resolve: str) -> Solution:
 
 
 def _four_harmonics(given: Problem, resolve: str) -> Solution:
-    found = four_harmonic_stereo(
-        given.gray, given.weight, given.mask, given.generator, robust=given.robust
-    )
-    albedo = found.shading[0]
-    normals = found.shading[1:] / torch.where(albedo > 0, albedo, 1)
-    shade = found.lights @ harmonics(normals.mT).mT
-    return _scaled(
-        Solution(
-            normals=normals,
-            albedo=chromatic_albedo(given.radiance, found.weight, shade),
-            lights=found.lights,
-            weight=found.weight,
-            applied=found.ambiguity,
-            free=f"convex or concave, {_FACTOR}",
-        )
-    )
+    return _by_harmonics(given, four_harmonic_stereo, harmonics)
 
 
 def _nine_harmonics(given: Problem, resolve: str) -> Solution:
-    found = nine_harmonic_stereo(
-        given.gray, given.weight, given.mask, given.generator, robust=given.robust
-    )
+    return _by_harmonics(given, nine_harmonic_stereo, second_order)
+
+
+def _by_harmonics(
+    given: Problem, stereo: Callable[..., Harmonic], basis: Callable[[Tensor], Tensor]
+) -> Solution:
+    found = stereo(given.gray, given.weight, given.mask, given.generator, robust=given.robust)
     albedo = found.shading[0]
     normals = found.shading[1:] / torch.where(albedo > 0, albedo, 1)
-    shade = found.lights @ nine_harmonics(normals.mT).mT
+    shade = found.lights @ basis(normals.mT).mT
     return _scaled(
         Solution(
             normals=normals,

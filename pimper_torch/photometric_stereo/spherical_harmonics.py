@@ -28,6 +28,7 @@ from pimper_torch.photometric_stereo.regression import regress
 from pimper_torch.photometric_stereo.relief import bulge
 from pimper_torch.photometry.ambiguity import Ambiguity, lorentz
 from pimper_torch.photometry.cone import project_to_cone, split_shading
+from pimper_torch.photometry.manifolds import second_order
 from pimper_torch.photometry.spectral import upgrade_to_cone
 from pimper_torch.records import Record
 
@@ -60,17 +61,6 @@ class Harmonic(Record):
     weight: Float[Tensor, "view pixel"]
     ambiguity: Ambiguity
     curl: float
-
-
-def nine_harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
-    """Give ``1, x, y, z, xy, xz, yz, x^2 - y^2, 3 z^2 - 1``: the constants are the lights'.
-
-    >>> nine_harmonics(torch.tensor([0.0, 0.0, -1.0]))
-    tensor([ 1.,  0.,  0., -1.,  0., -0., -0.,  0.,  2.])
-    """
-    x, y, z = normals.unbind(dim=-1)
-    rest = [x * y, x * z, y * z, x * x - y * y, 3 * z * z - 1]
-    return torch.stack([torch.ones_like(x), x, y, z, *rest], dim=-1)
 
 
 def four_harmonic_stereo(
@@ -177,7 +167,7 @@ def nine_harmonic_stereo(
         normal = split_shading(project_to_cone(moved.mT))[1].mT
         # From rho (1, n) to t rho (1, n'), and then to t^2 rho.
         albedo = moved[0] ** 2 / torch.where(length > 0, length, 1)
-        basis = albedo * nine_harmonics(normal.mT).mT
+        basis = albedo * second_order(normal.mT).mT
         lights = regress(
             torch.where(weight > 0, radiance, 0).double().mT,
             weight.double().mT,
@@ -204,7 +194,7 @@ def _explain(
         vector = flat.reshape(3, 9) @ S
         albedo = vector.norm(dim=0)
         normal = vector / torch.where(albedo > 0, albedo, 1)
-        basis = root * albedo * nine_harmonics(normal.mT).mT
+        basis = root * albedo * second_order(normal.mT).mT
         # An orthonormal basis of the rows: what of S is not in it is the misfit.
         rows = torch.linalg.qr(basis.mT).Q
         heavy = root * S
