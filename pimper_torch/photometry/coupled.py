@@ -18,8 +18,9 @@ from pimper_torch.photometry.bilinear import (
     objective,
     reweigh,
 )
-from pimper_torch.photometry.coupling import couple_lights, disagreement
+from pimper_torch.photometry.coupling import couple_lights, couple_steps, disagreement
 from pimper_torch.photometry.harmonics import rotate_lights
+from pimper_torch.photometry.implicit import answered, eliminated
 from pimper_torch.photometry.quadratics import unpacked
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record, StopCause
@@ -75,11 +76,7 @@ def solve_coupled(
     with torch.no_grad():
         states = [_start(batch.problem) for batch in batches]
         pairs = _patches_of(batches, pairs)
-        information, _ = _equations(batches, states)
-        known = information[..., 0, 0] - torch.cat([batch.problem.pull for batch in batches])
-        count = (known > 0).sum(dim=0).clamp_min(1)
-        strength = coupling * known.sum(dim=0) / count
-        strength = torch.where(known.sum(dim=0) > 0, strength, 1.0)
+        strength = strengths(batches, coupling)
         taken = max_iterations
         for step in range(max_iterations):
             lights = couple_lights(*_equations(batches, states), pairs, strength)
@@ -92,6 +89,48 @@ def solve_coupled(
             _finished(batch.problem, state, part, taken, tolerance)
             for batch, state, part in zip(batches, states, change, strict=True)
         )
+
+
+def strengths(batches: Sequence[Batch], coupling: float) -> Float[Tensor, " view"]:
+    """Give ``s_g``: the coupling, times what a patch's samples say of a light in the mean."""
+    with torch.no_grad():
+        information, _ = _equations(batches, [_start(batch.problem) for batch in batches])
+        known = information[..., 0, 0] - torch.cat([batch.problem.pull for batch in batches])
+        count = (known > 0).sum(dim=0).clamp_min(1)
+        strength = coupling * known.sum(dim=0) / count
+        return torch.where(known.sum(dim=0) > 0, strength, 1.0)
+
+
+def differentiable_together(
+    batches: Sequence[Batch],
+    factors: Sequence[Factors],
+    pairs: Int[Tensor, "pair 2"],
+    coupling: float,
+) -> tuple[Factors, ...]:
+    """Let gradients flow from coupled solutions to the data of all patches.
+
+    See :func:`~pimper_torch.photometry.implicit.differentiable`; the lights of all patches
+    answer together, by conjugate gradients.
+    """
+    systems = [
+        eliminated(batch.problem, found) for batch, found in zip(batches, factors, strict=True)
+    ]
+    slopes = torch.cat(
+        [_to_world(batch, one.slope) for batch, one in zip(batches, systems, strict=True)]
+    )
+    with torch.no_grad():
+        curvature = torch.cat(
+            [_turned(batch, one.hessian.schur) for batch, one in zip(batches, systems, strict=True)]
+        )
+        strength = strengths(batches, coupling).to(curvature)
+    step = couple_steps(curvature, slopes, _patches_of(batches, pairs), strength)
+    found, first = [], 0
+    for batch, one, solution in zip(batches, systems, factors, strict=True):
+        part = step[first : first + len(batch.facet)]
+        first += len(batch.facet)
+        own = rotate_lights(batch.patch_from_world.to(part), part)
+        found.append(answered(solution, one, own))
+    return tuple(found)
 
 
 def coupled_objective(
@@ -142,6 +181,17 @@ def _equations(
         matrices.append(turn.mT @ A @ turn)
         sides.append((turn.mT @ short[..., None])[..., 0])
     return torch.cat(matrices), torch.cat(sides)
+
+
+def _turned(
+    batch: Batch, curvature: Float[Tensor, "patch unknown unknown"]
+) -> Float[Tensor, "patch unknown unknown"]:
+    """Turn second derivatives by the lights to the world frame."""
+    views = curvature.shape[1] // 4
+    turn = torch.eye(4, dtype=curvature.dtype, device=curvature.device).repeat(len(curvature), 1, 1)
+    turn[:, 1:, 1:] = batch.patch_from_world[:, :3, :3]
+    blocks = curvature.reshape(len(curvature), views, 4, views, 4)
+    return torch.einsum("pai,pfagb,pbj->pfigj", turn, blocks, turn).reshape(curvature.shape)
 
 
 def _to_world(batch: Batch, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:

@@ -18,7 +18,7 @@ from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver, select
 from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold
 from pimper_torch.photometry.colour import solve_in_colour, split_colours
-from pimper_torch.photometry.coupled import Batch, solve_coupled
+from pimper_torch.photometry.coupled import Batch, differentiable_together, solve_coupled
 from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.harmonics import rotate_lights
 from pimper_torch.photometry.implicit import differentiable
@@ -196,8 +196,7 @@ class Factorize(nn.Module):
 
     Differentiable in the radiance: lights by the implicit function at the optimum (see
     :mod:`~pimper_torch.photometry.implicit`), then every sample by its exact last step and its
-    albedo. The light field, robust weights of the last step and the gauge are held constant; so
-    are coupled lights.
+    albedo. The light field, robust weights of the last step and the gauge are held constant.
     """
 
     def __init__(self, config: FactorizeConfig | None = None) -> None:
@@ -259,7 +258,7 @@ class Factorize(nn.Module):
     ) -> Photometry:
         rows, normals = posed.rows, chunk.normals
         if problem.radiance.requires_grad and self.config.light_coupling == 0:
-            factors = differentiable(problem, factors)
+            factors = differentiable(problem, factors)  # coupled ones have their gradients
         found = refine_on_manifold(problem, factors)
         sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
         lit = rows.seen.sum(dim=1) >= self.config.min_views
@@ -354,16 +353,18 @@ class Factorize(nn.Module):
             problem = self._pose(chunk, field).problem
             batches.append(
                 Batch(
-                    problem=problem.replace(radiance=problem.radiance.detach()),
+                    problem=problem,
                     patch_from_world=chunk.templates.patch_from_world.to(chunk.normals),
                     facet=chunk.templates.facet,
                 )
             )
         pairs, _ = face_pairs(seen.patches.coarse.mesh.faces)
         config = self.config
-        return solve_coupled(
-            batches, pairs, config.light_coupling, config.max_iterations, config.tolerance
-        )
+        strength = config.light_coupling
+        found = solve_coupled(batches, pairs, strength, config.max_iterations, config.tolerance)
+        if any(batch.problem.radiance.requires_grad for batch in batches):
+            return differentiable_together(batches, found, pairs, strength)
+        return found
 
 
 def _of_rank(lights: Float[Tensor, "*batch 4"], rank: int) -> Float[Tensor, "*batch rank"]:

@@ -42,26 +42,15 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
 
     Checked by ``gradcheck`` against the solvers themselves in ``test_implicit.py``.
     """
-    L, N = factors.lights.detach().double(), factors.shading.detach().double()
-    hessian = _hessian(problem, L, N)
-    on_lights, on_samples = _slopes(problem, hessian, L, N)
-    inner = _apply(hessian.inverse, on_samples)
-    reduced = on_lights - _mix(hessian, inner)
-    size = reduced.shape[1] * reduced.shape[2]
-    step = torch.linalg.solve(hessian.schur, reduced.reshape(-1, size, 1)).reshape(reduced.shape)
-    turn = inner - _apply(hessian.inverse, _mix_back(hessian, step))
-    moved = sum(
-        (column * turn[:, place, None] for place, column in enumerate(hessian.columns)),
-        start=torch.zeros_like(N),
-    )
-    return factors.replace(
-        lights=factors.lights.detach() + (step - step.detach()).to(factors.lights),
-        shading=factors.shading.detach() + (moved - moved.detach()).to(factors.shading),
-    )
+    system = eliminated(problem, factors)
+    size = system.slope.shape[1] * system.slope.shape[2]
+    flat = system.slope.reshape(-1, size, 1)
+    step = torch.linalg.solve(system.hessian.schur, flat).reshape(system.slope.shape)
+    return answered(factors, system, step)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Hessian(Record):
+class Hessian(Record):
     """Half the second derivatives of the objective, constant, samples eliminated.
 
     Attributes:
@@ -83,10 +72,50 @@ class _Hessian(Record):
     schur: Float[Tensor, "patch unknown unknown"]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Eliminated(Record):
+    """The Newton step at a solution, as equations for the lights alone.
+
+    Attributes:
+        hessian: Constant; its ``schur`` times the step of the lights is the slope.
+        slope: What the data say to the lights; zero at the optimum, but not its derivative.
+        inner: What they say to the samples, lights held.
+    """
+
+    hessian: Hessian
+    slope: Float[Tensor, "patch view rank"]
+    inner: Float[Tensor, "patch tangent sample"]
+
+
+def eliminated(problem: Bilinear, factors: Factors) -> Eliminated:
+    """Set the equations up; differentiable in the data, with the Hessian held constant."""
+    L, N = factors.lights.detach().double(), factors.shading.detach().double()
+    hessian = _hessian(problem, L, N)
+    on_lights, on_samples = _slopes(problem, hessian, L, N)
+    inner = _apply(hessian.inverse, on_samples)
+    return Eliminated(hessian=hessian, slope=on_lights - _mix(hessian, inner), inner=inner)
+
+
+def answered(
+    factors: Factors, system: Eliminated, step: Float[Tensor, "patch view rank"]
+) -> Factors:
+    """Give the solution the derivatives of a step of the lights, and of the samples after it."""
+    hessian = system.hessian
+    turn = system.inner - _apply(hessian.inverse, _mix_back(hessian, step))
+    moved = sum(
+        (column * turn[:, place, None] for place, column in enumerate(hessian.columns)),
+        start=torch.zeros_like(hessian.shading),
+    )
+    return factors.replace(
+        lights=factors.lights.detach() + (step - step.detach()).to(factors.lights),
+        shading=factors.shading.detach() + (moved - moved.detach()).to(factors.shading),
+    )
+
+
 @torch.no_grad()
 def _hessian(
     problem: Bilinear, L: Float[Tensor, "patch view rank"], N: Float[Tensor, "patch rank sample"]
-) -> _Hessian:
+) -> Hessian:
     weight, radiance = problem.weight.double(), problem.radiance.double()
     residual = radiance - L @ N
     deviation = deviation_of(problem, residual)[:, None, None]
@@ -104,7 +133,7 @@ def _hessian(
     # A sample that no view has answers to nothing.
     own = torch.where((diagonal > 0)[..., None, None], own, eye)
     inverse = torch.linalg.inv_ex(own).inverse
-    found = _Hessian(
+    found = Hessian(
         lights=L,
         shading=N,
         columns=columns,
@@ -116,7 +145,7 @@ def _hessian(
     return found.replace(schur=_schur(problem, found))
 
 
-def _schur(problem: Bilinear, hessian: _Hessian) -> Float[Tensor, "patch unknown unknown"]:
+def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown unknown"]:
     L, N = hessian.lights, hessian.shading
     batch, views, rank = L.shape
     products = (N[:, :, None] * N[:, None]).flatten(1, 2)
@@ -149,7 +178,7 @@ def _schur(problem: Bilinear, hessian: _Hessian) -> Float[Tensor, "patch unknown
 
 def _slopes(
     problem: Bilinear,
-    hessian: _Hessian,
+    hessian: Hessian,
     L: Float[Tensor, "patch view rank"],
     N: Float[Tensor, "patch rank sample"],
 ) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]]:
@@ -167,7 +196,7 @@ def _slopes(
 
 
 def _mix(
-    hessian: _Hessian, turn: Float[Tensor, "patch tangent sample"]
+    hessian: Hessian, turn: Float[Tensor, "patch tangent sample"]
 ) -> Float[Tensor, "patch view rank"]:
     """Apply the mixed part to changes of the samples."""
     moved = sum(
@@ -180,7 +209,7 @@ def _mix(
 
 
 def _mix_back(
-    hessian: _Hessian, step: Float[Tensor, "patch view rank"]
+    hessian: Hessian, step: Float[Tensor, "patch view rank"]
 ) -> Float[Tensor, "patch tangent sample"]:
     """Apply its transpose to changes of the lights."""
     ambient = hessian.lights.mT @ (hessian.bent * (step @ hessian.shading)) - (

@@ -6,7 +6,12 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.photometry.bilinear import select
-from pimper_torch.photometry.coupled import Batch, coupled_objective, solve_coupled
+from pimper_torch.photometry.coupled import (
+    Batch,
+    coupled_objective,
+    differentiable_together,
+    solve_coupled,
+)
 from pimper_torch.photometry.coupling import couple_lights
 from pimper_torch.photometry.harmonics import rotate_lights
 from pimper_torch.photometry.variable_projection import solve_variable_projection
@@ -118,6 +123,51 @@ def test_infinite_coupling_gives_one_light_in_the_world(batches):
     ]
     one = torch.cat(world)
     assert_close(one, one[:1].expand_as(one))
+
+
+@pytest.mark.parametrize("coupling", [0.3, math.inf])
+def test_gradients_of_coupled_patches_are_those_of_the_solver(batches, coupling, generator):
+    def solved(given):
+        return solve_coupled(given, CHAIN, coupling, 400, 1e-11)
+
+    def moved(sign, ways):
+        return [
+            batch.replace(
+                problem=batch.problem.replace(radiance=batch.problem.radiance + sign * way)
+            )
+            for batch, way in zip(batches, ways, strict=True)
+        ]
+
+    start = solved(batches)
+    batches = [
+        batch.replace(problem=batch.problem.replace(lights=found.lights, shading=found.shading))
+        for batch, found in zip(batches, start, strict=True)
+    ]
+    start = solved(batches)
+    leaves = [batch.problem.radiance.clone().requires_grad_() for batch in batches]
+    given = [
+        batch.replace(problem=batch.problem.replace(radiance=leaf))
+        for batch, leaf in zip(batches, leaves, strict=True)
+    ]
+    found = differentiable_together(given, start, CHAIN, coupling)
+
+    def draw(like):
+        return torch.randn(like.shape, generator=generator, dtype=torch.float64)
+
+    probes = [(draw(one.lights), draw(one.shading)) for one in found]
+
+    def total(answers):
+        return sum(
+            (a * one.lights).sum() + (b * one.shading).sum()
+            for (a, b), one in zip(probes, answers, strict=True)
+        )
+
+    slopes = torch.autograd.grad(total(found), leaves)
+    ways = [draw(leaf) for leaf in leaves]
+    step = 1e-3
+    ahead, behind = (total(solved(moved(sign * step, ways))) for sign in (1, -1))
+    along = sum((slope * way).sum() for slope, way in zip(slopes, ways, strict=True))
+    assert_close(along, (ahead - behind) / (2 * step), rtol=1e-3, atol=1e-4)
 
 
 def test_coupling_in_between_lowers_its_objective_and_is_at_a_minimum(batches):

@@ -269,12 +269,13 @@ def test_confidence_falls_with_noise(scene, generator):
     assert dirty.confidence[dirty.valid].mean() < 0.8 * clean.confidence[clean.valid].mean()
 
 
-def test_gradients_reach_the_radiance_of_lit_samples_only(scene):
+@pytest.mark.parametrize("settings", [{}, {"light_coupling": 1.0}, {"colour": True}, {"rank": 3}])
+def test_gradients_reach_the_radiance_of_lit_samples_only(scene, settings):
     true = scene()
     first = true.seen.buckets[0]
     radiance = first.radiance.clone().requires_grad_()
     seen = true.seen.replace(buckets=(first.replace(radiance=radiance), *true.seen.buckets[1:]))
-    found = Factorize()(seen).buckets[0]
+    found = Factorize(FactorizeConfig(**settings))(seen).buckets[0]
     (found.normals_patch[..., 0].sum() + found.albedo.sum()).backward()
     assert radiance.grad.isfinite().all()
     assert radiance.grad.abs().sum() > 0
