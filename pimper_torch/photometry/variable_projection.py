@@ -121,11 +121,13 @@ def curvature_of_lights(
     """
     batch, views, rank = lights.shape
     stride = max(1, shading.shape[2] // samples) if samples else 1
+    shading, weight = shading[:, :, ::stride], weight[:, :, ::stride]
     some = problem.replace(
         radiance=problem.radiance[:, :, ::stride],
+        weight=weight,
+        shading=shading,
         prior=None if problem.prior is None else problem.prior[:, :, ::stride],
     )
-    shading, weight = shading[:, :, ::stride], weight[:, :, ::stride]
     # (w_fk n_k n_k^T) on the diagonal blocks, one a view.
     products = (shading[:, :, None] * shading[:, None]).flatten(1, 2)
     blocks = (weight @ products.mT).reshape(batch, views, rank, rank)
