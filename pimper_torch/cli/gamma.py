@@ -9,6 +9,7 @@ from rich.console import Console
 
 from pimper_torch.cli.bars import Bars
 from pimper_torch.datasets.raster import read_mask
+from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import load_views
 from pimper_torch.photometry.gamma import GammaEstimate, gamma_of_photographs
 from pimper_torch.progress import listening
@@ -39,6 +40,11 @@ def run(command: str, arguments: Sequence[str]) -> None:
             rank: 3 if lamps are far away and the room is dark, 4 with ambient light.
             max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         """
+        if mask is not None and not mask.is_file():
+            raise InputError(
+                f"{mask}: there is no such file; needed: a mask, bright on the object, for all "
+                "photographs."
+            )
         with Bars(Console(stderr=True)) as bars:
             bars.started("read")
             with listening(bars.progressed):

@@ -21,9 +21,17 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.robust import cauchy_weights, spread
-from pimper_torch.photometry.variable_projection import solve_variable_projection
-from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
+from pimper_torch.photometry.encoded import (
+    ROUNDS,
+    EncodedFit,
+    EncodedMatrix,
+    enough,
+    fit_encoded,
+    freedom,
+    residual_spread,
+)
+from pimper_torch.photometry.robust import spread
+from pimper_torch.radiometry import SATURATED, Gamma, Linear, Srgb
 from pimper_torch.records import PatchViews, Record, Views
 
 # Between them lie all curves in use; 1 is linear.
@@ -47,11 +55,6 @@ _LEAST_SCALE = 5e-4
 # (Holland & Welsch, 1977).
 _CAUCHY = 2.385
 
-# Further rounds of linearising about the fit and weighing outliers, each exponent starting where
-# the last one ended.
-_ROUNDS = 1
-_ITERATIONS, _TOLERANCE = 30, 1e-7
-
 # The estimate is checked without the darker third and half of the entries.
 _DARKEST_SHARES = (1 / 3, 1 / 2)
 # Fewer degrees of freedom say little of their own error.
@@ -63,7 +66,6 @@ _DOUBTED, _CONTRADICTED = 2.0, 3.0
 # The second choice of entries halves the bias that the first, from noisy values, leaves: 0.8 and
 # 0.4 % of gamma at 1 % noise.
 _CHOICES = 2
-_FILL_STEPS = 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -238,42 +240,6 @@ def gamma_of_patches(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Problem(Record):
-    """What is to be explained.
-
-    Attributes:
-        encoded: All samples looked at.
-        seen: Among them, that are not missing.
-        used: That the fit rests on.
-        scale: Of residuals, beyond which they are outliers; 0 is least squares.
-        rank: Of radiance.
-    """
-
-    encoded: Float[Tensor, "view sample"]
-    seen: Bool[Tensor, "view sample"]
-    used: Bool[Tensor, "view sample"]
-    scale: float
-    rank: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Fit(Record):
-    """How well a response does.
-
-    Attributes:
-        predicted: Encoded values.
-        loss: Of each entry; 0 where not used.
-        weight: Of each entry, less for outliers.
-        left: Left factor, from which the next response starts.
-    """
-
-    predicted: Float[Tensor, "view sample"]
-    loss: Float[Tensor, "view sample"]
-    weight: Float[Tensor, "view sample"]
-    left: Float[Tensor, "view rank"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Minimum(Record):
     """Where the loss is least, and how sure that is.
 
@@ -285,9 +251,9 @@ class _Minimum(Record):
         error: Standard error of gamma.
     """
 
-    problem: _Problem
+    problem: EncodedMatrix
     gamma: float
-    fit: _Fit
+    fit: EncodedFit
     inner: bool
     error: float
 
@@ -298,46 +264,38 @@ def _problem(
     rank: int,
     limits: tuple[float, float],
     max_samples: int,
-) -> _Problem:
+) -> EncodedMatrix:
     """Thin the samples, and use what is neither dark nor saturated."""
-    used = _enough(seen & (encoded > limits[0]) & (encoded < limits[1]), rank)
+    used = enough(seen & (encoded > limits[0]) & (encoded < limits[1]), rank)
     views, samples = used.any(dim=1), used.any(dim=0).nonzero().flatten()
     if int(views.sum()) <= rank + 1 or len(samples) <= 4 * rank:
         raise InputError(
-            f"only {len(samples)} samples are lit in more than {rank} views, in {int(views.sum())} "
-            f"views altogether; needed: more than {4 * rank} in at least {rank + 2}. Add "
-            "photographs under other lights, expose so that less is dark or saturated, or lower "
-            "the rank."
+            f"only {len(samples)} samples are lit in more than {rank} of {len(seen)} views; "
+            f"needed: more than {4 * rank}, in at least {rank + 2} views. Add photographs under "
+            "other lights, expose so that less is dark or saturated, or lower the rank."
         )
     count = min(max_samples, len(samples))
     spaced = torch.linspace(0, len(samples) - 1, count, dtype=torch.float64).round().long()
     chosen = samples[spaced.to(samples.device)]
-    return _Problem(
+    return EncodedMatrix(
         encoded=torch.where(seen, encoded, 0)[views][:, chosen].double(),
         seen=seen[views][:, chosen],
-        used=_enough(used[views][:, chosen], rank),
+        used=enough(used[views][:, chosen], rank),
         scale=0.0,
         rank=rank,
     )
 
 
-def _enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
-    """Leave out samples and views that the factors fit whatever they hold."""
-    for _ in range(2):
-        used = used & (used.sum(dim=0) > rank) & (used.sum(dim=1, keepdim=True) > 2 * rank)
-    return used
-
-
 def _chosen_by_fit(
-    problem: _Problem, predicted: Float[Tensor, "view sample"], limits: tuple[float, float]
-) -> _Problem:
+    problem: EncodedMatrix, predicted: Float[Tensor, "view sample"], limits: tuple[float, float]
+) -> EncodedMatrix:
     """Use what the fit predicts to be lit and not saturated, and weigh outliers."""
     dark, saturated = limits
     encoded = problem.encoded
     known = problem.seen & (problem.used.sum(dim=0) > problem.rank)
     lit = (predicted > dark) & (encoded > dark / 2)  # far below: a cast shadow
     lit = lit & (predicted < saturated - dark / 2) & (encoded < saturated)
-    used = _enough(known & lit, problem.rank)
+    used = enough(known & lit, problem.rank)
     if int(used.any(dim=0).sum()) <= 4 * problem.rank:
         used = problem.used
     residual = (encoded - predicted)[used]
@@ -345,29 +303,30 @@ def _chosen_by_fit(
     return problem.replace(used=used, scale=max(scale, _LEAST_SCALE))
 
 
-def _coarsely(problem: _Problem, rounds: int) -> tuple[float, _Fit]:
+def _coarsely(problem: EncodedMatrix, rounds: int) -> tuple[float, EncodedFit]:
     """Give the best of a few exponents, spread evenly."""
     trials = torch.logspace(math.log10(LEAST), math.log10(MOST), _TRIALS, dtype=torch.float64)
-    fits: list[_Fit] = []
+    fits: list[EncodedFit] = []
     for exponent in trials.tolist():
-        fits.append(_fit(problem, Gamma(exponent=exponent), fits[-1] if fits else None, rounds))
+        former = fits[-1] if fits else None
+        fits.append(fit_encoded(problem, Gamma(exponent=exponent), former, rounds))
     best = min(range(_TRIALS), key=lambda trial: float(fits[trial].loss.sum()))
     return float(trials[best]), fits[best]
 
 
-def _minimise(problem: _Problem, start: _Fit, low: float, high: float) -> _Minimum:
+def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float) -> _Minimum:
     """Find where between two exponents the loss is least."""
     fit = start
 
     def loss(logarithm: float) -> float:
         nonlocal fit
-        fit = _fit(problem, Gamma(exponent=math.exp(logarithm)), fit)
+        fit = fit_encoded(problem, Gamma(exponent=math.exp(logarithm)), fit)
         return float(fit.loss.sum())
 
     bounds = (math.log(max(low, LEAST)), math.log(min(high, MOST)))
     found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _CLOSE})
     gamma = math.exp(found.x)
-    fit = _fit(problem, Gamma(exponent=gamma), fit)
+    fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
     return _Minimum(
         problem=problem,
         gamma=gamma,
@@ -377,19 +336,19 @@ def _minimise(problem: _Problem, start: _Fit, low: float, high: float) -> _Minim
     )
 
 
-def _most_trusted(problem: _Problem) -> _Minimum:
+def _most_trusted(problem: EncodedMatrix) -> _Minimum:
     """Estimate from all entries, or from the brighter ones alone where those contradict.
 
     Ambient light in attached shadows is not first-order, bright, and more precise than right.
     """
-    best, fit = _coarsely(problem, _ROUNDS)
+    best, fit = _coarsely(problem, ROUNDS)
     step = (MOST / LEAST) ** (1 / (_TRIALS - 1))
     found = [_minimise(problem, fit, best / step, best * step)]
     predicted = found[0].fit.predicted
     for share in _DARKEST_SHARES:
         level = predicted[problem.used].quantile(share)
-        used = _enough(problem.used & (predicted > level), problem.rank)
-        if _free(used, problem.rank) < _LEAST_FREE:
+        used = enough(problem.used & (predicted > level), problem.rank)
+        if freedom(used, problem.rank) < _LEAST_FREE:
             break
         found.append(_minimise(problem.replace(used=used), found[0].fit, LEAST, MOST))
     for place, estimate in enumerate(found):
@@ -407,13 +366,7 @@ def _most_trusted(problem: _Problem) -> _Minimum:
     raise AssertionError("nothing contradicts the last estimate")
 
 
-def _free(used: Bool[Tensor, "view sample"], rank: int) -> int:
-    """Count the degrees of freedom that the factors leave."""
-    views, samples = (int(used.any(dim=axis).sum()) for axis in (1, 0))
-    return int(used.sum()) - rank * (views + samples - rank)
-
-
-def _standard_error(problem: _Problem, gamma: float, fit: _Fit) -> float:
+def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> float:
     r"""Say how far samples, or views if those differ more, disagree about gamma.
 
     With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
@@ -421,8 +374,8 @@ def _standard_error(problem: _Problem, gamma: float, fit: _Fit) -> float:
     of the noise. Infinite where the loss hardly bends.
     """
     step = 0.02 * gamma
-    below = _fit(problem, Gamma(exponent=gamma - step), fit)
-    above = _fit(problem, Gamma(exponent=gamma + step), fit)
+    below = fit_encoded(problem, Gamma(exponent=gamma - step), fit)
+    above = fit_encoded(problem, Gamma(exponent=gamma + step), fit)
     middle = float(fit.loss.sum())
     curvature = (float(below.loss.sum()) + float(above.loss.sum()) - 2 * middle) / step**2
     slope = (above.loss - below.loss) / (2 * step)
@@ -435,80 +388,16 @@ def _standard_error(problem: _Problem, gamma: float, fit: _Fit) -> float:
 def _judged(found: _Minimum) -> GammaEstimate:
     """Put the answer together."""
     problem = found.problem
-    residual = _spread(problem, found.fit)
+    residual = residual_spread(problem, found.fit)
+    linear = fit_encoded(problem, Linear(), found.fit, 2 * ROUNDS)
+    srgb = fit_encoded(problem, Srgb(), found.fit, 2 * ROUNDS)
     sure = found.inner and found.error < _MOST_UNCERTAIN * found.gamma
     return GammaEstimate(
         gamma=found.gamma,
         standard_error=found.error,
         determined=sure and residual < _MOST_RESIDUAL,
         residual=residual,
-        residual_linear=_spread(problem, _fit(problem, Linear(), found.fit, 2 * _ROUNDS)),
-        residual_srgb=_spread(problem, _fit(problem, Srgb(), found.fit, 2 * _ROUNDS)),
+        residual_linear=residual_spread(problem, linear),
+        residual_srgb=residual_spread(problem, srgb),
         entries=int(problem.used.sum()),
     )
-
-
-def _spread(problem: _Problem, fit: _Fit) -> float:
-    """Give the robust standard deviation of the residuals, for the freedom that is left."""
-    residual = (problem.encoded - fit.predicted)[problem.used]
-    size = float(spread(residual, torch.ones_like(residual, dtype=torch.bool)))
-    free = max(_free(problem.used, problem.rank), 1)
-    return size * (int(problem.used.sum()) / free) ** 0.5
-
-
-def _fit(problem: _Problem, response: Response, start: _Fit | None, rounds: int = _ROUNDS) -> _Fit:
-    """Explain the encoded values by first-order light seen through a response.
-
-    The encoded residual is linearised, first about the values, then about the fit.
-    """
-    mask = problem.used.double()
-    about, weight = torch.where(problem.used, problem.encoded, 0.5), mask
-    left: Tensor | None = None
-    if start is not None:
-        about, weight, left = start.predicted, start.weight, start.left
-    for turn in range(rounds + 1):
-        rate = _derivative(response, about)
-        target = response.linear_from_encoded(about) + rate * (problem.encoded - about)
-        heavy = weight / rate.square()
-        heavy = heavy / heavy.max()
-        if left is None:
-            left = _start(target, mask, problem.rank)
-        solved = solve_variable_projection(
-            target[None], heavy[None], left[None], _ITERATIONS, _TOLERANCE
-        )
-        left = solved.left[0]
-        about = response.encoded_from_linear(left @ solved.right[0]).clamp_min(_DARKEST)
-        residual = mask * (problem.encoded - about)
-        if problem.scale and turn < rounds:
-            weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
-    loss = residual.square()
-    if problem.scale:
-        loss = problem.scale**2 * torch.log1p(loss / problem.scale**2)
-    assert left is not None, "there is one round at least"
-    return _Fit(predicted=about, loss=loss, weight=weight, left=left)
-
-
-# Where a fit predicts less light than none, it is linearised here.
-_DARKEST = 0.02
-
-
-def _derivative(
-    response: Response, encoded: Float[Tensor, "view sample"]
-) -> Float[Tensor, "view sample"]:
-    with torch.enable_grad():
-        at = encoded.detach().requires_grad_()
-        (rate,) = torch.autograd.grad(response.linear_from_encoded(at).sum(), at)
-    return rate
-
-
-def _start(
-    matrix: Float[Tensor, "view sample"], mask: Float[Tensor, "view sample"], rank: int
-) -> Float[Tensor, "view rank"]:
-    """Fill what is missing by albedo times brightness, then by the best of the rank in turn."""
-    gain = (mask * matrix).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp_min(1)
-    level = (mask * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
-    filled = torch.where(mask > 0, matrix, gain * (mask * matrix).sum(dim=0, keepdim=True) / level)
-    for _ in range(_FILL_STEPS):
-        basis = torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:]
-        filled = torch.where(mask > 0, matrix, basis @ (basis.mT @ filled))
-    return basis

@@ -39,9 +39,9 @@ def test_what_the_user_can_mend_is_one_message(fixed, capsys):
     for path in sorted((fixed / "photos").iterdir())[4:]:
         path.unlink()
     assert main(["gamma", str(fixed / "photos")]) == 2
-    assert "samples are lit in more than 4 views, in 4 views" in capsys.readouterr().err
+    assert "samples are lit in more than 4 of 4 views" in capsys.readouterr().err
     assert main(["gamma", str(fixed / "photos"), "--mask", str(fixed / "none.png")]) == 2
-    assert "none.png: there is no such file" in capsys.readouterr().err
+    assert "none.png: there is no such file; needed: a mask" in capsys.readouterr().err
 
 
 def estimate(gamma, residuals, determined=True):

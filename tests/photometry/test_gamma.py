@@ -187,7 +187,7 @@ def test_photographs_or_masks_of_unlike_sizes_are_refused():
         (lambda x: 255 * x, 3, r"encoded values reach from .* needed: shares"),
         (lambda x: x - 0.5, 3, r"encoded values reach from -0\.5"),
         (lambda x: x, 0, "rank is 0"),
-        (lambda x: x[:4], 3, r"only \d+ samples are lit in more than 3 views, in 4 views"),
+        (lambda x: x[:4], 3, r"only \d+ samples are lit in more than 3 of 4 views"),
         (lambda x: x[:, :11], 3, r"only \d+ samples are lit"),
         (lambda x: 0.05 * x, 3, "only 0 samples are lit"),
         (lambda x: 0 * x + 1, 3, "only 0 samples are lit"),
