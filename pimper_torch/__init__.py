@@ -22,9 +22,11 @@ if TYPE_CHECKING:
     from pimper_torch.io.photographs import load_views
     from pimper_torch.io.results import write_result
     from pimper_torch.pipeline import Pimper, PimperConfig, load_config
+    from pimper_torch.radiometry import Encoding
 
 __all__ = [
     "ConfigError",
+    "Encoding",
     "InputError",
     "OutputError",
     "Pimper",
@@ -40,6 +42,7 @@ __all__ = [
 
 # What needs torch is imported when it is asked for, so that the command line answers at once.
 _HOMES = {
+    "Encoding": "pimper_torch.radiometry",
     "Pimper": "pimper_torch.pipeline",
     "PimperConfig": "pimper_torch.pipeline",
     "load_config": "pimper_torch.pipeline",

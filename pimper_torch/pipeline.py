@@ -14,6 +14,7 @@ from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Reconstruction, Views
 from pimper_torch.refinement.refine import Refine, RefineConfig
 from pimper_torch.reporting import Observer, Silent, recorded
@@ -22,8 +23,12 @@ from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PimperConfig:
-    """The settings of every stage, in the order they run."""
+    """The settings of every stage, in the order they run.
 
+    ``photographs`` is what :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
+    """
+
+    photographs: Encoding = field(default_factory=Encoding)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
     triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)

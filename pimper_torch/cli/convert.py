@@ -15,7 +15,7 @@ from rich.console import Console
 from torch import Tensor
 
 from pimper_torch.cli.bars import Bars
-from pimper_torch.cli.options import Flag
+from pimper_torch.cli.options import LEVELS, Flag
 from pimper_torch.datasets import (
     read_colmap,
     read_diligent,
@@ -37,6 +37,8 @@ from pimper_torch.datasets.posed import shrink
 from pimper_torch.errors import InputError
 from pimper_torch.io.folders import prepare_output, written_whole
 from pimper_torch.progress import listening
+from pimper_torch.radiometry import Encoding
+from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
 from pimper_torch.records import Cameras, Capture, StageReport, Truth, Views
 from pimper_torch.reporting import peak_memory_mb
 
@@ -72,6 +74,13 @@ RESULT_NAMES = (
 _MOST_POINTS = 100_000
 
 
+_PHOTOGRAPHS = ("response", "saturation", "black")
+
+
+def _named(name: str) -> object:
+    return tyro.conf.arg(name=f"photographs.{name}")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadOptions:
     """What a reader may be told; each goes with the layouts that know it.
@@ -82,7 +91,9 @@ class ReadOptions:
         masks: Folder with a mask for each photograph, of the same name; black off the object.
         mesh: File of the true surface, in the data set's frame; the export's cloud or unit
             sphere comes from it.
-        linear: The files hold linear radiance, not sRGB.
+        response: As photographs.response of `pimper reconstruct`; the layout's own unless given.
+        saturation: As photographs.saturation of `pimper reconstruct`.
+        black: As photographs.black of `pimper reconstruct`.
         light_seed: Keep one light at each place, chosen by this seed.
         max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
             leaves them.
@@ -92,7 +103,9 @@ class ReadOptions:
     images: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    linear: Flag = False
+    response: Annotated[ResponseChoice | None, _named("response")] = None
+    saturation: Annotated[SaturationChoice | None, _named("saturation")] = None
+    black: Annotated[float | None, _named("black")] = None
     light_seed: int | None = None
     max_size_px: int = 0
 
@@ -167,7 +180,7 @@ def parse(arguments: Sequence[str]) -> Job:
             options=options,
         )
 
-    return tyro.cli(convert, prog="pimper convert", args=list(arguments))
+    return tyro.cli(convert, prog="pimper convert", args=list(arguments), config=(LEVELS,))
 
 
 def readers() -> Mapping[Source, Callable[..., Capture]]:
@@ -217,9 +230,17 @@ def read(job: Job) -> Capture:
         for name in _OPTIONS
         if getattr(job.options, name) != getattr(plain, name)
     }
+    photographs = {name: given.pop(name) for name in _PHOTOGRAPHS if name in given}
+    if photographs and "encoding" in known:
+        usual = known["encoding"].default
+        assert isinstance(usual, Encoding), "readers say what their layout's files hold"
+        given["encoding"] = dataclasses.replace(usual, **photographs)
+    elif photographs:
+        given |= photographs
     strange = [_option(name) for name in given if name not in known]
     if strange:
-        goes = [_option(name) for name in _OPTIONS if name in known]
+        accepted = {*known, *(_PHOTOGRAPHS if "encoding" in known else ())}
+        goes = [_option(name) for name in _OPTIONS if name in accepted]
         raise InputError(
             f"{', '.join(strange)}: the reader of {job.source} does not know it; needed: some of "
             f"{', '.join(goes)}, or another --source."
@@ -288,7 +309,7 @@ def _count(number: int, noun: str) -> str:
 
 
 def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+    return f"--{'photographs.' * (name in _PHOTOGRAPHS)}{name.replace('_', '-')}"
 
 
 def _report(capture: Capture, seconds: float) -> StageReport:

@@ -23,6 +23,7 @@ usage: pimper reconstruct PHOTOS -o OUT [options]
        pimper evaluate RESULT TRUTH [options]
        pimper bench [-o OUT] [options]
        pimper convert DATA -o OUT --source KIND --target KIND [options]
+       pimper gamma PHOTOS [options]
        pimper --version
 
 Photographs from many places under many unknown lights, to a dense surface with normals,
@@ -34,6 +35,7 @@ albedo and light.
   evaluate      a result against the truth
   bench         the table: scenes, presets and rivals
   convert       a data set of another layout, or to one
+  gamma         the response of photographs from a fixed camera under several lights
 
 `pimper COMMAND --help` tells every option, and every setting of every stage.
 """
@@ -45,6 +47,7 @@ _COMMANDS = {
     "evaluate": "pimper_torch.cli.evaluate",
     "bench": "pimper_torch.cli.bench",
     "convert": "pimper_torch.cli.convert",
+    "gamma": "pimper_torch.cli.gamma",
 }
 _FAILED, _INTERRUPTED = 2, 130
 

@@ -5,13 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from pimper_torch.pipeline import PimperConfig, load_config
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
+# Several numbers are one word, 15000,15100,14900: a list would swallow PHOTOS behind it.
+LEVELS: Any = tyro.conf.UsePythonSyntaxForLiteralCollections  # typed as what it marks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,12 +44,10 @@ class InputOptions:
         masks: Folder with a mask for each photograph, of the same name; zero off the object.
         sparse: Folder of a COLMAP model of these photographs, used instead of structure
             from motion.
-        linear: The files hold linear radiance, not sRGB.
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     sparse: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    linear: Flag = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,6 +113,7 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         reconstruct if command == "reconstruct" else demo,
         prog=f"pimper {command}",
         args=list(arguments),
+        config=(LEVELS,),
     )
     if job.common.reference:
         triangulate = dataclasses.replace(job.config.triangulate, reference=job.common.reference)

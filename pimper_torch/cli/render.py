@@ -57,10 +57,10 @@ def run(command: str, arguments: Sequence[str]) -> None:
                 figures={"photographs": job.config.num_views},
             )
         )
-    linear = " --linear" if job.config.encoding == "linear" else ""
+    told = "" if job.config.encoding == "srgb" else " --photographs.response linear"
     Console().print(
         f"{job.out}/photos are the photographs, {job.out}/truth is what they show. Next:\n"
-        f"  pimper reconstruct {job.out}/photos -o RESULT{linear}",
+        f"  pimper reconstruct {job.out}/photos -o RESULT{told}",
         highlight=False,
         soft_wrap=True,
         markup=False,

@@ -45,7 +45,7 @@ def _read(job: Job) -> Views:
     return load_views(
         job.photos,
         masks=job.inputs.masks,
-        linear=job.inputs.linear,
+        encoding=job.config.photographs,
         max_size_px=job.common.max_size_px,
     )
 
@@ -55,7 +55,7 @@ def _write(job: Job, result: Reconstruction) -> None:
         "photographs": str(job.photos),
         "masks": _text(job.inputs.masks),
         "sparse": _text(job.inputs.sparse),
-        "linear": job.inputs.linear,
+        "response": str(job.config.photographs.response),
         "max_size_px": job.common.max_size_px,
         "preset": job.common.preset,
         "device": job.common.device,

@@ -10,6 +10,7 @@ from torch import Tensor
 from pimper_torch.datasets.layout import expect, first_of, inside
 from pimper_torch.datasets.pictures import file_names, refuse_skew, write_mask, write_picture
 from pimper_torch.datasets.posed import PosedPhotograph, assemble, mask_finder, read_views
+from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, SparseScene, Views
 from pimper_torch.sfm.colmap import read_model, write_binary
 from pimper_torch.sfm.model import SparseModel
@@ -26,7 +27,7 @@ def read_colmap(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Capture:
     """Read a COLMAP model, text or binary, and the photographs it was made from.
@@ -42,7 +43,7 @@ def read_colmap(
         masks: Folder of masks; by default ``masks`` beside that, if there is one.
         names: Keep these photographs, as the model calls them, in this order.
         mesh: File of the true surface, if it is known.
-        linear: The files hold linear radiance, not sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
@@ -55,7 +56,7 @@ def read_colmap(
         _KIND,
         names=names,
         mesh=mesh,
-        linear=linear,
+        encoding=encoding,
         max_size_px=max_size_px,
     )
 
@@ -65,7 +66,7 @@ def read_colmap_scene(
     *,
     images: Path | str | None = None,
     masks: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> SparseScene:
     """Read a COLMAP model with its cloud and tracks, as structure from motion gives it.
@@ -78,7 +79,7 @@ def read_colmap_scene(
     model_folder, photographs = _photographs(Path(folder), images, masks)
     missing = [one.name for one in photographs if not one.image.is_file()]
     expect(not missing, model_folder, _KIND, "all its photographs", f"no {', '.join(missing[:5])}")
-    views = read_views(photographs, linear=linear, max_size_px=max_size_px)
+    views = read_views(photographs, encoding=encoding, max_size_px=max_size_px)
     return Reconstruct()(views, model_folder)
 
 

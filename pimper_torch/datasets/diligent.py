@@ -22,6 +22,7 @@ from pimper_torch.datasets.raster import (
 from pimper_torch.datasets.sampling import choose_photographs
 from pimper_torch.errors import InputError
 from pimper_torch.io.decode import decode
+from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Capture, Record, Truth
 
 KIND = "DiLiGenT"
@@ -115,7 +116,7 @@ def read_diligent(
     views = read_photographs(
         [files.paths[index] for index in kept],
         [files.paths[index].name for index in kept],
-        linear=True,
+        encoding=LINEAR,
         max_size_px=max_size_px,
         masks=[root / "mask.png"] * len(kept),
         divide_by=intensity if divide_by_intensity else None,

@@ -18,6 +18,7 @@ from pimper_torch.datasets.sampling import choose_photographs
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import read_header
 from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Cameras, Capture, Mesh, Truth
 
 KIND = "DiLiGenT-MV"
@@ -94,7 +95,7 @@ def read_diligent_mv(
     views = read_photographs(
         paths,
         [f"{path.parent.name}/{path.name}" for path in paths],
-        linear=True,
+        encoding=LINEAR,
         max_size_px=max_size_px,
         masks=[path.parent / "mask.png" for path in paths],
         divide_by=intensity if divide_by_intensity else None,

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pimper_torch.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Cameras, Capture, Truth
 
 CALIBRATED_WIDTH = 1600  # of 1600 x 1200; copies of half the size exist
@@ -21,7 +22,7 @@ def dtu_capture(
     cameras: tuple[Float[Tensor, "place 3 3"], Float[Tensor, "place 4 4"]],
     truth: Truth,
     *,
-    linear: bool,
+    encoding: Encoding,
     max_size_px: int,
 ) -> Capture:
     """Read photographs and give each the camera of its place.
@@ -33,7 +34,7 @@ def dtu_capture(
         cameras: Intrinsics, whose pixels count from the centre of the first one, and poses of
             the different places in ascending order.
         truth: Of the scene.
-        linear: False to undo sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
 
     Raises:
@@ -42,7 +43,7 @@ def dtu_capture(
     order = sorted(set(places))
     index = torch.tensor([order.index(place) for place in places])
     views = read_photographs(
-        paths, [path.name for path in paths], linear=linear, max_size_px=max_size_px
+        paths, [path.name for path in paths], encoding=encoding, max_size_px=max_size_px
     )
     K, cam_from_world = cameras
     factor = float(views.sizes_px[0, 0]) / CALIBRATED_WIDTH

@@ -15,6 +15,7 @@ from pimper_torch.datasets.projections import decompose_projections
 from pimper_torch.datasets.sampling import choose_photographs
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Capture, DtuProtocol, Truth
 
 KIND = "the DTU multi-view stereo set of 2014"
@@ -30,7 +31,7 @@ def read_dtu_mvs(
     lights: Sequence[int] | None = None,
     light_seed: int | None = None,
     max_size_px: int = 0,
-    linear: bool = True,
+    encoding: Encoding = LINEAR,
 ) -> Capture:
     """Read a scan of the DTU multi-view stereo set.
 
@@ -58,7 +59,7 @@ def read_dtu_mvs(
         light_seed: Read one light a place, chosen by this seed; ``None`` reads all. Decided
             before anything is decoded.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
-        linear: False to undo sRGB.
+        encoding: Response, saturation and black level of the files.
 
     Raises:
         InputError: Another layout; says what was expected and what is there.
@@ -93,7 +94,7 @@ def read_dtu_mvs(
         lamps,
         _read_cameras(root, sorted(set(places))),
         Truth(points_world=_scan(root, scan)),
-        linear=linear,
+        encoding=encoding,
         max_size_px=max_size_px,
     )
 

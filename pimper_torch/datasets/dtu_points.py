@@ -13,6 +13,7 @@ from pimper_torch.datasets.layout import expect, first_of
 from pimper_torch.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.datasets.projections import decompose_projections
 from pimper_torch.datasets.sampling import choose_photographs
+from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Capture, Truth
 
 KIND = "the DTU point feature set"
@@ -29,7 +30,7 @@ def read_dtu_points(
     lights: Sequence[int] | None = None,
     light_seed: int | None = None,
     max_size_px: int = 0,
-    linear: bool = True,
+    encoding: Encoding = LINEAR,
 ) -> Capture:
     """Read a scene of the DTU point feature set.
 
@@ -55,7 +56,7 @@ def read_dtu_points(
         light_seed: Read one LED a place, chosen by this seed, each place another than the one
             before; ``None`` reads all. Decided before anything is decoded.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
-        linear: False if the files were converted to sRGB.
+        encoding: Response, saturation and black level of the files.
 
     Raises:
         InputError: Another layout; says what was expected and what is there.
@@ -93,7 +94,7 @@ def read_dtu_points(
         lamps,
         decompose_projections(projections),
         Truth(points_world=_scan(root, scan)),
-        linear=linear,
+        encoding=encoding,
         max_size_px=max_size_px,
     )
 

@@ -22,6 +22,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import indices_from_pixels, pixels_from_indices
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.decode import read_header
+from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Cameras, Capture, Views
 
 _KIND = "an IDR or NeuS set"
@@ -36,7 +37,7 @@ def read_idr(
     camera_file: str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
@@ -54,7 +55,7 @@ def read_idr(
             ``cameras_large.npz``.
         names: Keep these photographs, in this order.
         mesh: File of the true surface, if it is known, in the world's units.
-        linear: The files hold linear radiance, not sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
@@ -79,7 +80,13 @@ def read_idr(
         for index, (image, mask, matrix) in enumerate(zip(files, masks, matrices, strict=True))
     ]
     return assemble(
-        photographs, folder, _KIND, names=names, mesh=mesh, linear=linear, max_size_px=max_size_px
+        photographs,
+        folder,
+        _KIND,
+        names=names,
+        mesh=mesh,
+        encoding=encoding,
+        max_size_px=max_size_px,
     )
 
 

@@ -19,6 +19,7 @@ from pimper_torch.datasets.posed import (
 )
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Capture, Lens
 
 _KIND = "an LLFF set"
@@ -32,7 +33,7 @@ def read_llff(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of ``poses_bounds.npy`` and the photographs beside it.
@@ -58,7 +59,7 @@ def read_llff(
             one.
         names: Keep these photographs, in this order.
         mesh: File of the true surface, if it is known.
-        linear: The files hold linear radiance, not sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
@@ -89,7 +90,13 @@ def read_llff(
         for path, row in zip(files, rows, strict=True)
     ]
     return assemble(
-        photographs, folder, _KIND, names=names, mesh=mesh, linear=linear, max_size_px=max_size_px
+        photographs,
+        folder,
+        _KIND,
+        names=names,
+        mesh=mesh,
+        encoding=encoding,
+        max_size_px=max_size_px,
     )
 
 

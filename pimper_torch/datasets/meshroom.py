@@ -11,6 +11,7 @@ from pimper_torch.datasets.layout import expect, first_of, numbers, objects, rea
 from pimper_torch.datasets.posed import PosedPhotograph, assemble, mask_finder, rigid_or_refuse
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.photographs import some
+from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Capture, Lens
 
 _KIND = "a Meshroom cameras.sfm"
@@ -28,7 +29,7 @@ def read_meshroom(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of Meshroom's ``cameras.sfm`` and the photographs it names.
@@ -55,7 +56,7 @@ def read_meshroom(
         masks: Folder of masks, if somebody drew some.
         names: Keep these photographs, in this order.
         mesh: File of the true surface, if it is known.
-        linear: The files hold linear radiance, not sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
@@ -104,7 +105,7 @@ def read_meshroom(
         )
     expect(bool(photographs), path, _KIND, "views with a pose and intrinsics", "none")
     return assemble(
-        photographs, path, _KIND, names=names, mesh=mesh, linear=linear, max_size_px=max_size_px
+        photographs, path, _KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
     )
 
 

@@ -19,6 +19,7 @@ from pimper_torch.datasets.posed import (
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.io.photographs import some
+from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Capture, Lens
 
 _KIND = "a Metashape camera XML"
@@ -31,7 +32,7 @@ def read_metashape(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras that Metashape exported as XML, and their photographs.
@@ -52,7 +53,7 @@ def read_metashape(
         masks: Folder of masks, if somebody drew some.
         names: Keep these photographs, in this order; names of files.
         mesh: File of the true surface, if it is known.
-        linear: The files hold linear radiance, not sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
@@ -94,7 +95,7 @@ def read_metashape(
         )
     expect(bool(photographs), path, _KIND, "cameras with a transform", "none")
     return assemble(
-        photographs, path, _KIND, names=names, mesh=mesh, linear=linear, max_size_px=max_size_px
+        photographs, path, _KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
     )
 
 

@@ -13,6 +13,7 @@ from pimper_torch.datasets.posed import (
 )
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.decode import read_header
+from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Capture
 
 _KIND = "a Middlebury multi-view set"
@@ -24,7 +25,7 @@ def read_middlebury(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of ``*_par.txt`` and the photographs beside it.
@@ -40,7 +41,7 @@ def read_middlebury(
         masks: Folder of masks, if somebody drew some.
         names: Keep these photographs, in this order.
         mesh: File of the true surface, if it is known.
-        linear: The files hold linear radiance, not sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
@@ -65,7 +66,7 @@ def read_middlebury(
         _KIND,
         names=names,
         mesh=mesh,
-        linear=linear,
+        encoding=encoding,
         max_size_px=max_size_px,
         one_light=True,
     )

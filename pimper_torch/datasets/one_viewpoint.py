@@ -8,6 +8,7 @@ import torch
 from pimper_torch.datasets.diligent import FLIP, directed_lights
 from pimper_torch.datasets.layout import expect, inside, numbers, read_text
 from pimper_torch.datasets.raster import read_photographs
+from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Capture, Truth, Views
 
 _UW = "the UW photometric stereo set"
@@ -53,7 +54,7 @@ def read_uw_ps(folder: Path | str, name: str, *, max_size_px: int = 0) -> Captur
     views = read_photographs(
         photographs,
         names[:-1],
-        linear=True,
+        encoding=LINEAR,
         max_size_px=max_size_px,
         masks=[mask] * len(photographs),
     )
@@ -92,13 +93,13 @@ def read_yale_b(
     views = read_photographs(
         [path for path, _, _ in found],
         [path.name for path, _, _ in found],
-        linear=True,
+        encoding=LINEAR,
         max_size_px=max_size_px,
     )
     dark = sorted(root.glob("*_Ambient.pgm"))
     if subtract_ambient and dark:
         ambient = read_photographs(
-            dark[:1], [dark[0].name], linear=True, max_size_px=max_size_px
+            dark[:1], [dark[0].name], encoding=LINEAR, max_size_px=max_size_px
         ).images
         views = views.replace(images=(views.images - ambient).clamp_min(0))
     angles = torch.tensor([[azimuth, up] for _, azimuth, up in found], dtype=torch.float64)

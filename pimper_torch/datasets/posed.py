@@ -14,9 +14,9 @@ from pimper_torch.geometry.frames import rigid
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import SUFFIXES, decode, read_header
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import resized, resized_mask, shrunk_size, some
-from pimper_torch.progress import track
-from pimper_torch.radiometry import linear_from_srgb
+from pimper_torch.io.photographs import shrunk_size, some
+from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
+from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Record, Truth, Views
 from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
 from pimper_torch.sfm.undistort import pinhole_for, undistort
@@ -56,7 +56,7 @@ def assemble(
     *,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
     one_light: bool = False,
 ) -> Capture:
@@ -71,7 +71,7 @@ def assemble(
         kind: Its name, for messages.
         names: Keep these, in this order; ``None`` for all.
         mesh: File of the true surface, in the data set's frame.
-        linear: The files hold linear radiance, not sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
             leaves them as they are.
         one_light: All were taken under the same light; else each is taken to have its own.
@@ -86,7 +86,7 @@ def assemble(
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
     chosen = _select(photographs, names, place, kind)
-    views = read_views(chosen, linear=linear, max_size_px=max_size_px)
+    views = read_views(chosen, encoding=encoding, max_size_px=max_size_px)
     lenses = fitted_lenses(chosen, views)
     undistorted, _ = undistort(views, lenses)
     count = views.num_views
@@ -106,13 +106,13 @@ def assemble(
 
 
 def read_views(
-    photographs: Sequence[PosedPhotograph], *, linear: bool = False, max_size_px: int = 0
+    photographs: Sequence[PosedPhotograph], *, encoding: Encoding = SRGB, max_size_px: int = 0
 ) -> Views:
     """Read photographs as their lenses saw them, linear, padded to one raster.
 
     Args:
         photographs: At least one.
-        linear: The files hold linear radiance: leave the values as they are.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
 
     Raises:
@@ -120,20 +120,19 @@ def read_views(
     """
     headers = [read_header(one.image) for one in photographs]
     sizes = [shrunk_size(header, max_size_px) for header in headers]
-    width, height = (max(sides) for sides in zip(*sizes, strict=True))
-    channels = max(header.channels for header in headers)
-    images = torch.zeros(len(photographs), channels, height, width)
-    masks = torch.zeros(len(photographs), height, width, dtype=torch.bool)
+    paths = [one.image for one in photographs]
+    pictures = read_pictures(paths, headers, sizes, encoding)
+    images = pictures.images
+    masks = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
     has_masks = False
-    for index in track(range(len(photographs))):
-        decoded, (wide, high) = decode(photographs[index].image), sizes[index]
-        radiance = decoded.samples if linear else linear_from_srgb(decoded.samples)
-        images[index, :, :high, :wide] = resized(radiance, wide, high)
+    for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
         mask = photographs[index].mask
-        opacity = decoded.alpha if mask is None else _read_mask(mask)
-        opacity = None if opacity is None or bool((opacity >= _HALF).all()) else opacity
-        has_masks = has_masks or opacity is not None or mask is not None
-        masks[index, :high, :wide] = resized_mask(opacity, wide, high)
+        has_masks = has_masks or opaque is not None or mask is not None
+        if mask is None and opaque is not None:
+            masks[index] = opaque
+        else:
+            drawn = None if mask is None else _read_mask(mask)
+            masks[index, :high, :wide] = resized_mask(drawn, wide, high)
     focals = [
         header.focal_px * max(size) / max(header.width, header.height)
         for header, size in zip(headers, sizes, strict=True)
@@ -165,7 +164,7 @@ def shrink(views: Views, cameras: Cameras, max_size_px: int) -> tuple[Views, Cam
     images = views.images.new_zeros(*views.images.shape[:2], height, width)
     masks = torch.zeros(len(sizes), height, width, dtype=torch.bool)
     for index, ((wide, high), (w, h)) in enumerate(zip(full, sizes, strict=True)):
-        images[index, :, :h, :w] = resized(views.images[index, :, :high, :wide], w, h)
+        images[index, :, :h, :w] = resized_radiance(views.images[index, :, :high, :wide], w, h)
         if views.masks is not None:
             masks[index, :h, :w] = resized_mask(views.masks[index, :high, :wide].float(), w, h)
     intrinsics = [

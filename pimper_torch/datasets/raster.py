@@ -10,9 +10,9 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.decode import decode, read_header
-from pimper_torch.io.photographs import resized, resized_mask, shrunk_size
-from pimper_torch.progress import track
-from pimper_torch.radiometry import linear_from_srgb
+from pimper_torch.io.photographs import shrunk_size
+from pimper_torch.io.radiance import read_pictures, resized_mask
+from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Views
 
 _OPAQUE = 0.5
@@ -22,7 +22,7 @@ def read_photographs(
     paths: Sequence[Path],
     names: Sequence[str],
     *,
-    linear: bool,
+    encoding: Encoding,
     max_size_px: int = 0,
     masks: Sequence[Path] | None = None,
     divide_by: Float[Tensor, "view channel"] | None = None,
@@ -32,7 +32,7 @@ def read_photographs(
     Args:
         paths: JPEG, PNG, TIFF, BMP or PGM.
         names: Unique, one a path.
-        linear: The files hold linear radiance; otherwise sRGB is undone.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         masks: One a path, brighter than half on the object; a mask that several
             photographs share is decoded once.
@@ -43,22 +43,19 @@ def read_photographs(
     """
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
-    header = read_header(_there(paths[0]))
-    full = (header.width, header.height)
-    width, height = shrunk_size(header, max_size_px)
-    images = torch.zeros(len(paths), header.channels, height, width)
-    for index in track(range(len(paths))):
-        samples = decode(_there(paths[index])).samples
-        _same_size(paths[index], (samples.shape[2], samples.shape[1]), paths[0], full)
-        if samples.shape[0] != header.channels:
+    headers = [read_header(_there(path)) for path in paths]
+    full, channels = (headers[0].width, headers[0].height), headers[0].channels
+    for path, header in zip(paths, headers, strict=True):
+        _same_size(path, (header.width, header.height), paths[0], full)
+        if header.channels != channels:
             raise InputError(
-                f"{paths[index]}: has {samples.shape[0]} colours, but {paths[0].name} has "
-                f"{header.channels}; needed: photographs of one kind. Unpack the data set again."
+                f"{path}: has {header.channels} colours, but {paths[0].name} has {channels}; "
+                "needed: photographs of one kind. Unpack the data set again."
             )
-        radiance = samples if linear else linear_from_srgb(samples)
-        if divide_by is not None:
-            radiance = radiance / divide_by[index, :, None, None]
-        images[index] = resized(radiance, width, height)
+    width, height = shrunk_size(headers[0], max_size_px)
+    images = read_pictures(paths, headers, [(width, height)] * len(paths), encoding).images
+    if divide_by is not None:
+        images = images / divide_by[:, :, None, None].to(images)
     return Views(
         images=images,
         sizes_px=torch.tensor([[width, height]]).repeat(len(paths), 1),

@@ -16,7 +16,7 @@ from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.io.decode import decode
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.progress import track
-from pimper_torch.radiometry import linear_from_srgb
+from pimper_torch.radiometry import Linear, Srgb
 from pimper_torch.records import Cameras, Capture, Truth, Views
 from pimper_torch.scenes.config import SceneConfig
 from pimper_torch.scenes.maps import MAP_NAMES, unpack_maps
@@ -135,6 +135,7 @@ def _read_views(
     photographs: bool,
 ) -> Views:
     width, height = settings.width, settings.height
+    response = Srgb() if settings.encoding == "srgb" else Linear()
     images = torch.zeros(1).expand(len(names), 3, height, width)
     masks = None
     if photographs:
@@ -142,8 +143,7 @@ def _read_views(
         masks = torch.zeros(len(names), height, width, dtype=torch.bool)
         for row in track(range(len(names))):
             samples = _read_picture(folder / "photos", names[row], width, height)
-            linear = linear_from_srgb(samples) if settings.encoding == "srgb" else samples
-            images[row] = linear.expand(3, -1, -1)
+            images[row] = response.linear_from_encoded(samples).expand(3, -1, -1)
             masks[row] = _read_picture(folder / "masks", names[row], width, height).amax(dim=0) > 0
     return Views(
         images=images,

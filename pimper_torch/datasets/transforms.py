@@ -15,6 +15,7 @@ from pimper_torch.datasets.posed import PosedPhotograph, assemble, rigid_or_refu
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.io.decode import SUFFIXES, read_header
 from pimper_torch.io.meshes import write_ply
+from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Mesh, Views
 
 _KIND = "a transforms.json set"
@@ -29,7 +30,7 @@ def read_transforms(
     *,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of a ``transforms.json`` and the photographs it names.
@@ -49,7 +50,7 @@ def read_transforms(
         names: Keep these photographs, in this order. They are called as their files, or by
             their whole paths in the file where that is not unique.
         mesh: File of the true surface, if it is known.
-        linear: The files hold linear radiance, not sRGB.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
@@ -67,7 +68,7 @@ def read_transforms(
         for frame, image, name in zip(frames, images, _names(images, path), strict=True)
     ]
     return assemble(
-        photographs, path, _KIND, names=names, mesh=mesh, linear=linear, max_size_px=max_size_px
+        photographs, path, _KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
     )
 
 

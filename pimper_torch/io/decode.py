@@ -57,11 +57,13 @@ class Decoded(Record):
         samples: In [0, 1] as the file encodes them; one or three channels.
         alpha: Opacity in [0, 1]; ``None`` where the file has none.
         lossy: True for JPEG, whose samples ring round edges.
+        bits: 8 or 16; full scale, a sample of 1, is ``2 ** bits - 1`` in the file.
     """
 
     samples: Float[Tensor, "channel height width"]
     alpha: Float[Tensor, "height width"] | None
     lossy: bool
+    bits: int
 
 
 def read_header(path: Path) -> Header:
@@ -117,6 +119,7 @@ def decode(path: Path) -> Decoded:
         samples=colour.permute(2, 0, 1).contiguous(),
         alpha=planes[..., -1] if has_alpha else None,
         lossy=path.suffix.lower() in (".jpg", ".jpeg"),
+        bits=8 * array.dtype.itemsize,
     )
 
 

@@ -1,40 +1,42 @@
 """Photographs from a folder, as linear radiance."""
 
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import interpolate
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header, turned
-from pimper_torch.progress import track
-from pimper_torch.radiometry import linear_from_srgb
+from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
+from pimper_torch.radiometry import SATURATED, SRGB, Encoding
 from pimper_torch.records import Views
 
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
 # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
 _BLACK = 1e-3
 _LIT_SHARE = 1e-3  # more than hot pixels
-_OPAQUE = 0.5
+# Less of the object than this is left of a photograph that is mostly saturated.
+_LEAST_USABLE = 0.1
 
 
 def load_views(
     folder: Path | str,
     *,
     masks: Path | str | None = None,
-    linear: bool = False,
+    encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Views:
     """Read the photographs of a folder, in the natural order of their names.
 
     JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette; other files, hidden ones and
     folders inside are passed over. EXIF's orientation is applied, its focal length kept in
-    pixels. sRGB is undone exactly, so that radiance is linear and 1 is saturation; colour
-    profiles are not looked at. Photographs of unlike sizes are padded.
+    pixels. The response, sRGB unless told otherwise, is undone, so that radiance is linear;
+    colour profiles are not looked at. Radiance 1 is saturation, in every colour: the level that
+    is told, or at which values pile up, or full scale. Photographs of unlike sizes are padded.
 
     Masks are images of the photographs' sizes, zero off the object (JPEG: below half).
     Without a folder of masks, alpha channels that are somewhere transparent are the masks,
@@ -44,16 +46,19 @@ def load_views(
         folder: With the photographs.
         masks: Folder with one mask for each photograph, of the same name whatever the
             suffix (``17.jpg``: ``17.png``, or COLMAP's ``17.jpg.png``).
-        linear: The files hold linear radiance: leave the values as they are.
+        encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer, in linear light and
-            without aliasing; 0 leaves them as they are.
+            without aliasing; 0 leaves them as they are. A pixel made of some saturated ones
+            is saturated.
 
     Returns:
         On the CPU, float32.
 
     Raises:
-        InputError: Names the photographs or masks that are missing, damaged, black, or do
-            not belong together, and says what to do.
+        InputError: Names the photographs or masks that are missing, damaged, black or
+            saturated all over, do not belong together or do not fit the encoding, and says
+            what to do. A :class:`~pimper_torch.errors.PimperWarning` names photographs of
+            which hardly anything is left, and tells a level of saturation that was found.
     """
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
@@ -62,25 +67,21 @@ def load_views(
     headers = [read_header(path) for path in paths]
     mask_paths = _match_masks(paths, Path(masks)) if masks is not None else None
     sizes = [shrunk_size(header, max_size_px) for header in headers]
-    width, height = (max(sides) for sides in zip(*sizes, strict=True))
-    channels = max(header.channels for header in headers)
-    images = torch.zeros(len(paths), channels, height, width)
-    drawn = torch.zeros(len(paths), height, width, dtype=torch.bool)
-    has_masks = mask_paths is not None
-    for index in track(range(len(paths))):
-        decoded, (wide, high) = decode(paths[index]), sizes[index]
-        radiance = decoded.samples if linear else linear_from_srgb(decoded.samples)
-        images[index, :, :high, :wide] = resized(radiance, wide, high)
-        opacity = decoded.alpha
+    pictures = read_pictures(paths, headers, sizes, encoding)
+    images = pictures.images
+    has_masks = mask_paths is not None or any(one is not None for one in pictures.opaque)
+    drawn = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
+    for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
         if mask_paths is not None:
             opacity = _read_mask(mask_paths[index], paths[index], headers[index])
-        elif opacity is not None and bool((opacity < _OPAQUE).any()):
-            has_masks = True
-        drawn[index, :high, :wide] = resized_mask(opacity, wide, high)
+            drawn[index, :high, :wide] = resized_mask(opacity, wide, high)
+        else:
+            drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
     names = tuple(path.name for path in paths)
     _refuse_black(images, names, Path(folder))
     if has_masks:
         _refuse_empty(drawn, names, Path(masks) if masks is not None else None)
+    _judge_saturation(images, drawn, names, Path(folder))
     return Views(
         images=images,
         sizes_px=torch.tensor(sizes),
@@ -167,26 +168,6 @@ def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
     return max(1, round(header.width * factor)), max(1, round(header.height * factor))
 
 
-def resized(
-    planes: Float[Tensor, "channel height width"], width: int, height: int
-) -> Float[Tensor, "channel {height} {width}"]:
-    """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
-    if tuple(planes.shape[-2:]) == (height, width):
-        return planes
-    return interpolate(
-        planes[None], size=(height, width), mode="bilinear", antialias=True, align_corners=False
-    )[0]
-
-
-def resized_mask(
-    opacity: Float[Tensor, "height_in width_in"] | None, width: int, height: int
-) -> Bool[Tensor, "{height} {width}"]:
-    """Shrink opacity and call what is at least half opaque the object; ``None`` is all of it."""
-    if opacity is None:
-        return torch.ones(height, width, dtype=torch.bool)
-    return resized(opacity[None], width, height)[0] >= _OPAQUE
-
-
 def _match_masks(paths: list[Path], folder: Path) -> list[Path]:
     """Find the mask of each photograph by its stem, or by its whole name as COLMAP has it."""
     by_stem = {path.stem: path for path in list_images(folder)}
@@ -219,7 +200,7 @@ def _read_mask(path: Path, photograph: Path, header: Header) -> Float[Tensor, "h
 
 def _on_object(decoded: Decoded) -> Float[Tensor, "height width"]:
     brightest = decoded.samples.amax(dim=0)
-    drawn = brightest >= _OPAQUE if decoded.lossy else brightest > 0
+    drawn = brightest >= OPAQUE if decoded.lossy else brightest > 0
     if decoded.alpha is not None:
         drawn = drawn & (decoded.alpha > 0)
     return drawn.float()
@@ -234,6 +215,37 @@ def _refuse_black(
         raise InputError(
             f"{folder}: {some(black)} {'is' if len(black) == 1 else 'are'} black all over. Take "
             "them out of the folder; at least some of the object has to be lit."
+        )
+
+
+def _judge_saturation(
+    images: Float[Tensor, "view channel height width"],
+    drawn: Bool[Tensor, "view height width"],
+    names: tuple[str, ...],
+    folder: Path,
+) -> None:
+    """Refuse photographs saturated all over, and warn of those with hardly anything else."""
+    usable = [
+        float((image.amax(dim=0)[mask] < SATURATED).float().mean())
+        for image, mask in zip(images, drawn, strict=True)
+    ]
+    blind = [name for name, share in zip(names, usable, strict=True) if share <= _LIT_SHARE]
+    what = "Expose less, or tell the level of saturation by `photographs.saturation`"
+    if blind:
+        raise InputError(
+            f"{folder}: {some(blind)} {'is' if len(blind) == 1 else 'are'} saturated all over. "
+            f"Take them out of the folder. {what}."
+        )
+    scant = [
+        f"{name} ({share:.1%} left)"
+        for name, share in zip(names, usable, strict=True)
+        if share < _LEAST_USABLE
+    ]
+    if scant:
+        warnings.warn(
+            f"{folder}: hardly anything is left of {some(scant)}; all else is saturated. {what}.",
+            PimperWarning,
+            stacklevel=3,
         )
 
 

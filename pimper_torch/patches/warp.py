@@ -14,6 +14,7 @@ from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.progress import track
+from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,
     PatchSet,
@@ -37,7 +38,7 @@ class WarpConfig:
     """
 
     dark_level: float = 0.01
-    saturation_level: float = 0.98
+    saturation_level: float = SATURATED
     max_tilt_deg: float = 75.0
     occlusion_stride: int = 4
     pyramid_levels: int = 4
@@ -61,7 +62,7 @@ class Warp(nn.Module):
     Perspective-correct, because each sample's own 3D point is projected; anti-aliased,
     because the level of an image pyramid is chosen by the pixels that a sample covers.
     Missing: outside the frame or the mask, grazing or back-facing, behind another facet,
-    too dark, saturated.
+    too dark, saturated, not finite.
 
     Differentiable in the images and in the templates' depth; what is missing is a constant.
     """
@@ -88,8 +89,12 @@ class Warp(nn.Module):
         usable = views.inside
         if views.masks is not None:
             usable = usable & views.masks
+        finite = views.images.isfinite()
+        usable = usable & finite.all(dim=1)
         usable = usable & (views.images.amax(dim=1) < self.config.saturation_level)
-        levels = [torch.cat([views.images, (~usable)[:, None].to(views.images)], dim=1)]
+        # NaN times a weight of 0 is NaN: zeros, which are marked, spread nothing.
+        images = torch.where(finite, views.images, 0)
+        levels = [torch.cat([images, (~usable)[:, None].to(images)], dim=1)]
         while len(levels) < self.config.pyramid_levels and min(levels[-1].shape[-2:]) >= 8:
             levels.append(pyrdown(levels[-1]))
         return levels

@@ -121,9 +121,10 @@ class Reconstruct(nn.Module):
 
         Raises:
             ReconstructionError: Fewer than 3 views found their place, or the model split.
-            InputError: One camera is to be shared by photographs of unlike sizes, or the
-                given model does not belong to the photographs.
+            InputError: Radiance that is not finite, one camera is to be shared by photographs
+                of unlike sizes, or the given model does not belong to the photographs.
         """
+        _require_finite(views)
         if sparse_model is None:
             model = self._structure_from_motion(views)
         else:
@@ -273,6 +274,20 @@ def _follow_resize(model: SparseModel, views: Views) -> SparseModel:
         lenses=tuple(lenses),
         observation_pixels=model.observation_pixels * factors[model.observation_view],
     )
+
+
+def _require_finite(views: Views) -> None:
+    """Refuse pixels that are no numbers, which resampling would spread over their neighbours."""
+    odd = [
+        f"{name} ({int((~image.isfinite()).any(dim=0).sum())} pixels)"
+        for name, image in zip(views.names, views.images, strict=True)
+        if not bool(image.isfinite().all())
+    ]
+    if odd:
+        raise InputError(
+            f"NaN or infinity in the photographs {', '.join(odd)}; needed: radiance in numbers. "
+            "Set these pixels to 0 and leave them out by `masks`, or to 1 if they are saturated."
+        )
 
 
 def _require_one_size(views: Views) -> None:

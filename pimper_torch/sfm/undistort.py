@@ -7,10 +7,12 @@ from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.progress import track
+from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_pixels
 
 _MOST_ZOOM = 1.25
+_TOUCHED = 1e-3  # share of saturated light in a pixel; below is the rounding of its weights
 
 
 def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tensor, "view 3 3"]]:
@@ -26,7 +28,8 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
         The views, and ``K`` of each. A pixel that looks past the photograph's edge is zero
         and false in the masks, which come to be for that; where there are none and nothing
         looks past, they stay ``None``. Radiance is interpolated bilinearly, masks at one
-        half; differentiable in the radiance. A view without distortion is left untouched.
+        half; what touches a saturated pixel is saturated. Differentiable in the radiance. A
+        view without distortion is left untouched.
     """
     images, inside = [], []
     for index in track(range(views.num_views)):
@@ -56,12 +59,15 @@ def _undistort_image(
     # Half a pixel from the edge on, the edge's own pixel continues; never the padding.
     sources = torch.where(within[..., None], sources, 0.5).clamp_min(0.5)
     grid = grid_from_pixels(torch.minimum(sources, size - 0.5), width, height)
-    stacked = torch.cat([image, mask[None].to(image)])[None]
+    saturated = (image >= SATURATED).to(image)
+    stacked = torch.cat([image, saturated, mask[None].to(image)])[None]
     sampled = grid_sample(stacked, grid[None], mode="bilinear", align_corners=False)[0]
     sampled = torch.where(within, sampled, 0)
     padding = (0, width - lens.width, 0, height - lens.height)
     sampled = torch.nn.functional.pad(sampled, padding)
-    return sampled[:-1], sampled[-1] > 0.5
+    count = len(image)
+    radiance, touched = sampled[:count], sampled[count:-1] > _TOUCHED
+    return torch.where(touched, radiance.clamp_min(1), radiance), sampled[-1] > 0.5
 
 
 def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:

@@ -12,6 +12,7 @@ from pimper_torch.cli.convert import Source, cloud, read_scene, readers
 from pimper_torch.cli.main import main
 from pimper_torch.datasets import read_colmap, read_idr, read_scale_mats, read_transforms
 from pimper_torch.geometry.frames import transform
+from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Mesh, Truth
 
 READERS = {"colmap": read_colmap, "idr": read_idr, "transforms": read_transforms}
@@ -71,6 +72,40 @@ def test_an_option_that_the_reader_does_not_know_is_refused(data, tmp_path, caps
     assert main([*arguments, "--target", "idr", "--light-seed", "0"]) == 2
     assert "--light-seed: the reader of transforms does not know it" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_encoding_of_the_files_reaches_the_reader(data, tmp_path, monkeypatch):
+    arguments = ["convert", "--photographs.saturation", "250", str(data)]
+    arguments += ["-o", str(tmp_path / "out"), "--source", "transforms", "--target", "idr"]
+    assert main([*arguments, "--photographs.response", "linear", "--photographs.black", "2"]) == 0
+    told = Encoding(response="linear", saturation=250.0, black=2.0)
+    assert_close(
+        read_idr(tmp_path / "out").views.images,
+        read_transforms(data, encoding=told).views.images,
+        rtol=0,
+        atol=0.01,  # of 8 bits in sRGB
+    )
+
+
+def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
+    asked = {}
+
+    def stand_in(folder, *, scan, encoding=LINEAR):
+        asked["encoding"] = encoding
+        return read_transforms(data)
+
+    monkeypatch.setattr(convert, "read_dtu_mvs", stand_in)
+    arguments = ["data", "-o", "out", "--source", "dtu-mvs", "--target", "idr", "--scan", "3"]
+    convert.read(convert.parse([*arguments, "--photographs.response", "2.2"]))
+    assert asked["encoding"] == Encoding(response=2.2, saturation=LINEAR.saturation)
+
+
+def test_a_reader_whose_files_are_known_is_told_nothing_of_them(data, tmp_path, capsys):
+    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "rendered"]
+    assert main([*arguments, "--target", "idr", "--photographs.response", "2.2"]) == 2
+    assert "--photographs.response: the reader of rendered does not know it" in (
+        capsys.readouterr().err
+    )
 
 
 def test_a_set_of_scans_needs_the_scans_number(data, tmp_path, capsys):

@@ -12,6 +12,7 @@ from pimper_torch.errors import PimperWarning, ReconstructionError
 from pimper_torch.io.results import RESULT_NAMES
 from pimper_torch.io.version import installed_version
 from pimper_torch.pipeline import PimperConfig, load_config
+from pimper_torch.radiometry import Encoding
 
 
 def run(*arguments):
@@ -40,7 +41,8 @@ def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys)
 def test_options_reach_their_places(photos, chain, tmp_path):
     out = tmp_path / "out"
     code = run(
-        *("reconstruct", photos, "--out", out, "--linear", "--max-size-px", "16"),
+        *("reconstruct", "--photographs.saturation", "250,251,252", photos, "--out", out),
+        *("--photographs.response", "linear", "--max-size-px", "16"),
         *("--reference", "1.png", "--sparse", tmp_path, "--reconstruct.starts", "7"),
     )
     assert code == 0
@@ -51,8 +53,9 @@ def test_options_reach_their_places(photos, chain, tmp_path):
     written = yaml.safe_load((out / "config.yaml").read_text())
     assert written["reconstruct"]["starts"] == 7
     assert load_config(out / "config.yaml") == config
+    assert config.photographs == Encoding(response="linear", saturation=(250, 251, 252))
     summary = json.loads((out / "summary.json").read_text())
-    assert (summary["linear"], summary["photographs"]) == (True, str(photos))
+    assert (summary["response"], summary["photographs"]) == ("linear", str(photos))
 
 
 def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):

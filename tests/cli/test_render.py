@@ -30,7 +30,7 @@ def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
     assert settings["lamp_distance"] == 2.5
     told = capsys.readouterr()
     assert f"{tmp_path}/out/photos" in told.out
-    assert "--linear" in told.out
+    assert "--photographs.response linear" in told.out
     assert "photographs 2" in told.err
 
 

@@ -4,10 +4,10 @@ import scipy.io
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.datasets import raster
 from pimper_torch.datasets.dtu_points import read_dtu_points
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.projection import project
+from pimper_torch.io import radiance
 
 
 @pytest.fixture
@@ -54,7 +54,9 @@ def _camera(capture, view):
 def test_only_the_chosen_photographs_are_decoded(folder, monkeypatch):
     decoded = []
     monkeypatch.setattr(
-        raster, "decode", lambda path, real=raster.decode: decoded.append(path.name) or real(path)
+        radiance,
+        "decode",
+        lambda path, real=radiance.decode: decoded.append(path.name) or real(path),
     )
     capture = read_dtu_points(folder, 4, light_seed=5, lights=(1, 2))
     assert capture.position.tolist() == [1, 2, 3]

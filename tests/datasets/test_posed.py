@@ -14,6 +14,7 @@ from pimper_torch.datasets.posed import (
 )
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.projection import project
+from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Lens
 from pimper_torch.sfm.colmap import distort
 
@@ -43,8 +44,17 @@ def test_the_camera_stays_with_its_photograph(shot, tmp_path, sees):
     assert_close(float(capture.views.images[0, 2, 11, 15]), ((100 / 255 + 0.055) / 1.055) ** 2.4)
 
 
+def test_shrinking_a_capture_keeps_saturated_pixels(shot, tmp_path):
+    capture = assemble([shot()], tmp_path, "a toy", encoding=LINEAR)
+    images = 0.2 * torch.ones_like(capture.views.images)
+    images[0, 0, 1, 1] = 1.0
+    small, _ = shrink(capture.views.replace(images=images), capture.cameras, 4)
+    assert small.images.max() == 1
+    assert (small.images[0, 1:] < 0.5).all()
+
+
 def test_linear_values_are_left_as_they_are(shot, tmp_path):
-    capture = assemble([shot()], tmp_path, "a toy", linear=True)
+    capture = assemble([shot()], tmp_path, "a toy", encoding=LINEAR)
     assert_close(float(capture.views.images[0, 0, 0, 0]), 120 / 255)
 
 
@@ -115,7 +125,7 @@ def test_a_lens_is_undistorted_to_the_pinhole_of_the_capture(tmp_path, hand_came
     shot = PosedPhotograph(
         name="a.png", image=tmp_path / "a.png", lens=lens, cam_from_world=hand_camera
     )
-    capture = assemble([shot], tmp_path, "a toy", linear=True)
+    capture = assemble([shot], tmp_path, "a toy", encoding=LINEAR)
     cameras = capture.cameras
     expected, _ = project(dot, cameras.cam_from_world[0], cameras.intrinsics[0])
     assert (expected - at).norm() > 1  # or the lens did nothing

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import load_views
 from pimper_torch.progress import listening
-from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear
+from pimper_torch.radiometry import LINEAR, linear_from_srgb, srgb_from_linear
 
 
 def save(path, array, **options):
@@ -34,7 +34,7 @@ def test_photographs_come_in_natural_order_as_linear_radiance(photos, pixels):
     assert views.focals_px.isnan().all()
     stored = torch.from_numpy(pixels / 255).permute(2, 0, 1)
     assert_close(views.images[0].double(), linear_from_srgb(stored), rtol=0, atol=1e-6)
-    assert_close(load_views(photos, linear=True).images[1].double(), stored, rtol=0, atol=1e-6)
+    assert_close(load_views(photos, encoding=LINEAR).images[1].double(), stored, rtol=0, atol=1e-6)
 
 
 def test_other_files_hidden_ones_and_folders_are_passed_over(photos, pixels):
@@ -81,7 +81,7 @@ def as_planes(array):
 
 def test_shrinking_averages_light_not_codes_and_scales_the_focal_length(tmp_path):
     stripes = np.zeros((64, 96, 3), dtype=np.uint8)
-    stripes[:, ::2] = 255
+    stripes[:, ::2] = 200
     exif = Image.Exif()
     exif[274] = 1
     exif.get_ifd(0x8769)[0xA405] = 50
@@ -89,8 +89,9 @@ def test_shrinking_averages_light_not_codes_and_scales_the_focal_length(tmp_path
         save(tmp_path / f"{number}.png", stripes, exif=exif)
     views = load_views(tmp_path, max_size_px=24)
     assert views.images.shape[-2:] == (16, 24)
-    # Half the light; decimation would give 0 or 1, averaging the codes 0.21.
-    assert_close(views.images[..., 1:-1], torch.full((3, 3, 16, 22), 0.5), rtol=0, atol=1e-4)
+    # Half the light; decimation would give none or all, averaging the codes a fifth.
+    half = float(linear_from_srgb(torch.tensor(200 / 255)) / 2)
+    assert_close(views.images[..., 1:-1], torch.full((3, 3, 16, 22), half), rtol=0, atol=1e-4)
     assert views.focals_px[0].item() == pytest.approx(5000 / 3600 * 24)
 
 
@@ -98,8 +99,8 @@ def test_shrinking_keeps_corners_in_place(photos):
     ramp = np.tile(np.arange(0, 240, 5, dtype=np.uint8)[None, :, None], (32, 1, 3))
     for name in ("1.png", "2.png", "10.png"):
         save(photos / name, ramp)
-    found = load_views(photos, linear=True, max_size_px=12).images
-    wanted = avg_pool2d(load_views(photos, linear=True).images, 4)
+    found = load_views(photos, encoding=LINEAR, max_size_px=12).images
+    wanted = avg_pool2d(load_views(photos, encoding=LINEAR).images, 4)
     assert_close(found[..., 1:-1], wanted[..., 1:-1])  # a triangle keeps a ramp; not at borders
 
 

@@ -138,3 +138,22 @@ def test_impossible_settings_are_refused():
         WarpConfig(dark_level=0.5, saturation_level=0.4)
     with pytest.raises(ConfigError, match="max_tilt_deg"):
         WarpConfig(max_tilt_deg=90.0)
+
+
+def test_pixels_that_are_no_numbers_are_missing_and_spoil_no_others(plane_scene, plane_mesh):
+    patches = Decompose()(plane_mesh, plane_scene.cameras)
+    images = plane_scene.views.images.clone()
+    rows, columns = images.shape[-2] // 2, images.shape[-1] // 2
+    images[0, 1, rows, columns] = torch.nan
+    images[0, 0, rows, columns + 5] = -torch.inf
+    holed = Warp()(plane_scene.views.replace(images=images), plane_scene.cameras, patches)
+    whole = Warp()(plane_scene.views, plane_scene.cameras, patches)
+    lost = 0
+    for found, wanted in zip(holed.buckets, whole.buckets, strict=True):
+        assert found.radiance.isfinite().all()
+        assert not (found.valid & ~wanted.valid).any()
+        lost += int((wanted.valid & ~found.valid).sum())
+        same = found.valid & wanted.valid
+        off = (found.radiance - wanted.radiance).abs().amax(dim=2)[same]
+        assert off.max() < 0.1  # of a pixel's share that may be missing in a sample
+    assert 0 < lost < 60

@@ -10,6 +10,7 @@ from pimper_torch.errors import ConfigError, OutputError
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Mesh
 from pimper_torch.scenes.config import SceneConfig
 from pimper_torch.scenes.frame import render_frame
@@ -65,7 +66,7 @@ def test_deep_linear_photographs_are_read_back_to_the_last_bit(ball, tmp_path):
         num_views=3, width=32, height=24, bits=16, encoding="linear", supersample=1
     )
     render_scene(ball, tmp_path / "deep", config, processes=1)
-    views = load_views(tmp_path / "deep" / "photos", linear=True)
+    views = load_views(tmp_path / "deep" / "photos", encoding=LINEAR)
     scene = build_scene(ball, config)
     frame = render_frame(
         Stage(scene.bodies), scene.cameras, scene.lights, 1, scene.noise(1), config.sensor

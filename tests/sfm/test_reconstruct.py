@@ -224,3 +224,13 @@ def test_eight_photographs_of_the_skull_register_and_their_points_reproject():
     assert scene.cameras.intrinsics[0, 0, 0] == pytest.approx(2048, rel=0.05)
     assert len(scene.points_world) > 500
     assert scene.reprojection_errors_px.median() < 1
+
+
+def test_photographs_with_pixels_that_are_no_numbers_are_refused_by_name(views, tmp_path):
+    images = views.images.clone()
+    images[1, :, 3, 4] = torch.nan
+    images[1, 0, 3, 5] = torch.inf
+    odd = views.replace(images=images)
+    for model in (None, tmp_path):
+        with pytest.raises(InputError, match=rf"photographs {views.names[1]} \(2 pixels\); needed"):
+            Reconstruct()(odd, model)

@@ -3,6 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import distort, undistort_pixels
 from pimper_torch.sfm.undistort import photograph_pixels, pinhole_for, undistort
@@ -124,3 +125,20 @@ def test_a_lens_and_its_inverse_undo_each_other(model):
     rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
     # COLMAP inverts by Newton's method to about 1e-10 of the image plane.
     assert_close(distort(lens, 3 * rays), pixels, rtol=0, atol=1e-6)
+
+
+def test_what_touches_a_saturated_pixel_is_saturated():
+    views = ramp_views([(50, 40)])
+    images = views.images.clone()
+    images[0, 0, 17, 23] = 1.0
+    plain, _ = undistort(views, (bent(50, 40, 0.3),))
+    lit, _ = undistort(views.replace(images=images), (bent(50, 40, 0.3),))
+    lifted = images.clone()
+    lifted[0, 0, 17, 23] = 0.9
+    weighed, _ = undistort(views.replace(images=lifted), (bent(50, 40, 0.3),))
+    touched = weighed.images - plain.images > 1e-2 * (0.9 - views.images[0, 0, 17, 23])
+    assert 1 <= int(touched.sum()) <= 9
+    assert ((lit.images >= SATURATED) >= touched).all()
+    assert torch.equal(lit.images[:, 1], plain.images[:, 1])
+    near = (lit.images != plain.images).sum()
+    assert near <= touched.sum() + 5

@@ -1,4 +1,4 @@
-"""Linear radiance and the encoded values that files hold."""
+"""The curve of IEC 61966-2-1, sRGB."""
 
 import torch
 from jaxtyping import Float, UInt8

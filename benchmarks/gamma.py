@@ -1,0 +1,91 @@
+"""Gamma from the factorization's residual: matrices whose gamma is known, and photographs.
+
+    python benchmarks/gamma.py FOLDER
+
+FOLDER holds `uw_ps/images` (the UW photometric stereo set) and
+`yale_b02/photometrics_images/yaleB02` (a face of the Yale database B).
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.datasets import read_uw_ps, read_yale_b
+from pimper_torch.photometry.gamma import GammaEstimate, estimate_gamma, gamma_of_photographs
+from pimper_torch.radiometry import Gamma, Linear, Srgb
+
+CURVES = {
+    "linear": Linear(),
+    "1.8": Gamma(exponent=1.8),
+    "2.2": Gamma(exponent=2.2),
+    "sRGB": Srgb(),
+}
+NOISE = (0.0, 0.005, 0.01)
+SEEDS = 4
+OBJECTS = ("gray", "cat", "horse", "buddha")
+
+
+def radiance(ambient: float, generator: torch.Generator) -> Float[Tensor, "16 400"]:
+    """Shade half a sphere of normals and albedos under 16 distant lamps, shadows included."""
+    normals = normalize(torch.randn(400, 3, generator=generator, dtype=torch.float64), dim=1)
+    normals[:, 2] = -normals[:, 2].abs()
+    aside = 0.6 * torch.randn(16, 2, generator=generator, dtype=torch.float64)
+    lamps = normalize(torch.cat([aside, -torch.ones(16, 1, dtype=torch.float64)], dim=1), dim=1)
+    albedo = 0.3 + 0.7 * torch.rand(400, generator=generator, dtype=torch.float64)
+    gain = 0.6 + 0.2 * torch.rand(16, 1, generator=generator, dtype=torch.float64)
+    return gain * albedo * ((lamps @ normals.T).clamp_min(0) + ambient)
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    folder = parser.parse_args().folder
+    torch.set_num_threads(1)
+    print("| curve | ambient | rank | noise, % | gamma | spread | standard error | CPU s |")  # noqa: T201
+    print("|---|--:|--:|--:|--:|--:|--:|--:|")  # noqa: T201
+    for ambient, rank in ((0.0, 3), (0.2, 4)):
+        for name, curve in CURVES.items():
+            for noise in NOISE:
+                began, found = time.process_time(), []
+                for seed in range(SEEDS):
+                    generator = torch.Generator().manual_seed(seed)
+                    clean = curve.encoded_from_linear(radiance(ambient, generator))
+                    drawn = torch.randn(clean.shape, generator=generator, dtype=clean.dtype)
+                    values = (clean + noise * drawn).clamp(0, 1)
+                    found.append(estimate_gamma(values, values >= 0, rank=rank))
+                seconds = (time.process_time() - began) / SEEDS
+                gammas = torch.tensor([one.gamma for one in found])
+                errors = torch.tensor([one.standard_error for one in found])
+                print(  # noqa: T201
+                    f"| {name} | {ambient} | {rank} | {100 * noise} | {gammas.mean():.3f} "
+                    f"| {gammas.std():.3f} | {errors.mean():.3f} | {seconds:.1f} |",
+                    flush=True,
+                )
+    print()  # noqa: T201
+    print("| photographs | rank | gamma | residual, % | if linear | if sRGB | told |")  # noqa: T201
+    print("|---|--:|--:|--:|--:|--:|---|")  # noqa: T201
+    captures = {name: read_uw_ps(folder / "uw_ps" / "images", name) for name in OBJECTS}
+    face = folder / "yale_b02" / "photometrics_images" / "yaleB02"
+    captures["yaleB02"] = read_yale_b(face, subtract_ambient=False)
+    for name, capture in captures.items():
+        for rank in (3, 4):
+            print(row(name, rank, gamma_of_photographs(capture.views, rank=rank)), flush=True)  # noqa: T201
+
+
+def row(name: str, rank: int, found: GammaEstimate) -> str:
+    """Write an estimate as a row."""
+    return (
+        f"| {name} | {rank} | {found.gamma:.2f} ± {found.standard_error:.2f} "
+        f"| {100 * found.residual:.2f} | {100 * found.residual_linear:.2f} "
+        f"| {100 * found.residual_srgb:.2f} | {'yes' if found.determined else 'no'} |"
+    )
+
+
+if __name__ == "__main__":
+    main()

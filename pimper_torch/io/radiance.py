@@ -1,0 +1,268 @@
+"""Image files to radiance: the response undone, 1 where the sensor saturates, shrunk."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.io.decode import Decoded, Header, decode
+from pimper_torch.io.responses import response_of
+from pimper_torch.progress import track
+from pimper_torch.radiometry import SATURATED, Curve, Encoding, Response, find_saturation
+from pimper_torch.radiometry.saturation import PIXELS
+from pimper_torch.records import Record
+
+OPAQUE = 0.5
+# Saturated light in a pixel's footprint counts from this share on; below is the rounding of the
+# filter's weights.
+_TOUCHED = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Pictures(Record):
+    """Photographs on one raster, padded right and below.
+
+    Attributes:
+        images: Linear radiance, 1 where saturated.
+        opaque: Where each photograph's alpha channel shows the object, false in the padding;
+            ``None`` where it has none, or none that is transparent anywhere.
+    """
+
+    images: Float[Tensor, "view channel height width"]
+    opaque: tuple[Bool[Tensor, "height width"] | None, ...]
+
+
+# Levels of saturation by the bits of the file, shares of full scale, one a colour.
+_Whites = Mapping[int, Float[Tensor, " channel"]]
+
+
+def read_pictures(
+    paths: Sequence[Path],
+    headers: Sequence[Header],
+    sizes_px: Sequence[tuple[int, int]],
+    encoding: Encoding,
+) -> Pictures:
+    """Read image files as linear radiance that is 1 where the sensor saturates.
+
+    Black is taken away, values above saturation are cut off. Files whose saturation is to be
+    found are read once more if it lies below full scale; a :class:`PimperWarning` tells it.
+
+    Args:
+        paths: Of the files.
+        headers: Of each.
+        sizes_px: Width and height of each, at most those of its header.
+        encoding: Of all.
+
+    Raises:
+        InputError: Names a file that cannot be read, or that the encoding does not fit.
+    """
+    response = response_of(encoding)
+    width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
+    channels = max(header.channels for header in headers)
+    images = torch.zeros(len(paths), channels, height, width)
+    given = None if encoding.saturation == "auto" else encoding
+    opaque, tallies = _fill(images, paths, sizes_px, response, encoding, {}, tally=given is None)
+    whites = _found(tallies, response)
+    if whites:
+        _tell(paths[0].parent, whites)
+        opaque, _ = _fill(images, paths, sizes_px, response, encoding, whites, tally=False)
+    return Pictures(images=images, opaque=opaque)
+
+
+def radiance_of(
+    decoded: Decoded,
+    response: Response,
+    black: Float[Tensor, ""],
+    white: Float[Tensor, " channel"],
+) -> Float[Tensor, "channel height width"]:
+    """Undo the response, so that ``black`` becomes 0 and ``white``, or more, 1.
+
+    Args:
+        decoded: Of a file.
+        response: Its response.
+        black: Share of full scale.
+        white: Shares of full scale, one a colour.
+    """
+    levels = white[:, None, None]
+    dark = response.linear_from_encoded(black.expand_as(levels))
+    span = response.linear_from_encoded(levels) - dark
+    return ((response.linear_from_encoded(decoded.samples) - dark) / span).clamp(0, 1)
+
+
+def resized(
+    planes: Float[Tensor, "channel height width"], width: int, height: int
+) -> Float[Tensor, "channel {height} {width}"]:
+    """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
+    if tuple(planes.shape[-2:]) == (height, width):
+        return planes
+    return interpolate(
+        planes[None], size=(height, width), mode="bilinear", antialias=True, align_corners=False
+    )[0]
+
+
+def resized_radiance(
+    radiance: Float[Tensor, "channel height width"], width: int, height: int
+) -> Float[Tensor, "channel {height} {width}"]:
+    """Shrink radiance; a pixel made of some that are saturated is saturated, colour by colour.
+
+    How bright the saturated ones were nobody knows, so neither is their mean with others.
+    """
+    if tuple(radiance.shape[-2:]) == (height, width):
+        return radiance
+    touched = resized((radiance >= SATURATED).to(radiance), width, height) > _TOUCHED
+    return torch.where(touched, 1.0, resized(radiance, width, height))
+
+
+def resized_mask(
+    opacity: Float[Tensor, "height_in width_in"] | None, width: int, height: int
+) -> Bool[Tensor, "{height} {width}"]:
+    """Shrink opacity and call what is at least half opaque the object; ``None`` is all of it."""
+    if opacity is None:
+        return torch.ones(height, width, dtype=torch.bool)
+    return resized(opacity[None], width, height)[0] >= OPAQUE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Tally(Record):
+    """How often each level occurs in all files of like bits; in how many files at all often."""
+
+    counts: Int[Tensor, "channel level"]
+    photographs: Int[Tensor, "channel level"]
+
+
+def _fill(
+    images: Float[Tensor, "view channel height width"],
+    paths: Sequence[Path],
+    sizes_px: Sequence[tuple[int, int]],
+    response: Response,
+    encoding: Encoding,
+    whites: _Whites,
+    *,
+    tally: bool,
+) -> tuple[tuple[Bool[Tensor, "height width"] | None, ...], dict[int, _Tally]]:
+    """Write the radiance of each file into the images; count its levels if that is asked for."""
+    opaque: list[Tensor | None] = []
+    tallies: dict[int, _Tally] = {}
+    for index in track(range(len(paths))):
+        decoded, (wide, high) = decode(paths[index]), sizes_px[index]
+        black, white = _levels(encoding, decoded, paths[index], whites)
+        _require_fit(response, decoded, paths[index])
+        radiance = radiance_of(decoded, response, black, white)
+        images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
+        opaque.append(None)
+        if decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any()):
+            drawn = torch.zeros(images.shape[-2:], dtype=torch.bool)
+            drawn[:high, :wide] = resized_mask(decoded.alpha, wide, high)
+            opaque[-1] = drawn
+        if tally:
+            tallies[decoded.bits] = _counted(decoded, images.shape[1], tallies.get(decoded.bits))
+    return tuple(opaque), tallies
+
+
+def _counted(decoded: Decoded, channels: int, former: _Tally | None) -> _Tally:
+    full = 2**decoded.bits - 1
+    levels = (full * decoded.samples).round().to(torch.int32)
+    counts = torch.stack([torch.bincount(one.flatten(), minlength=full + 1) for one in levels])
+    counts = counts.expand(channels, -1)
+    often = (counts >= PIXELS).long()
+    if former is None:
+        return _Tally(counts=counts, photographs=often)
+    return _Tally(counts=former.counts + counts, photographs=former.photographs + often)
+
+
+def _found(tallies: Mapping[int, _Tally], response: Response) -> dict[int, Tensor]:
+    """Give the saturation of files of each depth, where it is below full scale.
+
+    A colour that shows none saturates where the highest of the others does.
+    """
+    whites = {}
+    for bits, tally in tallies.items():
+        found = [
+            find_saturation(counts, photographs)
+            for counts, photographs in zip(tally.counts, tally.photographs, strict=True)
+        ]
+        levels = [level for level in found if level is not None]
+        if not levels:
+            continue
+        filled = [max(levels) if level is None else level for level in found]
+        white = torch.tensor(filled) / (2**bits - 1)
+        beyond = response.linear_from_encoded(white[:, None, None]).min()
+        end = response.linear_from_encoded(torch.ones_like(white)[:, None, None]).max()
+        if beyond < SATURATED * end:
+            whites[bits] = white
+    return whites
+
+
+def _tell(folder: Path, whites: _Whites) -> None:
+    for bits, white in whites.items():
+        full = 2**bits - 1
+        levels = [str(round(full * float(one))) for one in white]
+        same = len(set(levels)) == 1
+        text = levels[0] if same else f"{', '.join(levels)} (red, green, blue)"
+        warnings.warn(
+            f"{folder}: values of its files of {bits} bits pile up at {text} of {full}, which is "
+            "taken for the level of saturation. If it is not, set `photographs.saturation` to "
+            "the true level, or to 1 for full scale.",
+            PimperWarning,
+            stacklevel=4,
+        )
+
+
+def _levels(
+    encoding: Encoding, decoded: Decoded, path: Path, whites: _Whites
+) -> tuple[Float[Tensor, ""], Float[Tensor, " channel"]]:
+    """Give black and white of a file as shares of its full scale.
+
+    Raises:
+        InputError: Levels above full scale, ones for other colours, or no span between them.
+    """
+    full, channels = 2**decoded.bits - 1, decoded.samples.shape[0]
+    saturation, black = encoding.saturation, encoding.black
+    if saturation == "auto":
+        white = whites.get(decoded.bits, torch.ones(channels))[:channels]
+        given: tuple[float | int, ...] = ()
+    else:
+        given = saturation if isinstance(saturation, tuple) else (saturation,) * channels
+        white = torch.tensor([one if one <= 1 else one / full for one in given])
+    highest = max((black, *given))
+    if highest > full:
+        raise InputError(
+            f"{path}: holds {decoded.bits} bits, levels 0 to {full}, but a level of {highest:g} is "
+            "given for saturation or black; needed: a level that the files have, or a share of "
+            "full scale up to 1."
+        )
+    if len(white) != channels:
+        raise InputError(
+            f"{path}: is gray, but saturation has levels for red, green and blue; needed: one."
+        )
+    dark = torch.tensor(black if black <= 1 else black / full)
+    if bool((white <= dark).any()):
+        raise InputError(
+            f"{path}: black is {float(dark):.4g} of full scale and saturation "
+            f"{float(white.min()):.4g}; needed: saturation above black."
+        )
+    return dark, white
+
+
+def _require_fit(response: Response, decoded: Decoded, path: Path) -> None:
+    """Refuse a curve that was measured on files of another kind."""
+    if not isinstance(response, Curve):
+        return
+    if response.bits not in (None, decoded.bits):
+        last = float(response.encoded[-1]) * (2**response.bits - 1)
+        raise InputError(
+            f"{path}: holds {decoded.bits} bits, levels 0 to {2**decoded.bits - 1}, but the "
+            f"response curve ends at level {last:g}, for files of {response.bits} bits; needed: a "
+            "curve over the levels of these files, or over shares of full scale from 0 to 1."
+        )
+    if len(response.radiance) not in (1, decoded.samples.shape[0]):
+        raise InputError(
+            f"{path}: is gray, but the response curve is one for red, green and blue; needed: one "
+            "for all."
+        )

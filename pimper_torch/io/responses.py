@@ -1,0 +1,132 @@
+"""Measured response curves from small files."""
+
+import csv
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pimper_torch.errors import InputError
+from pimper_torch.radiometry import Curve, Encoding, Gamma, Linear, Response, Srgb
+from pimper_torch.radiometry.response import curve_from_table
+
+# A table of 65536 levels in three colours takes 5 MB as text.
+_LARGEST_BYTES = 20_000_000
+_LAYOUT = (
+    "a column of radiance, or red, green and blue, for the levels 0, 1, 2 and on; or two or four "
+    "columns, of which the first is the level"
+)
+
+
+def response_of(encoding: Encoding) -> Response:
+    """Give the response that was chosen, reading its file if it is a measured one.
+
+    Raises:
+        InputError: As :func:`read_curve`.
+    """
+    choice = encoding.response
+    if choice == "srgb":
+        return Srgb()
+    if choice == "linear":
+        return Linear()
+    if isinstance(choice, int | float):
+        return Gamma(exponent=float(choice))
+    return read_curve(Path(choice))
+
+
+def read_curve(path: Path | str) -> Curve:
+    """Read a measured inverse response: the radiance that belongs to each level.
+
+    The table has one column, the radiance of the levels 0, 1, 2 and on; three, of red, green
+    and blue; or two or four, of which the first is the level. Levels go from 0 to 1 (shares
+    of full scale), to 255 (files of 8 bits), or to more (of 16). Radiance is in any unit.
+
+    ========  =====================================================================
+    file      table
+    ========  =====================================================================
+    `.csv`    rows of numbers; a first row of names is passed over
+    `.json`   ``{"radiance": [...]}`` or three lists for the colours, and, if levels
+              are given, ``"levels": [...]``
+    `.npy`    rows as above, such as OpenCV's ``CalibrateDebevec`` gives with its
+              colours turned round to red, green, blue
+    ========  =====================================================================
+
+    Raises:
+        InputError: No such file, one of another kind, no table of numbers, or no curve:
+            see :func:`~pimper_torch.radiometry.response.curve_from_table`.
+    """
+    path = Path(path)
+    readers: Mapping[str, Callable[[Path], np.ndarray]] = {
+        ".csv": _read_csv,
+        ".json": _read_json,
+        ".npy": _read_npy,
+    }
+    reader = readers.get(path.suffix.lower())
+    if reader is None or not path.is_file():
+        found = "no such file" if reader else f"a {path.suffix} file" if path.suffix else "no file"
+        raise InputError(
+            f"{path}: is no response of photographs ({found}); needed: srgb, linear, the exponent "
+            f"of a gamma curve, or a file ending in {', '.join(readers)}."
+        )
+    if path.stat().st_size > _LARGEST_BYTES:
+        raise InputError(f"{path}: has {path.stat().st_size} bytes; needed: a small table.")
+    try:
+        table = reader(path)
+    except (OSError, ValueError, TypeError, KeyError, EOFError, csv.Error) as error:
+        raise InputError(
+            f"{path}: holds no table of a response curve ({error}); needed: {_LAYOUT}."
+        ) from error
+    if table.ndim != 2 or not 1 <= table.shape[1] <= 4:
+        raise InputError(
+            f"{path}: holds a table of {' x '.join(str(side) for side in table.shape)}; needed: "
+            f"{_LAYOUT}."
+        )
+    columns = torch.from_numpy(np.ascontiguousarray(table.T))
+    if len(columns) in (1, 3):
+        columns = torch.cat([torch.arange(columns.shape[1])[None].double(), columns])
+    try:
+        return curve_from_table(columns[0], columns[1:])
+    except InputError as error:
+        raise InputError(f"{path}: is no response curve: {error}") from error
+
+
+def _read_csv(path: Path) -> np.ndarray:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        text = file.read()
+    comma = ";" if ";" in text else ","
+    rows = [row for row in csv.reader(text.splitlines(), delimiter=comma) if any(row)]
+    if rows and not any(_is_number(cell) for cell in rows[0]):
+        rows = rows[1:]
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError("its rows are of unlike lengths, or there are none")
+    return np.array([[float(cell) for cell in row] for row in rows])
+
+
+def _read_json(path: Path) -> np.ndarray:
+    account = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(account, dict):
+        raise ValueError("it is no object with `radiance`")
+    radiance = np.array(account["radiance"], dtype=np.float64)
+    rows = radiance[None] if radiance.ndim == 1 else radiance
+    if "levels" in account:
+        rows = np.concatenate([np.array(account["levels"], dtype=np.float64)[None], rows])
+    return rows.T
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    table = np.load(path, allow_pickle=False)
+    if not isinstance(table, np.ndarray) or table.dtype.kind not in "iuf":
+        raise ValueError("it is no array of numbers")
+    if table.ndim == 3 and table.shape[1] == 1:  # as OpenCV has it
+        table = table[:, 0]
+    return (table[:, None] if table.ndim == 1 else table).astype(np.float64)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

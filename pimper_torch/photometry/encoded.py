@@ -1,0 +1,147 @@
+r"""Encoded values explained by first-order light that is seen through a response.
+
+The residual is taken in the encoded values, where the noise is:
+:math:`e = M - f^{-1}(L R)` with f the response.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.photometry.low_rank import low_rank_problem
+from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.radiometry import Response
+from pimper_torch.records import Record
+
+# Further rounds of linearising about the fit and weighing outliers, each exponent starting where
+# the last one ended.
+ROUNDS = 1
+_ITERATIONS, _TOLERANCE = 30, 1e-7
+_FILL_STEPS = 30  # to a start good enough for the solver
+
+# Where a fit predicts less light than none, it is linearised here.
+_DARKEST = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class EncodedMatrix(Record):
+    """Encoded values of the same samples in several views.
+
+    Attributes:
+        encoded: All samples looked at.
+        seen: Among them, that are not missing.
+        used: That the fit rests on.
+        scale: Of residuals, beyond which they are outliers; 0 is least squares.
+        rank: Of radiance.
+    """
+
+    encoded: Float[Tensor, "view sample"]
+    seen: Bool[Tensor, "view sample"]
+    used: Bool[Tensor, "view sample"]
+    scale: float
+    rank: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class EncodedFit(Record):
+    """How well a response does.
+
+    Attributes:
+        predicted: Encoded values.
+        loss: Of each entry; 0 where not used.
+        weight: Of each entry, less for outliers.
+        left: Left factor, from which the next response starts.
+    """
+
+    predicted: Float[Tensor, "view sample"]
+    loss: Float[Tensor, "view sample"]
+    weight: Float[Tensor, "view sample"]
+    left: Float[Tensor, "view rank"]
+
+
+def fit_encoded(
+    problem: EncodedMatrix, response: Response, start: EncodedFit | None, rounds: int = ROUNDS
+) -> EncodedFit:
+    """Explain the encoded values by first-order light seen through a response.
+
+    The encoded residual is linearised, first about the values or a former fit, then about the
+    fit: least squares in radiance, weighted by the square of the response's slope, is least
+    squares in encoded values then. Constant to autograd.
+
+    Args:
+        problem: The values.
+        response: Through which they are seen; ``f``.
+        start: Fit of a response near by; ``None`` starts from the values.
+        rounds: After the first.
+    """
+    mask = problem.used.double()
+    about, weight = torch.where(problem.used, problem.encoded, 0.5), mask
+    left: Tensor | None = None
+    if start is not None:
+        about, weight, left = start.predicted, mask * start.weight, start.left
+    for turn in range(rounds + 1):
+        rate = _derivative(response, about)
+        target = response.linear_from_encoded(about) + rate * (problem.encoded - about)
+        heavy = weight / rate.square()
+        heavy = heavy / heavy.max()
+        if left is None:
+            left = _start(target, mask, problem.rank)
+        matrix = low_rank_problem(target[None], heavy[None], left[None])
+        solved = solve_variable_projection(matrix, _ITERATIONS, _TOLERANCE)
+        left = solved.lights[0]
+        linear = left @ solved.shading[0]
+        about = response.encoded_from_linear(linear).clamp_min(_DARKEST)
+        residual = mask * (problem.encoded - about)
+        if problem.scale and turn < rounds:
+            weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
+    loss = residual.square()
+    if problem.scale:
+        loss = problem.scale**2 * torch.log1p(loss / problem.scale**2)
+    assert left is not None, "there is one round at least"
+    return EncodedFit(predicted=about, loss=loss, weight=weight, left=left)
+
+
+def _derivative(
+    response: Response, encoded: Float[Tensor, "view sample"]
+) -> Float[Tensor, "view sample"]:
+    with torch.enable_grad():
+        at = encoded.detach().requires_grad_()
+        (rate,) = torch.autograd.grad(response.linear_from_encoded(at).sum(), at)
+    return rate
+
+
+def _start(
+    matrix: Float[Tensor, "view sample"], mask: Float[Tensor, "view sample"], rank: int
+) -> Float[Tensor, "view rank"]:
+    """Fill what is missing by albedo times brightness, then by the best of the rank in turn."""
+    gain = (mask * matrix).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp_min(1)
+    level = (mask * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
+    filled = torch.where(mask > 0, matrix, gain * (mask * matrix).sum(dim=0, keepdim=True) / level)
+    for _ in range(_FILL_STEPS):
+        basis = torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:]
+        filled = torch.where(mask > 0, matrix, basis @ (basis.mT @ filled))
+    return basis
+
+
+def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
+    """Leave out samples and views that the factors fit whatever they hold."""
+    for _ in range(2):
+        used = used & (used.sum(dim=0) > rank) & (used.sum(dim=1, keepdim=True) > 2 * rank)
+    return used
+
+
+def freedom(used: Bool[Tensor, "view sample"], rank: int) -> int:
+    """Count the degrees of freedom that the factors leave."""
+    views, samples = (int(used.any(dim=axis).sum()) for axis in (1, 0))
+    return int(used.sum()) - rank * (views + samples - rank)
+
+
+def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
+    """Give the robust standard deviation of the residuals, for the freedom that is left."""
+    residual = (problem.encoded - fit.predicted)[problem.used]
+    size = float(spread(residual, torch.ones_like(residual, dtype=torch.bool)))
+    free = max(freedom(problem.used, problem.rank), 1)
+    return size * (int(problem.used.sum()) / free) ** 0.5

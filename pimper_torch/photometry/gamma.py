@@ -1,0 +1,403 @@
+r"""An unknown gamma, found as the one that lets first-order light explain the photographs.
+
+Views of the same samples under several lights are, as radiance, a matrix of rank 3 (distant
+lamps) or 4 (ambient light besides). Encoded by a curve that is not the assumed one they are
+not. For each exponent the residual is taken where the noise is, in the encoded values,
+
+.. math:: e = M - (L R)^{1/\gamma}, \qquad f(\gamma) = \min_{L, R} \sum \rho(e),
+
+so that it means the same for every exponent. A residual in radiance, even relative to radiance
+itself, does not: ``M ** gamma`` tends to a matrix of ones, which is of rank 1, as gamma falls.
+To first order noise adds to ``f`` its variance times the degrees of freedom, whatever the
+exponent, and does not move the minimum.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.encoded import (
+    ROUNDS,
+    EncodedFit,
+    EncodedMatrix,
+    enough,
+    fit_encoded,
+    freedom,
+    residual_spread,
+)
+from pimper_torch.photometry.robust import spread
+from pimper_torch.radiometry import SATURATED, Gamma, Linear, Srgb
+from pimper_torch.records import PatchViews, Record, Views
+
+# Between them lie all curves in use; 1 is linear.
+LEAST, MOST = 0.4, 4.0
+# Tried first, evenly in their logarithm; neighbours are 1.4 times one another.
+_TRIALS = 8
+# Of gamma's logarithm, a tenth of what noise leaves uncertain at best.
+_CLOSE = 1e-4
+# Relative difference between estimates of data without noise.
+_ROUNDING = 1e-3
+
+# A relative standard error above which 1.8 and 2.2 are not told apart.
+_MOST_UNCERTAIN = 0.1
+
+# Four levels of 255: more than noise, that is shadows, highlights, or a curve that is no gamma.
+_MOST_RESIDUAL = 0.015
+
+# Residuals of this size, half the rounding of 8 bits, are no outliers whatever the others are.
+_LEAST_SCALE = 5e-4
+# Cauchy's loss is as good as least squares on Gaussian noise to 95 % at 2.385 deviations
+# (Holland & Welsch, 1977).
+_CAUCHY = 2.385
+
+# The estimate is checked without the darker third and half of the entries.
+_DARKEST_SHARES = (1 / 3, 1 / 2)
+# Fewer degrees of freedom say little of their own error.
+_LEAST_FREE = 100
+# Beyond so many standard errors of theirs the brighter entries are believed instead; beyond the
+# first number the estimate becomes less sure.
+_DOUBTED, _CONTRADICTED = 2.0, 3.0
+
+# The second choice of entries halves the bias that the first, from noisy values, leaves: 0.8 and
+# 0.4 % of gamma at 1 % noise.
+_CHOICES = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class GammaEstimate(Record):
+    """The exponent of a gamma curve, as far as the data tells it.
+
+    Attributes:
+        gamma: ``radiance = encoded ** gamma``.
+        standard_error: Of gamma, from how samples, or views if those differ more, disagree.
+        determined: False where the data cannot tell: the standard error is more than a tenth
+            of gamma, the loss still falls at an end of what was searched, or more is left than
+            a camera's noise, so that first-order light explains the values with no gamma.
+        residual: Spread of what is left in encoded values, 1 being full scale.
+        residual_linear: The same if the values are taken for linear.
+        residual_srgb: The same if they are taken for sRGB.
+        entries: Of the matrix, that the estimate rests on.
+    """
+
+    gamma: float
+    standard_error: float
+    determined: bool
+    residual: float
+    residual_linear: float
+    residual_srgb: float
+    entries: int
+
+    def __str__(self) -> str:
+        """Say it in a sentence."""
+        found = (
+            f"gamma {self.gamma:.3f} +- {self.standard_error:.3f}; residual "
+            f"{100 * self.residual:.2f} % of full scale, {100 * self.residual_linear:.2f} % if "
+            f"linear, {100 * self.residual_srgb:.2f} % if sRGB"
+        )
+        if self.determined:
+            return f"{found}."
+        noisy = self.residual > _MOST_RESIDUAL
+        why = (
+            "shadows, highlights or another curve leave more than noise"
+            if noisy
+            else "light or surfaces vary too little"
+        )
+        return f"gamma cannot be told from these photographs, {why} ({found})."
+
+
+def estimate_gamma(
+    encoded: Float[Tensor, "view sample"],
+    seen: Bool[Tensor, "view sample"],
+    *,
+    rank: int = 4,
+    dark_level: float = 0.1,
+    saturation_level: float = SATURATED,
+    max_samples: int = 300,
+) -> GammaEstimate:
+    """Find the gamma of photographs from the same surface samples under several lights.
+
+    Values that shadow or saturation took are left out: first by what is observed, then by what
+    the fit predicts, since choosing by noisy values favours those with noise of one sign (at 1 %
+    noise gamma would come out 1 % too small on linear data). Outliers, such as highlights and
+    cast shadows, lose weight. Where the brighter entries alone contradict, they are believed:
+    ambient light in attached shadows is not first-order.
+
+    A gain of each view, such as its exposure, is part of its light and does not matter. What
+    cannot be told apart: light from one direction, or a plane, gives a matrix of rank 1 with
+    every gamma. The standard error knows of noise, not of light that is of another kind than
+    assumed.
+
+    Args:
+        encoded: As the files hold them, 1 being full scale.
+        seen: False for what is missing. Neither dark nor saturated values need be left out.
+        rank: 3 for distant lamps alone, 4 with ambient light.
+        dark_level: Encoded value up to which shading is not first-order.
+        saturation_level: From which values are cut off.
+        max_samples: More are thinned evenly.
+
+    Raises:
+        InputError: Values that are not in [0, 1] or no numbers, an impossible rank, or fewer
+            views or samples than the rank needs.
+
+    Constant to autograd.
+    """
+    if not 1 <= rank <= 9:
+        raise InputError(f"rank is {rank}; needed: 3 for distant lamps, 4 with ambient light.")
+    values = encoded[seen]
+    if not bool(values.isfinite().all()):
+        raise InputError(
+            f"{int((~values.isfinite()).sum())} encoded values are no numbers; needed: numbers, or "
+            "`seen` false for these."
+        )
+    if values.numel() and not 0 <= float(values.min()) <= float(values.max()) <= 1:
+        raise InputError(
+            f"encoded values reach from {float(values.min()):.4g} to {float(values.max()):.4g}; "
+            "needed: shares of the files' full scale, 0 to 1."
+        )
+    with torch.no_grad():
+        limits = (dark_level, saturation_level)
+        problem = _problem(encoded, seen, rank, limits, max_samples)
+        for _ in range(_CHOICES):
+            problem = _chosen_by_fit(problem, _coarsely(problem, rounds=0)[1].predicted, limits)
+        return _judged(_most_trusted(problem))
+
+
+def gamma_of_photographs(
+    views: Views,
+    *,
+    mask: Bool[Tensor, "height width"] | None = None,
+    rank: int = 4,
+    channel: int | None = None,
+    max_samples: int = 300,
+) -> GammaEstimate:
+    """Find the gamma of photographs that a fixed camera took under several lights.
+
+    Args:
+        views: Read with :data:`~pimper_torch.radiometry.LINEAR`, so that they hold the files'
+            own values; of one size. Pixels that any of their masks leaves out are left out.
+        mask: True on the object, for all photographs.
+        rank: 3 for distant lamps alone, 4 with ambient light.
+        channel: Colour to look at; the middle one, green, unless given.
+        max_samples: More are thinned evenly.
+
+    Raises:
+        InputError: As :func:`estimate_gamma`, and for photographs or a mask of unlike sizes.
+    """
+    if len(set(map(tuple, views.sizes_px.tolist()))) > 1:
+        raise InputError(
+            "the photographs have unlike sizes; needed: photographs of one fixed camera."
+        )
+    inside = views.inside if views.masks is None else views.inside & views.masks
+    where = inside.all(dim=0)
+    if mask is not None:
+        if mask.shape != where.shape:
+            raise InputError(
+                f"the mask is {mask.shape[1]} x {mask.shape[0]}, the photographs are "
+                f"{where.shape[1]} x {where.shape[0]}; needed: a mask of the same size."
+            )
+        where = where & mask
+    colour = views.images.shape[1] // 2 if channel is None else channel
+    encoded = views.images[:, colour][:, where]
+    return estimate_gamma(
+        encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank, max_samples=max_samples
+    )
+
+
+def gamma_of_patches(
+    seen: PatchViews, *, rank: int = 4, channel: int | None = None, max_samples: int = 300
+) -> GammaEstimate:
+    """Find the gamma of registered photographs, all facets together.
+
+    One light a view for the whole scene is assumed, so a near lamp counts as noise. Samples
+    that registration dropped as dark or saturated stay dropped: keep ``warp.dark_level`` well
+    below 0.1.
+
+    Args:
+        seen: Of views read with :data:`~pimper_torch.radiometry.LINEAR`.
+        rank: 3 for distant lamps alone, 4 with ambient light.
+        channel: Colour to look at; the middle one, green, unless given.
+        max_samples: More are thinned evenly.
+
+    Raises:
+        InputError: As :func:`estimate_gamma`.
+    """
+    values, valid = [], []
+    for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
+        colour = registered.radiance.shape[2] // 2 if channel is None else channel
+        facet = (templates.barycentric >= 0).all(dim=-1)
+        values.append(registered.radiance[:, :, colour].movedim(1, 0)[:, facet])
+        valid.append(registered.valid.movedim(1, 0)[:, facet])
+    encoded = torch.cat(values, dim=1).detach()
+    # Interpolation and pyramids round; what they leave outside [0, 1] is no more than that.
+    return estimate_gamma(
+        encoded.clamp(0, 1), torch.cat(valid, dim=1), rank=rank, max_samples=max_samples
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Minimum(Record):
+    """Where the loss is least, and how sure that is.
+
+    Attributes:
+        problem: Whose loss.
+        gamma: Where it is least.
+        fit: There.
+        inner: Whether the loss rises on both sides.
+        error: Standard error of gamma.
+    """
+
+    problem: EncodedMatrix
+    gamma: float
+    fit: EncodedFit
+    inner: bool
+    error: float
+
+
+def _problem(
+    encoded: Float[Tensor, "view sample"],
+    seen: Bool[Tensor, "view sample"],
+    rank: int,
+    limits: tuple[float, float],
+    max_samples: int,
+) -> EncodedMatrix:
+    """Thin the samples, and use what is neither dark nor saturated."""
+    used = enough(seen & (encoded > limits[0]) & (encoded < limits[1]), rank)
+    views, samples = used.any(dim=1), used.any(dim=0).nonzero().flatten()
+    if int(views.sum()) <= rank + 1 or len(samples) <= 4 * rank:
+        raise InputError(
+            f"only {len(samples)} samples are lit in more than {rank} of {len(seen)} views; "
+            f"needed: more than {4 * rank}, in at least {rank + 2} views. Add photographs under "
+            "other lights, expose so that less is dark or saturated, or lower the rank."
+        )
+    count = min(max_samples, len(samples))
+    spaced = torch.linspace(0, len(samples) - 1, count, dtype=torch.float64).round().long()
+    chosen = samples[spaced.to(samples.device)]
+    return EncodedMatrix(
+        encoded=torch.where(seen, encoded, 0)[views][:, chosen].double(),
+        seen=seen[views][:, chosen],
+        used=enough(used[views][:, chosen], rank),
+        scale=0.0,
+        rank=rank,
+    )
+
+
+def _chosen_by_fit(
+    problem: EncodedMatrix, predicted: Float[Tensor, "view sample"], limits: tuple[float, float]
+) -> EncodedMatrix:
+    """Use what the fit predicts to be lit and not saturated, and weigh outliers."""
+    dark, saturated = limits
+    encoded = problem.encoded
+    known = problem.seen & (problem.used.sum(dim=0) > problem.rank)
+    lit = (predicted > dark) & (encoded > dark / 2)  # far below: a cast shadow
+    lit = lit & (predicted < saturated - dark / 2) & (encoded < saturated)
+    used = enough(known & lit, problem.rank)
+    if int(used.any(dim=0).sum()) <= 4 * problem.rank:
+        used = problem.used
+    residual = (encoded - predicted)[used]
+    scale = _CAUCHY * float(spread(residual, torch.ones_like(residual, dtype=torch.bool)))
+    return problem.replace(used=used, scale=max(scale, _LEAST_SCALE))
+
+
+def _coarsely(problem: EncodedMatrix, rounds: int) -> tuple[float, EncodedFit]:
+    """Give the best of a few exponents, spread evenly."""
+    trials = torch.logspace(math.log10(LEAST), math.log10(MOST), _TRIALS, dtype=torch.float64)
+    fits: list[EncodedFit] = []
+    for exponent in trials.tolist():
+        former = fits[-1] if fits else None
+        fits.append(fit_encoded(problem, Gamma(exponent=exponent), former, rounds))
+    best = min(range(_TRIALS), key=lambda trial: float(fits[trial].loss.sum()))
+    return float(trials[best]), fits[best]
+
+
+def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float) -> _Minimum:
+    """Find where between two exponents the loss is least."""
+    fit = start
+
+    def loss(logarithm: float) -> float:
+        nonlocal fit
+        fit = fit_encoded(problem, Gamma(exponent=math.exp(logarithm)), fit)
+        return float(fit.loss.sum())
+
+    bounds = (math.log(max(low, LEAST)), math.log(min(high, MOST)))
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _CLOSE})
+    gamma = math.exp(found.x)
+    fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
+    return _Minimum(
+        problem=problem,
+        gamma=gamma,
+        fit=fit,
+        inner=LEAST * 1.01 < gamma < MOST / 1.01,
+        error=_standard_error(problem, gamma, fit),
+    )
+
+
+def _most_trusted(problem: EncodedMatrix) -> _Minimum:
+    """Estimate from all entries, or from the brighter ones alone where those contradict.
+
+    Ambient light in attached shadows is not first-order, bright, and more precise than right.
+    """
+    best, fit = _coarsely(problem, ROUNDS)
+    step = (MOST / LEAST) ** (1 / (_TRIALS - 1))
+    found = [_minimise(problem, fit, best / step, best * step)]
+    predicted = found[0].fit.predicted
+    for share in _DARKEST_SHARES:
+        level = predicted[problem.used].quantile(share)
+        used = enough(problem.used & (predicted > level), problem.rank)
+        if freedom(used, problem.rank) < _LEAST_FREE:
+            break
+        found.append(_minimise(problem.replace(used=used), found[0].fit, LEAST, MOST))
+    for place, estimate in enumerate(found):
+        rivals = [brighter for brighter in found[place + 1 :] if brighter.inner]
+        off = [abs(brighter.gamma - estimate.gamma) for brighter in rivals]
+        believed = [
+            each <= _CONTRADICTED * brighter.error + _ROUNDING * estimate.gamma
+            for each, brighter in zip(off, rivals, strict=True)
+        ]
+        if all(believed):
+            doubts = [
+                each - _DOUBTED * brighter.error for each, brighter in zip(off, rivals, strict=True)
+            ]
+            return estimate.replace(error=math.hypot(estimate.error, max([0.0, *doubts])))
+    raise AssertionError("nothing contradicts the last estimate")
+
+
+def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> float:
+    r"""Say how far samples, or views if those differ more, disagree about gamma.
+
+    With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
+    second derivative of the whole, the variance is :math:`\sum_k s_k^2 / h^2`; it needs no model
+    of the noise. Infinite where the loss hardly bends.
+    """
+    step = 0.02 * gamma
+    below = fit_encoded(problem, Gamma(exponent=gamma - step), fit)
+    above = fit_encoded(problem, Gamma(exponent=gamma + step), fit)
+    middle = float(fit.loss.sum())
+    curvature = (float(below.loss.sum()) + float(above.loss.sum()) - 2 * middle) / step**2
+    slope = (above.loss - below.loss) / (2 * step)
+    noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
+    # On data without noise everything but the curvature is rounding.
+    bends = curvature * gamma**2 > (_LEAST_SCALE * 0.1) ** 2 * int(problem.used.sum())
+    return noise / curvature if bends else math.inf
+
+
+def _judged(found: _Minimum) -> GammaEstimate:
+    """Put the answer together."""
+    problem = found.problem
+    residual = residual_spread(problem, found.fit)
+    linear = fit_encoded(problem, Linear(), found.fit, 2 * ROUNDS)
+    srgb = fit_encoded(problem, Srgb(), found.fit, 2 * ROUNDS)
+    sure = found.inner and found.error < _MOST_UNCERTAIN * found.gamma
+    return GammaEstimate(
+        gamma=found.gamma,
+        standard_error=found.error,
+        determined=sure and residual < _MOST_RESIDUAL,
+        residual=residual,
+        residual_linear=residual_spread(problem, linear),
+        residual_srgb=residual_spread(problem, srgb),
+        entries=int(problem.used.sum()),
+    )

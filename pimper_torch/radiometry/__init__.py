@@ -1,0 +1,22 @@
+"""Radiance and the encoded values that files hold: responses, saturation, sRGB."""
+
+from pimper_torch.radiometry.encoding import LINEAR, SRGB, Encoding
+from pimper_torch.radiometry.response import Curve, Gamma, Linear, Response, Srgb
+from pimper_torch.radiometry.saturation import SATURATED, find_saturation
+from pimper_torch.radiometry.srgb import linear_from_srgb, srgb_from_linear, to_bytes
+
+__all__ = [
+    "LINEAR",
+    "SATURATED",
+    "SRGB",
+    "Curve",
+    "Encoding",
+    "Gamma",
+    "Linear",
+    "Response",
+    "Srgb",
+    "find_saturation",
+    "linear_from_srgb",
+    "srgb_from_linear",
+    "to_bytes",
+]
