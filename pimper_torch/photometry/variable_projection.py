@@ -33,7 +33,7 @@ from pimper_torch.photometry.bilinear import (
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
 from pimper_torch.photometry.manifolds import Free
-from pimper_torch.photometry.quadratics import PackedCholesky, congruence, diagonal
+from pimper_torch.photometry.quadratics import PackedCholesky, congruence
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record, StopCause
 
@@ -240,8 +240,6 @@ def _whitened(
         size = len(columns)
         packed = congruence(packed, columns)
         slopes = torch.stack([(lights @ column) * weight for column in columns], dim=2)
-    packed = packed.clone()
-    packed[:, diagonal(size)] += 1e-12 * packed[:, diagonal(size)].sum(dim=1, keepdim=True)
     return PackedCholesky(packed[:, None], size).whiten(slopes).to(lights)
 
 
