@@ -103,7 +103,7 @@ def test_cast_shadows_lose_weight():
     drawn = torch.rand(encoded.shape, generator=torch.Generator().manual_seed(8))
     spoilt = torch.where(drawn < 0.02, 0.3 * encoded, encoded)
     found = estimate_gamma(spoilt, everywhere(spoilt), rank=3)
-    assert abs(found.gamma - 2.2) < 0.1  # least squares is off by 0.5
+    assert abs(found.gamma - 2.2) < 0.1
     assert found.determined
 
 
