@@ -122,9 +122,9 @@ def estimate_gamma(
 
     Values that shadow or saturation took are left out: first by what is observed, then by what
     the fit predicts, since choosing by noisy values favours those with noise of one sign, which
-    biases gamma. Outliers, such as highlights and
-    cast shadows, lose weight. Where the brighter entries alone contradict, they are believed:
-    ambient light in attached shadows is not first-order.
+    biases gamma. Outliers, such as highlights and cast shadows, lose weight. Where the brighter
+    entries alone contradict, they are believed: ambient light in attached shadows is not
+    first-order.
 
     A gain of each view, such as its exposure, is part of its light and does not matter. What
     cannot be told apart: light from one direction, or a plane, gives a matrix of rank 1 with
