@@ -63,8 +63,7 @@ _LEAST_FREE = 100
 # first number the estimate becomes less sure.
 _DOUBTED, _CONTRADICTED = 2.0, 3.0
 
-# The second choice of entries halves the bias that the first, from noisy values, leaves: 0.8 and
-# 0.4 % of gamma at 1 % noise.
+# The first choice by the fit still starts from entries chosen by noisy values.
 _CHOICES = 2
 
 
@@ -122,10 +121,10 @@ def estimate_gamma(
     """Find the gamma of photographs from the same surface samples under several lights.
 
     Values that shadow or saturation took are left out: first by what is observed, then by what
-    the fit predicts, since choosing by noisy values favours those with noise of one sign (at 1 %
-    noise gamma would come out 1 % too small on linear data). Outliers, such as highlights and
-    cast shadows, lose weight. Where the brighter entries alone contradict, they are believed:
-    ambient light in attached shadows is not first-order.
+    the fit predicts, since choosing by noisy values favours those with noise of one sign, which
+    biases gamma. Outliers, such as highlights and cast shadows, lose weight. Where the brighter
+    entries alone contradict, they are believed: ambient light in attached shadows is not
+    first-order.
 
     A gain of each view, such as its exposure, is part of its light and does not matter. What
     cannot be told apart: light from one direction, or a plane, gives a matrix of rank 1 with

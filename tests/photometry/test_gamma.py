@@ -70,18 +70,18 @@ def test_noise_moves_gamma_by_no_more_than_its_standard_error_tells():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gamma", [1.0, 2.2])
-def test_noise_does_not_bias_gamma(gamma):
+@pytest.mark.parametrize(("gamma", "noise"), [(1.0, 0.02), (2.2, 0.01)])
+def test_noise_does_not_bias_gamma(gamma, noise):
     found = []
     for seed in range(16):
-        encoded = noisy(shaded(seed, views=14, samples=250) ** (1 / gamma), 0.01, seed)
+        encoded = noisy(shaded(seed, views=14, samples=250) ** (1 / gamma), noise, seed)
         found.append(estimate_gamma(encoded, everywhere(encoded), rank=3))
     off = torch.tensor([one.gamma - gamma for one in found])
     error = torch.tensor([one.standard_error for one in found])
-    # Taking entries by their noisy values, or the residual of radiance, is off by a whole one.
+    # Taking entries by their noisy values is off by a whole one on linear data.
     assert off.mean().abs() < 0.75 * error.mean()
     assert ((off / error).abs() < 3.5).all()
-    assert error.max() < 0.05 * gamma
+    assert error.max() < 0.06 * gamma
 
 
 def test_ambient_light_and_attached_shadows_are_told_from_a_gamma():
@@ -98,14 +98,13 @@ def test_srgb_is_near_a_gamma_of_two_point_two_and_explains_its_own_values_bette
     assert found.residual_srgb < 1e-5 < found.residual < found.residual_linear
 
 
-def test_highlights_and_cast_shadows_lose_weight():
+def test_cast_shadows_lose_weight():
     encoded = noisy(shaded(samples=150) ** (1 / 2.2), 0.003)
-    generator = torch.Generator().manual_seed(8)
-    drawn = torch.rand(encoded.shape, generator=generator)
-    spoilt = torch.where(drawn < 0.02, 0.02, encoded)
-    spoilt = torch.where(drawn > 0.98, (encoded + 0.15).clamp_max(1), spoilt)
+    drawn = torch.rand(encoded.shape, generator=torch.Generator().manual_seed(8))
+    spoilt = torch.where(drawn < 0.02, 0.3 * encoded, encoded)
     found = estimate_gamma(spoilt, everywhere(spoilt), rank=3)
     assert abs(found.gamma - 2.2) < 0.1
+    assert found.determined
 
 
 def test_light_from_one_direction_tells_nothing():
