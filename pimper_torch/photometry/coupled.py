@@ -80,8 +80,7 @@ def solve_coupled(
         taken = max_iterations
         for step in range(max_iterations):
             lights = couple_lights(*_equations(batches, states), pairs, strength)
-            moved, change = _follow(batches, states, lights, step)
-            states = moved
+            states, change = _follow(batches, states, lights, step)
             if step >= REWEIGH_EVERY and bool((torch.cat(change) <= tolerance).all()):
                 taken = step + 1
                 break

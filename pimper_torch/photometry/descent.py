@@ -24,7 +24,12 @@ from pimper_torch.photometry.bilinear import (
     reweigh,
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
-from pimper_torch.photometry.quadratics import congruence, solve_packed
+from pimper_torch.photometry.quadratics import (
+    combination,
+    congruence,
+    coordinates,
+    solve_packed,
+)
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record, StopCause
 
@@ -132,8 +137,6 @@ def _descend(
     per_sample, _ = equations_of_samples(problem, lights, weight)
     columns = problem.manifold.tangents(shading)
     along = congruence(per_sample, columns)
-    slope = torch.stack([(column * on_shading).sum(dim=1) for column in columns], dim=1)
-    down = solve_packed(along, part * slope)
-    step = sum((column * down[:, None, i] for i, column in enumerate(columns)), start=0 * shading)
+    step = combination(columns, solve_packed(along, part * coordinates(columns, on_shading)))
     lights = lights - solve_packed(per_view, part * on_lights.mT).mT
     return lights, problem.manifold.retract((shading - step).mT).mT

@@ -16,8 +16,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.photometry.bilinear import Bilinear, Factors, deviation_of
-from pimper_torch.photometry.quadratics import outer, unpacked
+from pimper_torch.photometry.bilinear import (
+    Bilinear,
+    Factors,
+    curvature_of_views,
+    deviation_of,
+)
+from pimper_torch.photometry.quadratics import (
+    apply_packed,
+    combination,
+    coordinates,
+    outer,
+    unpacked,
+)
 from pimper_torch.records import Record
 
 # Directions that nothing determines, such as Lorentz transformations of free lights, are held by
@@ -102,10 +113,7 @@ def answered(
     """Give the solution the derivatives of a step of the lights, and of the samples after it."""
     hessian = system.hessian
     turn = system.inner - _apply(hessian.inverse, _mix_back(hessian, step))
-    moved = sum(
-        (column * turn[:, place, None] for place, column in enumerate(hessian.columns)),
-        start=torch.zeros_like(hessian.shading),
-    )
+    moved = combination(hessian.columns, turn)
     return factors.replace(
         lights=factors.lights.detach() + (step - step.detach()).to(factors.lights),
         shading=factors.shading.detach() + (moved - moved.detach()).to(factors.shading),
@@ -125,7 +133,7 @@ def _hessian(
     packed, slope = outer(L.mT) @ bent, -(L.mT @ pulled)
     if problem.prior is not None:
         prior = problem.prior.double()
-        packed, slope = packed + prior, slope + _times(prior, N)
+        packed, slope = packed + prior, slope + apply_packed(prior, N)
     A, B = unpacked(packed, N.shape[1]), torch.stack(columns, dim=-1).transpose(1, 2)
     own = B.mT @ A @ B + problem.manifold.curvature(N, slope)
     diagonal = own.diagonal(dim1=2, dim2=3).abs().sum(dim=-1)
@@ -148,12 +156,7 @@ def _hessian(
 def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown unknown"]:
     L, N = hessian.lights, hessian.shading
     batch, views, rank = L.shape
-    products = (N[:, :, None] * N[:, None]).flatten(1, 2)
-    blocks = (hessian.bent @ products.mT).reshape(batch, views, rank, rank)
-    total = L.new_zeros(batch, views, rank, views, rank)
-    index = torch.arange(views, device=L.device)
-    total[:, index, :, index] = blocks.transpose(0, 1)
-    total = total.reshape(batch, views * rank, views * rank)
+    total = curvature_of_views(N, hessian.bent)
     pull = problem.pull.double()[..., None].expand(-1, -1, rank).flatten(1)
     total = total + torch.diag_embed(pull)
     mean = total.diagonal(dim1=1, dim2=2).mean(dim=1)
@@ -190,19 +193,15 @@ def _slopes(
     on_lights = pulled @ N.mT - problem.pull.double()[..., None] * apart
     ambient = L.mT @ pulled
     if problem.prior is not None:
-        ambient = ambient - _times(problem.prior.double(), N)
-    on_samples = torch.stack([(column * ambient).sum(dim=1) for column in hessian.columns], dim=1)
-    return on_lights, on_samples
+        ambient = ambient - apply_packed(problem.prior.double(), N)
+    return on_lights, coordinates(hessian.columns, ambient)
 
 
 def _mix(
     hessian: Hessian, turn: Float[Tensor, "patch tangent sample"]
 ) -> Float[Tensor, "patch view rank"]:
     """Apply the mixed part to changes of the samples."""
-    moved = sum(
-        (column * turn[:, place, None] for place, column in enumerate(hessian.columns)),
-        start=torch.zeros_like(hessian.shading),
-    )
+    moved = combination(hessian.columns, turn)
     return (
         hessian.bent * (hessian.lights @ moved)
     ) @ hessian.shading.mT - hessian.pulled @ moved.mT
@@ -215,7 +214,7 @@ def _mix_back(
     ambient = hessian.lights.mT @ (hessian.bent * (step @ hessian.shading)) - (
         step.mT @ hessian.pulled
     )
-    return torch.stack([(column * ambient).sum(dim=1) for column in hessian.columns], dim=1)
+    return coordinates(hessian.columns, ambient)
 
 
 def _apply(
@@ -223,9 +222,3 @@ def _apply(
     vectors: Float[Tensor, "patch tangent sample"],
 ) -> Float[Tensor, "patch tangent sample"]:
     return (inverse @ vectors.mT[..., None])[..., 0].mT
-
-
-def _times(
-    packed: Float[Tensor, "patch packed sample"], vectors: Float[Tensor, "patch rank sample"]
-) -> Float[Tensor, "patch rank sample"]:
-    return (unpacked(packed, vectors.shape[1]) @ vectors.mT[..., None])[..., 0].mT

@@ -5,6 +5,7 @@ one: 10 numbers for n = 4. Millions of them then cost one matrix product to asse
 elementwise arithmetic, without a call of a library each, to solve.
 """
 
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
 import torch
@@ -53,6 +54,33 @@ def apply_packed(
         if row != column:
             total[column] = torch.addcmul(total[column], entry, vectors[..., row, :])
     return torch.stack(total, dim=-2)
+
+
+def dot(
+    first: Float[Tensor, "*batch size item"], second: Float[Tensor, "*batch size item"]
+) -> Float[Tensor, "*batch item"]:
+    """Multiply vectors; several times as fast as a sum over their axis."""
+    total = torch.zeros_like(second[..., 0, :])
+    for a, b in zip(first.unbind(dim=-2), second.unbind(dim=-2), strict=True):
+        total = torch.addcmul(total, a, b)
+    return total
+
+
+def coordinates(
+    columns: Sequence[Tensor], vectors: Float[Tensor, "*batch size item"]
+) -> Float[Tensor, "*batch smaller item"]:
+    """Give ``B^T v`` for matrices ``B`` given by their columns."""
+    return torch.stack([dot(column, vectors) for column in columns], dim=-2)
+
+
+def combination(
+    columns: Sequence[Tensor], weights: Float[Tensor, "*batch smaller item"]
+) -> Float[Tensor, "*batch size item"]:
+    """Give ``B c`` for matrices ``B`` given by their columns."""
+    total = torch.zeros_like(columns[0])
+    for place, column in enumerate(columns):
+        total = total + column * weights[..., place : place + 1, :]
+    return total
 
 
 def congruence(

@@ -24,6 +24,7 @@ from torch import Tensor
 from pimper_torch.photometry.bilinear import (
     Bilinear,
     Factors,
+    curvature_of_views,
     equations_of_samples,
     evaluate,
     finish,
@@ -128,13 +129,7 @@ def curvature_of_lights(
         shading=shading,
         prior=None if problem.prior is None else problem.prior[:, :, ::stride],
     )
-    # (w_fk n_k n_k^T) on the diagonal blocks, one a view.
-    products = (shading[:, :, None] * shading[:, None]).flatten(1, 2)
-    blocks = (weight @ products.mT).reshape(batch, views, rank, rank)
-    normal = lights.new_zeros(batch, views, rank, views, rank)
-    index = torch.arange(views, device=lights.device)
-    normal[:, index, :, index] = blocks.transpose(0, 1)
-    normal = normal.reshape(batch, views * rank, views * rank)
+    normal = curvature_of_views(shading, weight)
     white = _whitened(some, lights, shading, weight)
     size = max(1, _CHUNK_ENTRIES // (batch * views * rank * white.shape[2]))
     for first in range(0, shading.shape[2], size):

@@ -5,7 +5,13 @@ from torch.testing import assert_close
 from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.ambiguity import align_factorizations
 from pimper_torch.photometry.balm import solve_balm
-from pimper_torch.photometry.bilinear import objective, select
+from pimper_torch.photometry.bilinear import (
+    equations_of_samples,
+    evaluate,
+    follow,
+    objective,
+    select,
+)
 from pimper_torch.photometry.certainty import refine_on_manifold
 from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.robust import Cauchy, GemanMcClure
@@ -82,6 +88,33 @@ def test_balm_and_descent_agree_on_clean_data(problem):
     costs = [objective(given, each.lights, each.shading, given.weight) for each in (balm, descent)]
     assert_close(*costs, rtol=1e-4, atol=1e-8)
     assert (costs[0] < objective(given, given.lights, given.shading, given.weight)).all()
+
+
+def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
+    given, _, _ = problem(patches=2, samples=40, missing=0.3)
+    _, normals = given.manifold.split(given.shading.mT)
+    given = given.replace(
+        pull=torch.full_like(given.pull, 3.0),
+        anchor=given.anchor + 0.1,
+        prior=0.1 * given.manifold.bend(normals.mT),
+    )
+    noise = torch.randn(given.radiance.shape, generator=generator, dtype=torch.float64)
+    given = given.replace(radiance=given.radiance + 0.1 * noise)
+    lights = given.lights.clone().requires_grad_()
+    # The shading is the best for the lights: its own change does not matter to first order.
+    equations = equations_of_samples(given, given.lights, given.weight)
+    shading = follow(given, *equations, given.shading, 60)
+    (eliminated,) = torch.autograd.grad(
+        objective(
+            given,
+            lights,
+            follow(given, *equations_of_samples(given, lights, given.weight), shading),
+            given.weight,
+        ).sum(),
+        lights,
+    )
+    _, slope = evaluate(given, given.lights, shading, given.weight)
+    assert_close(-eliminated / 2, slope, rtol=1e-5, atol=1e-6)
 
 
 @SOLVERS
