@@ -233,15 +233,21 @@ def step_along(
     """
     columns = manifold.tangents(shading)
     descent = coordinates(columns, slope)
-    curvature = congruence(packed, columns)
-    damped = curvature.clone()
-    size = len(columns)
-    damped[:, diagonal(size)] += 1e-9 * curvature[:, diagonal(size)].sum(dim=1, keepdim=True)
-    step = PackedCholesky(damped, size).solve(descent)
+    step = PackedCholesky(curvature_along(columns, packed), len(columns)).solve(descent)
     length = dot(step, step).detach().sqrt()[:, None]
     limit = LONGEST_STEP * manifold.split(shading.mT)[0].detach()[:, None]
     step = step * torch.where(length > limit, limit / length.clamp_min(1e-30), 1)
     return manifold.retract((shading + combination(columns, step)).mT).mT
+
+
+def curvature_along(
+    columns: list[Tensor], packed: Float[Tensor, "patch packed sample"]
+) -> Float[Tensor, "patch smaller sample"]:
+    """Give ``B^T A B``, packed, raised a little so that it can be inverted."""
+    curvature = congruence(packed, columns)
+    place = diagonal(len(columns))
+    curvature[:, place] += 1e-9 * curvature[:, place].sum(dim=1, keepdim=True)
+    return curvature
 
 
 def keep_scale(

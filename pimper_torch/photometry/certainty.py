@@ -7,8 +7,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.bilinear import Bilinear, Factors, equations_of_samples, step_along
-from pimper_torch.photometry.quadratics import apply_packed, congruence, diagonal, solve_packed
+from pimper_torch.photometry.bilinear import (
+    Bilinear,
+    Factors,
+    curvature_along,
+    equations_of_samples,
+    step_along,
+)
+from pimper_torch.photometry.quadratics import apply_packed, solve_packed
 from pimper_torch.records import Record
 
 # A normal whose standard error is this counts half.
@@ -52,7 +58,7 @@ def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
     moved = step_along(problem.manifold, A, slope, factors.shading)
     albedo, normals = problem.manifold.split(moved.mT)
     with torch.no_grad():
-        curvature = congruence(A, problem.manifold.tangents(factors.shading))
+        curvature = curvature_along(problem.manifold.tangents(factors.shading), A)
         error = _standard_error(problem, factors, curvature)
         half = math.radians(HALF_CONFIDENCE_DEG)
         confidence = 1 / (1 + (error / half) ** 2)
@@ -75,16 +81,15 @@ def fit_albedo(
 
     Not negative; zero where nothing is lit. Differentiable.
     """
-    channels = []
-    for channel in range(radiance.shape[2]):
-        light = channel % lights.shape[2]
+    channels, count = [], lights.shape[2]
+    for light in range(count):
         shading = lights[:, :, light] @ basis
         lit = weight[:, :, light] * shading
-        square = (lit * shading).sum(dim=1)
-        product = (lit * radiance[:, :, channel]).sum(dim=1)
+        square = (lit * shading).sum(dim=1)[:, None]
+        product = torch.einsum("pfk,pfck->pck", lit, radiance[:, :, light::count])
         some = square > torch.finfo(square.dtype).tiny ** 0.5
         channels.append(torch.where(some, product / torch.where(some, square, 1), 0))
-    return torch.stack(channels, dim=1).clamp_min(0)
+    return torch.cat(channels, dim=1).clamp_min(0)
 
 
 def light_varies(
@@ -107,8 +112,6 @@ def light_varies(
 def _standard_error(
     problem: Bilinear, factors: Factors, curvature: Float[Tensor, "patch 6 sample"]
 ) -> Float[Tensor, "patch sample"]:
-    damped = curvature.clone()
-    damped[:, diagonal(3)] += 1e-9 * curvature[:, diagonal(3)].sum(dim=1, keepdim=True)
     residual = problem.radiance - factors.lights @ factors.shading
     square = (factors.weight * residual**2).sum(dim=1)
     count = factors.weight.sum(dim=1)
@@ -121,7 +124,7 @@ def _standard_error(
     for place in (1, 2):
         unit = torch.zeros_like(factors.shading[:, :3])
         unit[:, place] = 1
-        variance = variance + solve_packed(damped, unit)[:, place]
+        variance = variance + solve_packed(curvature, unit)[:, place]
     albedo, _ = problem.manifold.split(factors.shading.mT)
     some = albedo > 0
     error = (spread * variance).clamp_min(0).sqrt() / torch.where(some, albedo, 1)

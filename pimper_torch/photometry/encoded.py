@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.low_rank import low_rank_problem
+from pimper_torch.photometry.low_rank import low_rank_problem, singular_left
 from pimper_torch.photometry.robust import cauchy_weights, spread
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import Response
@@ -119,11 +119,8 @@ def _start(
     """Fill what is missing by albedo times brightness, then by the best of the rank in turn."""
     gain = (mask * matrix).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp_min(1)
     level = (mask * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
-    filled = torch.where(mask > 0, matrix, gain * (mask * matrix).sum(dim=0, keepdim=True) / level)
-    for _ in range(_FILL_STEPS):
-        basis = torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:]
-        filled = torch.where(mask > 0, matrix, basis @ (basis.mT @ filled))
-    return basis
+    guess = gain * (mask * matrix).sum(dim=0, keepdim=True) / level
+    return singular_left(matrix[None], mask[None], rank, guess[None], _FILL_STEPS - 1)[0]
 
 
 def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:

@@ -61,17 +61,19 @@ def singular_left(
     matrix: Float[Tensor, "batch row column"],
     weight: Float[Tensor, "batch row column"],
     rank: int,
+    guess: Float[Tensor, "batch row column"] | None = None,
     fillings: int = 20,
 ) -> Float[Tensor, "batch row rank"]:
     """Start from the data: singular vectors of the matrix with its holes filled in.
 
-    Holes begin as the mean of their row and become, in turn, what the leading singular vectors
-    say. Orthonormal; in float64.
+    Holes begin as a guess, without one as the mean of their row, and become, in turn, what the
+    leading singular vectors say. Orthonormal; in float64.
     """
     seen = weight > 0
     known = torch.where(seen, matrix.double(), 0)
-    count = seen.sum(dim=2, keepdim=True).clamp_min(1)
-    filled = torch.where(seen, known, known.sum(dim=2, keepdim=True) / count)
+    if guess is None:
+        guess = known.sum(dim=2, keepdim=True) / seen.sum(dim=2, keepdim=True).clamp_min(1)
+    filled = torch.where(seen, known, guess.double())
     left = _leading(filled, rank)
     for _ in range(fillings):
         filled = torch.where(seen, known, left @ (left.mT @ filled))
