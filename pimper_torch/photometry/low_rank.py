@@ -35,7 +35,7 @@ def low_rank_problem(
             f"rank is {rank}; needed: between 1 and {min(rows, columns)} for matrices of "
             f"{rows} x {columns}."
         )
-    heavy = weight.double()
+    heavy = weight.double().contiguous()
     if not bool(((heavy >= 0) & heavy.isfinite()).all()):
         raise InputError("weights must be finite and not negative; found others.")
     seen = heavy > 0
@@ -44,7 +44,7 @@ def low_rank_problem(
         raise InputError(
             f"{count} entries with weight are not finite; needed: numbers. Give them weight 0."
         )
-    known = torch.where(seen, matrix.double(), 0)
+    known = torch.where(seen, matrix.double(), 0).contiguous()
     left = start.double()
     return Bilinear(
         radiance=known,

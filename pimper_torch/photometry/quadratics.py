@@ -127,28 +127,28 @@ class PackedCholesky:
             for j in range(i + 1):
                 total = entries[i, j]
                 for k in range(j):
-                    total = total - lower[i, k] * lower[j, k]
+                    total = torch.addcmul(total, lower[i, k], lower[j, k], value=-1)
                 lower[i, j] = torch.maximum(total, floor).sqrt() if i == j else total / lower[j, j]
 
     def solve(self, rhs: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch size item"]:
         """Give ``A^-1 b``, in the dtype of ``b``."""
-        solution = list(self.whiten(rhs).unbind(dim=-2))
+        solution = self.whiten(rhs.unbind(dim=-2))
         for i in reversed(range(self._size)):
             value = solution[i]
             for k in range(i + 1, self._size):
-                value = value - self._lower[k, i] * solution[k]
+                value = torch.addcmul(value, self._lower[k, i], solution[k], value=-1)
             solution[i] = value / self._lower[i, i]
         return torch.stack(solution, dim=-2).to(rhs.dtype)
 
-    def whiten(self, rhs: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch size item"]:
-        """Give ``C^-1 b`` in float64: products of such vectors are ``b^T A^-1 b'``."""
+    def whiten(self, rows: Sequence[Float[Tensor, "*batch item"]]) -> list[Tensor]:
+        """Give ``C^-1 b`` row by row in float64: products of such vectors are ``b^T A^-1 b'``."""
         forward: list[Tensor] = []
-        for i in range(self._size):
-            value = rhs[..., i, :].double()
+        for i, row in enumerate(rows):
+            value = row.double()
             for k in range(i):
-                value = value - self._lower[i, k] * forward[k]
+                value = torch.addcmul(value, self._lower[i, k], forward[k], value=-1)
             forward.append(value / self._lower[i, i])
-        return torch.stack(forward, dim=-2)
+        return forward
 
 
 def _triangle(size: int) -> tuple[list[int], list[int]]:

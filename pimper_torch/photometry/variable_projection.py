@@ -34,7 +34,7 @@ from pimper_torch.photometry.bilinear import (
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
 from pimper_torch.photometry.manifolds import Free
-from pimper_torch.photometry.quadratics import PackedCholesky, congruence
+from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record, StopCause
 
@@ -50,8 +50,8 @@ _FOLLOWING = 2
 # Residuals of so many roundings of the data are zero.
 _ROUNDINGS = 30.0
 
-# Entries of the Gauss-Newton matrices' factors that are held at once.
-_CHUNK_ENTRIES = 20_000_000
+# Products of views, over all samples of a patch, that are held at once.
+_GROUP_ENTRIES = 100_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -120,7 +120,7 @@ def curvature_of_lights(
         weight: Of each entry.
         samples: Sum over about so many, evenly chosen, in place of all.
     """
-    batch, views, rank = lights.shape
+    rank = lights.shape[2]
     stride = max(1, shading.shape[2] // samples) if samples else 1
     shading, weight = shading[:, :, ::stride], weight[:, :, ::stride]
     some = problem.replace(
@@ -129,14 +129,8 @@ def curvature_of_lights(
         shading=shading,
         prior=None if problem.prior is None else problem.prior[:, :, ::stride],
     )
-    normal = curvature_of_views(shading, weight)
-    white = _whitened(some, lights, shading, weight)
-    size = max(1, _CHUNK_ENTRIES // (batch * views * rank * white.shape[2]))
-    for first in range(0, shading.shape[2], size):
-        part = slice(first, first + size)
-        spread = white[:, :, None, :, part] * shading[:, None, :, None, part]
-        spread = spread.reshape(batch, views * rank, -1)
-        normal = normal - spread @ spread.mT
+    own = curvature_of_views(shading, weight)
+    normal = own - _explained(_whitened(some, lights, shading, weight), shading)
     pull = problem.pull[..., None].expand(-1, -1, rank).flatten(1)
     return stride * normal + torch.diag_embed(pull)
 
@@ -221,21 +215,45 @@ def _whitened(
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
-) -> Float[Tensor, "patch view tangent sample"]:
-    """Give ``C_k^-1 B_k^T l_f w_fk``, with ``C C^T`` the sample's own normal equations.
-
-    Products of such vectors over the tangents are what eliminating the sample subtracts.
-    """
+) -> list[Float[Tensor, "patch view sample"]]:
+    """Give ``C_k^-1 B_k^T l_f w_fk`` by tangents, ``C C^T`` the sample's normal equations."""
     packed, _ = equations_of_samples(problem, lights, weight)
-    size = lights.shape[2]
     if isinstance(problem.manifold, Free):
-        slopes = lights[..., None] * weight[:, :, None]
+        slopes = [light[..., None] * weight for light in lights.unbind(dim=2)]
     else:
         columns = problem.manifold.tangents(shading)
-        size = len(columns)
         packed = congruence(packed, columns)
-        slopes = torch.stack([(lights @ column) * weight for column in columns], dim=2)
-    return PackedCholesky(packed[:, None], size).whiten(slopes).to(lights)
+        slopes = [(lights @ column) * weight for column in columns]
+    white = PackedCholesky(packed[:, None], len(slopes)).whiten(slopes)
+    return [rows.to(lights) for rows in white]
+
+
+def _explained(
+    white: list[Float[Tensor, "patch view sample"]],
+    shading: Float[Tensor, "patch rank sample"],
+) -> Float[Tensor, "patch unknown unknown"]:
+    """Sum what eliminating each sample takes away: ``(n n^T) (x) (white^T white)``.
+
+    The product by views comes first, the small one by ``n n^T`` after it: several times less
+    arithmetic than their Kronecker product would take.
+    """
+    batch, views, samples = white[0].shape
+    rank = shading.shape[1]
+    pairs = outer(shading)
+    blocks = shading.new_zeros(batch, views, views, pairs.shape[1])
+    group = max(1, _GROUP_ENTRIES // (views * samples))
+    for view in range(0, views, group):
+        some = slice(view, view + group)
+        factors = [(rows[:, some, None], rows[:, None, view:]) for rows in white]
+        shared = torch.mul(*factors[0])
+        for factor in factors[1:]:
+            shared.addcmul_(*factor)
+        summed = shared.flatten(1, 2) @ pairs.mT
+        blocks[:, some, view:] = summed.reshape(*shared.shape[:3], -1)
+    upper = unpacked(blocks.flatten(1, 2).mT, rank).reshape(batch, views, views, rank, rank)
+    upper = upper.transpose(2, 3).reshape(batch, views * rank, views * rank)
+    place = torch.arange(views * rank, device=shading.device) // rank
+    return torch.where(place[:, None] <= place, upper, upper.mT)
 
 
 def _move(state: _State) -> Float[Tensor, "patch view rank"]:
