@@ -44,14 +44,25 @@ def differences_transposed(
 
 def solve_poisson(
     source: Float[Tensor, "*batch height width"],
+    weight_right: float = 1.0,
+    weight_down: float = 1.0,
+    anchor: float = 0.0,
 ) -> Float[Tensor, "*batch height width"]:
-    r"""Solve :math:`D^T D z = s` with mean zero, D the steps of :func:`differences`.
+    r"""Solve :math:`(D^T W D + a) z = s`, D the steps of :func:`differences`.
 
-    The mean of ``source``, which no ``z`` can produce, is ignored. Differentiable.
+    Args:
+        source: ``s``. Without anchor no ``z`` can produce its mean, which is ignored; ``z``
+            then has mean zero.
+        weight_right: Of all steps to the right.
+        weight_down: Of all steps down.
+        anchor: ``a`` of all samples, not negative.
+
+    Differentiable in ``source``.
     """
     height, width = source.shape[-2:]
     rows, cols = cosine_basis(height, source), cosine_basis(width, source)
-    stiffness = _stiffness(height, source)[:, None] + _stiffness(width, source)
+    across = weight_down * _stiffness(height, source)[:, None]
+    stiffness = across + weight_right * _stiffness(width, source) + anchor
     # No height answers to the mean; dividing it by infinity removes it.
     stiffness = stiffness.masked_fill(stiffness == 0, torch.inf)
     return rows.mT @ ((rows @ source @ cols.mT) / stiffness) @ cols

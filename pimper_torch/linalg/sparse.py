@@ -4,23 +4,18 @@ The one place that talks to cholespy (CHOLMOD underneath). Systems are factored 
 in float64 whatever the device and dtype of the tensors; solutions go back to both.
 """
 
-from typing import Any
-
 import numpy as np
 import torch
 from cholespy import CholeskySolverD, MatrixType
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import PimperError
+from pimper_torch.linalg.adjoint import solve_adjointly
+from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 
 # Above this the solution has fewer than three digits in float64; an exactly singular
 # matrix that survives elimination by rounding lands at 1e15 and more.
 _WORST_CONDITION = 1e13
-
-
-class SingularSystemError(PimperError):
-    """Linear equations that do not determine their unknowns."""
 
 
 class SparseCholesky:
@@ -55,7 +50,7 @@ class SparseCholesky:
         size: int,
         what: str = "the linear system",
     ) -> None:
-        self._rows, self._cols, self._values, self._what = rows, cols, values, what
+        self.rows, self.cols, self._values, self._what = rows, cols, values, what
         with torch.no_grad():
             matrix = torch.sparse_coo_tensor(
                 torch.stack([rows, cols]).cpu(),
@@ -67,7 +62,7 @@ class SparseCholesky:
             diagonal = torch.zeros(size, dtype=torch.float64)
             on = index[0] == index[1]
             diagonal[index[0, on]] = entries[on]
-            self._refuse_hopeless(entries, diagonal)
+            refuse_hopeless(entries, diagonal, what)
             # A unit diagonal makes the condition a property of the problem, not of its units.
             self._scale = diagonal.rsqrt()
             entries = entries * self._scale[index[0]] * self._scale[index[1]]
@@ -88,25 +83,7 @@ class SparseCholesky:
             SingularSystemError: The solution does not satisfy the equations to 1e-6 of the
                 right-hand side, or the right-hand side is not finite.
         """
-        solution: Tensor = _Solve.apply(self, self._values, rhs)  # type: ignore[no-untyped-call]
-        return solution
-
-    def _refuse_hopeless(
-        self, entries: Float[Tensor, " entry"], diagonal: Float[Tensor, " unknown"]
-    ) -> None:
-        if not bool(entries.isfinite().all()):
-            raise SingularSystemError(
-                f"{self._what} has {int((~entries.isfinite()).sum())} entries that are not "
-                "finite numbers; all must be. Look for zero weights or invalid samples in its "
-                "input."
-            )
-        empty = torch.nonzero(diagonal <= 0).flatten()
-        if len(empty):
-            raise SingularSystemError(
-                f"{self._what} leaves {len(empty)} of {len(diagonal)} unknowns without a "
-                f"positive diagonal (the first is unknown {int(empty[0])}); each needs at least "
-                "one equation with positive weight. Add data or a prior for them."
-            )
+        return solve_adjointly(self, self._values, rhs)
 
     def _factor(
         self, index: Int[Tensor, "2 entry"], entries: Float[Tensor, " entry"], size: int
@@ -142,7 +119,8 @@ class SparseCholesky:
             self._solver.solve(np.ascontiguousarray(scaled_rhs.numpy()), answer)
         return torch.from_numpy(answer)
 
-    def _checked_solve(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+    def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+        """Solve without a trace for autograd; the same errors."""
         columns = rhs.detach().double().cpu().reshape(rhs.shape[0], -1)
         scaled = columns * self._scale[:, None]
         answer = self._substitute(scaled)
@@ -189,31 +167,3 @@ def scatter_blocks(
     rows = (side * block_rows[:, None, None] + within[:, None]).expand(blocks.shape)
     cols = (side * block_cols[:, None, None] + within).expand(blocks.shape)
     return rows.reshape(-1), cols.reshape(-1), blocks.reshape(-1)
-
-
-class _Solve(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
-        factor: SparseCholesky,
-        values: Float[Tensor, " entry"],
-        rhs: Float[Tensor, "unknown ..."],
-    ) -> Float[Tensor, "unknown ..."]:
-        solution = factor._checked_solve(rhs)
-        ctx.factor = factor
-        ctx.save_for_backward(values, solution)
-        return solution
-
-    @staticmethod
-    def backward(
-        ctx: Any,  # noqa: ANN401
-        upstream: Float[Tensor, "unknown ..."],
-    ) -> tuple[None, Float[Tensor, " entry"] | None, Float[Tensor, "unknown ..."]]:
-        values, solution = ctx.saved_tensors
-        factor: SparseCholesky = ctx.factor
-        adjoint: Tensor = _Solve.apply(factor, values, upstream)  # type: ignore[no-untyped-call]
-        into_values = None
-        if ctx.needs_input_grad[1]:
-            products = adjoint[factor._rows] * solution[factor._cols]
-            into_values = -products.reshape(len(values), -1).sum(dim=1).to(values)
-        return None, into_values, adjoint

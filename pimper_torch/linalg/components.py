@@ -1,0 +1,93 @@
+"""Parts of a raster that hang together without any anchor: each has a free constant."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FreeComponents:
+    """Which pixels move together, free of all others.
+
+    Attributes:
+        pixel: Those of all free components, counted row by row.
+        component: Of each of these.
+        root: One pixel of each component.
+        size: Pixels of each component.
+    """
+
+    pixel: Int[Tensor, " member"]
+    component: Int[Tensor, " member"]
+    root: Int[Tensor, " component"]
+    size: Float[Tensor, " component"]
+
+    def centered(self, heights: Float[Tensor, " pixel"]) -> Float[Tensor, " pixel"]:
+        """Subtract from each free component its mean. Its own transpose; differentiable."""
+        if not len(self.root):
+            return heights
+        part = heights[self.pixel]
+        mean = heights.new_zeros(len(self.root)).index_add(0, self.component, part) / self.size
+        return heights.index_add(0, self.pixel, -mean[self.component])
+
+    def grounded(self, heights: Float[Tensor, " pixel"]) -> Float[Tensor, " pixel"]:
+        """Subtract from each free component the height of its root."""
+        part = heights[self.pixel] - heights[self.root][self.component]
+        return heights.index_copy(0, self.pixel, part)
+
+    def held(self, diagonal: Float[Tensor, " pixel"]) -> Float[Tensor, " pixel"]:
+        """Double the diagonal at one pixel of each free component, which makes it definite.
+
+        With a right-hand side of mean zero this holds that pixel at 0 and changes nothing else.
+        """
+        return diagonal.index_add(0, self.root, diagonal[self.root])
+
+
+def free_components(
+    right: Bool[Tensor, "height steps_right"],
+    down: Bool[Tensor, "steps_down width"],
+    anchored: Bool[Tensor, "height width"],
+) -> FreeComponents:
+    """Find the components without anchor; a pixel without any edge is none.
+
+    Args:
+        right: Whether a pixel and the next in its row hang together.
+        down: Whether it and the one below do.
+        anchored: Whether a pixel's height is known.
+    """
+    label = _labels(right, down, anchored.shape)
+    tied = torch.zeros_like(anchored)
+    tied[:, 1:] |= right
+    tied[:, :-1] |= right
+    tied[1:] |= down
+    tied[:-1] |= down
+    count = int(label.max()) + 1 if label.numel() else 0
+    held = anchored.new_zeros(count).index_put(
+        (label[anchored.reshape(-1)],), anchored.new_ones(())
+    )
+    pixel = (tied.reshape(-1) & ~held[label]).nonzero()[:, 0]
+    found, component = torch.unique(label[pixel], return_inverse=True)
+    root = pixel.new_full((len(found),), label.numel())
+    root = root.scatter_reduce(0, component, pixel, "amin")
+    size = torch.bincount(component, minlength=len(found)).double()
+    return FreeComponents(pixel=pixel, component=component, root=root, size=size)
+
+
+def _labels(
+    right: Bool[Tensor, "height steps_right"],
+    down: Bool[Tensor, "steps_down width"],
+    shape: tuple[int, ...],
+) -> Int[Tensor, " pixel"]:
+    count = shape[0] * shape[1]
+    if bool(right.all()) and bool(down.all()):
+        return torch.zeros(count, dtype=torch.long, device=right.device)
+    pixel = torch.arange(count, dtype=torch.int32).reshape(shape)
+    across, along = right.cpu(), down.cpu()
+    one = torch.cat([pixel[:, :-1][across], pixel[:-1][along]]).numpy()
+    other = torch.cat([pixel[:, 1:][across], pixel[1:][along]]).numpy()
+    graph = coo_array((one >= 0, (one, other)), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    return torch.from_numpy(label).long().to(right.device)

@@ -1,0 +1,162 @@
+"""One cycle of multigrid: an approximate inverse in time proportional to the unknowns.
+
+Coarse unknowns and matrices are found by scipy on the CPU, once; cycles run in torch on the
+device of the system. On the CPU products go through scipy all the same: torch's own compressed
+rows are 4 times slower there, see ``benchmarks/README.md``.
+"""
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from pimper_torch.linalg.aggregation import prolongation
+
+Product = Callable[[Tensor], Tensor]
+
+# So few unknowns are solved for by a dense inverse.
+_DENSE = 400
+
+# Coarsening that leaves more than this share of the unknowns is not worth its cycle.
+_WORTHWHILE = 0.8
+
+# Smoothing leaves alone what Chebyshev's polynomial expects of the coarse unknowns: the part
+# of the spectrum, [0, 2], below 2 / _SPAN.
+_SPAN = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Level:
+    """A matrix, how to smooth it and how to reach the next one."""
+
+    product: Product
+    inverse_diagonal: Float[Tensor, " unknown"]
+    prolong: Product | None
+    restrict: Product | None
+
+
+class Hierarchy:
+    """Levels of a symmetric positive definite matrix, cycled as a preconditioner.
+
+    Args:
+        matrix: In float64; both triangles.
+        device: Where cycles run.
+        product: Of the matrix, if there is a quicker way than its compressed rows.
+
+    The cycle is symmetric and positive definite, as conjugate gradients need it: two
+    Chebyshev-Jacobi steps before and after every coarser level.
+    """
+
+    def __init__(
+        self, matrix: csr_array, device: torch.device, product: Product | None = None
+    ) -> None:
+        self._levels: list[Level] = []
+        while True:
+            spread = prolongation(matrix) if matrix.shape[0] > _DENSE else None
+            if spread is not None and not 0 < spread.shape[1] < _WORTHWHILE * matrix.shape[0]:
+                spread = None
+            gather = None if spread is None else spread.T.tocsr()
+            self._levels.append(
+                Level(
+                    product=product or sparse_product(matrix, device),
+                    inverse_diagonal=torch.from_numpy(1 / dominant_diagonal(matrix)).to(device),
+                    prolong=None if spread is None else sparse_product(spread, device),
+                    restrict=None if gather is None else sparse_product(gather, device),
+                )
+            )
+            product = None
+            if spread is None:
+                break
+            matrix = gather @ (matrix @ spread)
+        small = matrix.shape[0] <= _DENSE
+        self._coarsest = _dense_inverse(matrix).to(device) if small else None
+
+    @property
+    def num_levels(self) -> int:
+        """The given matrix counted."""
+        return len(self._levels)
+
+    def precondition(self, residual: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+        """Apply the approximate inverse."""
+        return self._cycle(0, residual)
+
+    def with_product(self, product: Product, dominant: Float[Tensor, " unknown"]) -> "Hierarchy":
+        """Give a copy for a matrix not far from this one: only the finest level is new.
+
+        Args:
+            product: Of the new matrix.
+            dominant: As :func:`dominant_diagonal` gives it for the new matrix.
+        """
+        other = object.__new__(Hierarchy)
+        finest, *coarse = self._levels
+        finest = dataclasses.replace(finest, product=product, inverse_diagonal=1 / dominant)
+        other._levels, other._coarsest = [finest, *coarse], self._coarsest
+        return other
+
+    def _cycle(self, depth: int, residual: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+        level = self._levels[depth]
+        if level.prolong is None or level.restrict is None:
+            if self._coarsest is not None:
+                return self._coarsest @ residual
+            return _smooth(level, residual, None)
+        found = _smooth(level, residual, None)
+        coarse = self._cycle(depth + 1, level.restrict(residual - level.product(found)))
+        found += level.prolong(coarse)
+        return _smooth(level, residual, found)
+
+
+def sparse_product(matrix: csr_array, device: torch.device) -> Product:
+    """Give the product of a sparse matrix with vectors on a device."""
+    if device.type == "cpu":
+        return lambda vector: torch.from_numpy(matrix @ vector.numpy())
+    with warnings.catch_warnings():  # that compressed rows are in beta state
+        warnings.simplefilter("ignore", UserWarning)
+        moved = torch.sparse_csr_tensor(
+            torch.from_numpy(matrix.indptr),
+            torch.from_numpy(matrix.indices),
+            torch.from_numpy(matrix.data),
+            matrix.shape,
+            check_invariants=False,
+        ).to(device)
+    return lambda vector: moved @ vector
+
+
+def _smooth(
+    level: Level, residual: Float[Tensor, " unknown"], start: Float[Tensor, " unknown"] | None
+) -> Float[Tensor, " unknown"]:
+    """Take two Chebyshev steps of Jacobi's iteration towards A x = residual."""
+    center, radius = 1 + 1 / _SPAN, 1 - 1 / _SPAN
+    left = residual if start is None else residual - level.product(start)
+    step = level.inverse_diagonal * left
+    step /= center
+    left = left - level.product(step)
+    # Of the three-term recurrence of Chebyshev's polynomials, its second member.
+    gain = 1 / (2 * center / radius - radius / center)
+    found = step if start is None else start + step
+    found = torch.add(found, step, alpha=gain * radius / center)
+    return found.addcmul_(level.inverse_diagonal, left, value=2 * gain / radius)
+
+
+def dominant_diagonal(matrix: csr_array) -> np.ndarray:
+    """Give a diagonal with which Jacobi's iteration has a spectrum within [0, 2].
+
+    It is the matrix's own wherever that is diagonally dominant.
+    """
+    diagonal: np.ndarray = matrix.diagonal()
+    return np.maximum(diagonal, abs(matrix).sum(axis=1) / 2)
+
+
+def _dense_inverse(matrix: csr_array) -> Float[Tensor, "unknown unknown"]:
+    dense = torch.from_numpy(matrix.toarray())
+    scale = dense.diagonal().rsqrt()
+    values, vectors = torch.linalg.eigh(scale[:, None] * dense * scale)
+    # Rounding may turn what is nearly free round; the inverse must stay positive definite.
+    values = values.clamp_min(torch.finfo(torch.float64).eps)
+    half = scale[:, None] * vectors
+    return (half / values) @ half.mT

@@ -1,0 +1,334 @@
+r"""Least squares over a raster whose neighbours are tied by weighted steps.
+
+.. math:: \min_z \sum_e w_e (z_{e+} - z_{e-} - g_e)^2 + \sum_i a_i (z_i - c_i)^2
+
+over the edges ``e`` between a pixel and the next to the right or below. The matrix,
+:math:`D^T W D + \mathrm{diag}(a)`, is a graph Laplacian with anchors. A mask is weights that
+are zero: a pixel without edges and without anchor is outside, and gets 0.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.linalg.components import FreeComponents, free_components
+from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Iterate
+from pimper_torch.linalg.poisson import differences, differences_transposed
+from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.stencil import (
+    CholeskyRaster,
+    CosineRaster,
+    MultigridRaster,
+    RasterSolver,
+    Stencil,
+)
+
+Method = Literal["auto", "cholesky", "multigrid", "cosine"]
+
+# Up to here a factor is quicker than a hierarchy on the CPU, and its solutions are exact.
+_CHOLESKY_PIXELS = 20_000
+
+
+def edge_weights(
+    weight: Float[Tensor, "height width"],
+    pixel_width: float = 1.0,
+    pixel_height: float = 1.0,
+) -> tuple[Float[Tensor, "height steps_right"], Float[Tensor, "steps_down width"]]:
+    """Give the weights of steps from those of pixels.
+
+    Args:
+        weight: Of a pixel's slopes, per area; zero outside the mask.
+        pixel_width: Distance between neighbours in a row.
+        pixel_height: Distance between rows.
+
+    Returns:
+        Of steps to the right and down: the mean of both pixels, times the area over the squared
+        distance, as a step is a slope times a distance; zero where either pixel is outside.
+    """
+    inside = weight > 0
+    right = torch.where(inside[:, 1:] & inside[:, :-1], (weight[:, 1:] + weight[:, :-1]) / 2, 0)
+    down = torch.where(inside[1:] & inside[:-1], (weight[1:] + weight[:-1]) / 2, 0)
+    return right * (pixel_height / pixel_width), down * (pixel_width / pixel_height)
+
+
+def steps_from_slopes(
+    slope_right: Float[Tensor, "height width"],
+    slope_down: Float[Tensor, "height width"],
+    pixel_width: float = 1.0,
+    pixel_height: float = 1.0,
+) -> tuple[Float[Tensor, "height steps_right"], Float[Tensor, "steps_down width"]]:
+    """Give the steps between neighbours: the mean slope of both, right to second order."""
+    right = (slope_right[:, 1:] + slope_right[:, :-1]) * (pixel_width / 2)
+    return right, (slope_down[1:] + slope_down[:-1]) * (pixel_height / 2)
+
+
+class RasterSystem:
+    r"""The matrix :math:`D^T W D + \mathrm{diag}(a)` of a raster, prepared for many solves.
+
+    Args:
+        weight_right: Of the step from each pixel to the next in its row; not negative.
+        weight_down: Of the step to the row below.
+        anchor: ``a``, of each pixel's known height; not negative. None for no anchors.
+        method: ``"cholesky"``: exact, on the CPU; ``"multigrid"``: conjugate gradients, memory
+            and time grow with the pixels only; ``"cosine"``: one division, for full rectangles
+            with equal weights. ``"auto"`` takes the quickest that can.
+        free: What to do with pixels that hang together without any anchor, whose height has
+            a free constant: ``"mean_zero"`` gives each such component the mean 0, and ignores
+            the mean of its right-hand side; ``"refuse"`` raises.
+        tolerance: Of multigrid: of the error, in the energy norm, relative.
+        what: Names the system in errors.
+
+    Raises:
+        InputError: Weights that are negative or not finite; ``"cosine"`` where they differ.
+        SingularSystemError: Free constants, if they are to be refused.
+
+    Weights that vary over ten orders, holes, islands and single pixels are all in order. Heights
+    are float64 inside, and go back to the device and dtype of the right-hand side.
+
+    >>> system = RasterSystem(torch.ones(2, 1), torch.ones(1, 2))
+    >>> system.fit_steps(torch.ones(2, 1), torch.zeros(1, 2))
+    tensor([[-0.5000,  0.5000],
+            [-0.5000,  0.5000]])
+    """
+
+    def __init__(
+        self,
+        weight_right: Float[Tensor, "height steps_right"],
+        weight_down: Float[Tensor, "steps_down width"],
+        anchor: Float[Tensor, "height width"] | None = None,
+        *,
+        method: Method = "auto",
+        free: Literal["mean_zero", "refuse"] = "mean_zero",
+        tolerance: float = DEFAULT_TOLERANCE,
+        what: str = "the raster",
+    ) -> None:
+        self._wish, self._refuses = method, free == "refuse"
+        self._tolerance, self._what = tolerance, what
+        self._take(weight_right, weight_down, anchor, None)
+
+    @property
+    def method(self) -> str:
+        """The method that is used."""
+        return self._solver.method
+
+    @property
+    def anchored(self) -> Bool[Tensor, "height width"]:
+        """Whether a pixel's height is determined by anchors: not outside, and no constant free."""
+        fixed = self._inside.reshape(-1).index_fill(0, self._components.pixel, False)
+        return fixed.view(self._inside.shape)
+
+    def solve(
+        self, source: Float[Tensor, "*batch height width"]
+    ) -> Float[Tensor, "*batch height width"]:
+        r"""Solve :math:`(D^T W D + \mathrm{diag}(a)) z = s`.
+
+        Args:
+            source: ``s``; ignored outside, and its mean over each free component.
+
+        Differentiable in ``source`` and in all weights, any number of times, by one more solve
+        with the same factor or hierarchy. Anchors of free components get no gradient.
+
+        Raises:
+            SingularSystemError: No convergence, with iterations and residual.
+        """
+        found: Tensor = _RasterSolve.apply(self, *self._given, source)  # type: ignore[no-untyped-call]
+        return found
+
+    def fit_steps(
+        self,
+        right: Float[Tensor, "height steps_right"],
+        down: Float[Tensor, "steps_down width"],
+        heights: Float[Tensor, "height width"] | None = None,
+    ) -> Float[Tensor, "height width"]:
+        """Find the heights whose steps and anchored pixels come nearest to those given.
+
+        Args:
+            right: Wanted steps to the right; anything, NaN included, without weight.
+            down: Wanted steps down.
+            heights: Known heights, likewise where there is no anchor; None for zero.
+        """
+        weight_right, weight_down, anchor = self._given
+        source = differences_transposed(_times(weight_right, right), _times(weight_down, down))
+        if heights is not None:
+            source = source + _times(anchor, heights)
+        return self.solve(source).to(right)
+
+    def iterate(
+        self,
+        source: Float[Tensor, "height width"],
+        start: Float[Tensor, "height width"] | None = None,
+    ) -> Iterate:
+        """Solve once and say how; not differentiable.
+
+        Args:
+            source: As for :meth:`solve`.
+            start: Heights near the solution, such as those of the round before, save cycles.
+        """
+        with torch.no_grad():
+            diagonal, groups = self._stencil.diagonal, self._components
+            wanted = torch.where(self._inside, source.detach().to(diagonal), 0)
+            rhs = groups.centered(wanted.reshape(-1)).view(diagonal.shape)
+            near = None
+            if start is not None:
+                near = torch.where(self._inside, start.detach().to(diagonal), 0)
+                near = groups.grounded(near.reshape(-1)).view(diagonal.shape)
+            found = self._solver.iterate(rhs, near)
+            return dataclasses.replace(found, values=groups.centered(found.values))
+
+    def refreshed(
+        self,
+        weight_right: Float[Tensor, "height steps_right"],
+        weight_down: Float[Tensor, "steps_down width"],
+        anchor: Float[Tensor, "height width"] | None = None,
+    ) -> "RasterSystem":
+        """Prepare the same raster with other weights.
+
+        The coarse levels of multigrid are kept, as a slightly worse preconditioner, while
+        nearly all weights stay within a factor two of those they were made from: the usual
+        case in late rounds of reweighting. Else this is as a new system.
+        """
+        other = object.__new__(RasterSystem)
+        other._wish, other._refuses = self._wish, self._refuses
+        other._tolerance, other._what = self._tolerance, self._what
+        other._take(weight_right, weight_down, anchor, self)
+        return other
+
+    def _take(
+        self,
+        weight_right: Float[Tensor, "height steps_right"],
+        weight_down: Float[Tensor, "steps_down width"],
+        anchor: Float[Tensor, "height width"] | None,
+        former: "RasterSystem | None",
+    ) -> None:
+        if anchor is None:
+            anchor = weight_right.new_zeros(weight_right.shape[0], weight_down.shape[1])
+        self._given = (weight_right, weight_down, anchor)
+        self._refuse_unusable()
+        with torch.no_grad():
+            right, down, held = (part.detach().double().contiguous() for part in self._given)
+            tied = _row_sums(right, down) + held
+            self._inside = tied > 0
+            self._components = _components(right, down, held, former)
+            self._refuse_free()
+            diagonal = torch.where(self._inside, tied, 1).reshape(-1)
+            diagonal = self._components.held(diagonal).view(tied.shape)
+            self._stencil = Stencil(right=right, down=down, diagonal=diagonal)
+            kept = former._solver.refreshed(self._stencil) if former else None
+            self._solver: RasterSolver = kept or self._prepared(held)
+
+    def _refuse_unusable(self) -> None:
+        names = ("steps to the right", "steps down", "anchors")
+        for name, part in zip(names, self._given, strict=True):
+            bad = ~(part.detach().isfinite() & (part.detach() >= 0))
+            if bool(bad.any()):
+                first = [int(place) for place in bad.nonzero()[0]]
+                raise InputError(
+                    f"{self._what}: {int(bad.sum())} weights of {name} are negative or not "
+                    f"finite (the first at row {first[0]}, column {first[1]}); each must be 0 or "
+                    "more. Give weight 0 to what is not known."
+                )
+
+    def _refuse_free(self) -> None:
+        count = len(self._components.root)
+        if self._refuses and count:
+            raise SingularSystemError(
+                f"{self._what} has {count} components without any anchor "
+                f"({len(self._components.pixel)} of {self._inside.numel()} pixels), whose "
+                "heights have a free constant. Anchor a pixel of each, or ask for mean zero."
+            )
+
+    def _prepared(self, anchor: Float[Tensor, "height width"]) -> RasterSolver:
+        stencil = self._stencil
+        equal = all(
+            bool((part > 0).all() & (part == part[:1, :1]).all())
+            for part in (stencil.right, stencil.down)
+        ) and bool((anchor == anchor[:1, :1]).all())
+        if self._wish == "cosine" and not equal:
+            raise InputError(
+                f"{self._what}: the cosine transform was asked for, but the weights are not the "
+                "same everywhere, or some are 0. Use another method, or 'auto'."
+            )
+        if self._wish == "cosine" or (self._wish == "auto" and equal):
+            return CosineRaster(stencil, float(anchor[0, 0]))
+        small = anchor.numel() <= _CHOLESKY_PIXELS and anchor.device.type == "cpu"
+        if self._wish == "cholesky" or (self._wish == "auto" and small):
+            return CholeskyRaster(stencil, self._what)
+        return MultigridRaster(stencil, self._tolerance, self._what)
+
+
+def _components(
+    right: Float[Tensor, "height steps_right"],
+    down: Float[Tensor, "steps_down width"],
+    anchor: Float[Tensor, "height width"],
+    former: RasterSystem | None,
+) -> FreeComponents:
+    """Find the free components; those of the former weights where the same are positive."""
+    pattern = (right > 0, down > 0, anchor > 0)
+    if former is not None:
+        stencil, (_, _, held) = former._stencil, former._given
+        before = (stencil.right > 0, stencil.down > 0, held.detach() > 0)
+        if all(torch.equal(new, old) for new, old in zip(pattern, before, strict=True)):
+            return former._components
+    return free_components(*pattern)
+
+
+def _row_sums(
+    right: Float[Tensor, "height steps_right"], down: Float[Tensor, "steps_down width"]
+) -> Float[Tensor, "height width"]:
+    """Add up the weights of each pixel's edges."""
+    pad = torch.nn.functional.pad
+    across = pad(right, (1, 0)) + pad(right, (0, 1))
+    return across + pad(down, (0, 0, 1, 0)) + pad(down, (0, 0, 0, 1))
+
+
+def _times(weight: Float[Tensor, "..."], value: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Multiply in float64, so that nothing without weight matters."""
+    return weight.double() * torch.where(weight > 0, value, 0).double()
+
+
+class _RasterSolve(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
+        system: RasterSystem,
+        weight_right: Float[Tensor, "height steps_right"],
+        weight_down: Float[Tensor, "steps_down width"],
+        anchor: Float[Tensor, "height width"],
+        source: Float[Tensor, "*batch height width"],
+    ) -> Float[Tensor, "*batch height width"]:
+        rasters = source.reshape(-1, *anchor.shape)
+        found = [system.iterate(raster).values for raster in rasters]
+        heights = torch.stack(found).reshape(source.shape).to(source) if found else source.clone()
+        ctx.system = system
+        ctx.save_for_backward(weight_right, weight_down, anchor, heights)
+        return heights
+
+    @staticmethod
+    def backward(
+        ctx: Any,  # noqa: ANN401
+        upstream: Float[Tensor, "*batch height width"],
+    ) -> tuple[Float[Tensor, "..."] | None, ...]:
+        weight_right, weight_down, anchor, heights = ctx.saved_tensors
+        system: RasterSystem = ctx.system
+        adjoint: Tensor = _RasterSolve.apply(  # type: ignore[no-untyped-call]
+            system, weight_right, weight_down, anchor, upstream
+        )
+        into: list[Tensor | None] = [None, None, None]
+        if any(ctx.needs_input_grad[1:4]):
+            steps, adjoint_steps = differences(heights), differences(adjoint)
+            products = [
+                steps[0] * adjoint_steps[0],
+                steps[1] * adjoint_steps[1],
+                heights * adjoint * system.anchored,
+            ]
+            into = [
+                -product.reshape(-1, *given.shape).sum(dim=0).to(given)
+                for product, given in zip(
+                    products, (weight_right, weight_down, anchor), strict=True
+                )
+            ]
+        return None, *into, adjoint

@@ -1,0 +1,381 @@
+"""Weighted rasters against dense matrices and closed forms."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.linalg.poisson import differences, differences_transposed
+from pimper_torch.linalg.rasters import RasterSystem, edge_weights, steps_from_slopes
+from pimper_torch.linalg.singular import SingularSystemError
+
+
+@dataclass(frozen=True)
+class Weighted:
+    right: Tensor
+    down: Tensor
+    anchor: Tensor
+
+    @property
+    def shape(self):
+        return self.anchor.shape
+
+    def dense(self):
+        """Every edge adds its four entries, one by one."""
+        height, width = self.shape
+        index = torch.arange(height * width).reshape(height, width)
+        matrix = torch.diag(self.anchor.flatten())
+        for one, other, weight in (
+            (index[:, :-1], index[:, 1:], self.right),
+            (index[:-1], index[1:], self.down),
+        ):
+            for i, j, w in zip(one.flatten(), other.flatten(), weight.flatten(), strict=True):
+                matrix[i, i] += w
+                matrix[j, j] += w
+                matrix[i, j] -= w
+                matrix[j, i] -= w
+        return matrix
+
+
+def equal(height, width, anchor=0.0):
+    return Weighted(
+        right=torch.ones(height, width - 1, dtype=torch.float64),
+        down=torch.ones(height - 1, width, dtype=torch.float64),
+        anchor=torch.full((height, width), anchor, dtype=torch.float64),
+    )
+
+
+def masked(weighted, inside):
+    return Weighted(
+        right=weighted.right * (inside[:, 1:] & inside[:, :-1]),
+        down=weighted.down * (inside[1:] & inside[:-1]),
+        anchor=weighted.anchor * inside,
+    )
+
+
+def ragged(height, width):
+    """A disc with two holes, an island of 2 x 2 and a single pixel apart from it."""
+    row, col = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    inside = (row - height / 2) ** 2 + (col - width / 2) ** 2 < (0.4 * min(height, width)) ** 2
+    inside[height // 2 : height // 2 + 2, width // 2] = False
+    inside[height // 3, width // 3 : width // 3 + 3] = False
+    inside[:2, :2] = True
+    inside[0, -1] = True
+    return inside
+
+
+def jumping(height, width, generator, decades=8.0):
+    """Weights of every size, with no relation to their neighbours'."""
+
+    def some(*shape):
+        return 10 ** (-decades * torch.rand(shape, generator=generator, dtype=torch.float64))
+
+    return Weighted(
+        right=some(height, width - 1),
+        down=some(height - 1, width),
+        anchor=torch.zeros(height, width, dtype=torch.float64),
+    )
+
+
+def terraced(height, width, drop=1e-8):
+    """Plateaus tied to each other by next to nothing, as heights cut at depth edges are."""
+    row, col = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    level = ((col / 5).sin() * (row / 7).cos() * 3).floor()
+    weighted = equal(height, width)
+    return Weighted(
+        right=torch.where(level[:, 1:] != level[:, :-1], drop, weighted.right),
+        down=torch.where(level[1:] != level[:-1], drop, weighted.down),
+        anchor=weighted.anchor,
+    )
+
+
+METHODS = ["cholesky", "multigrid"]
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(6113)
+
+
+@pytest.fixture(params=["equal", "ragged", "terraced", "jumping", "strips", "empty"])
+def weighted(request, generator):
+    height, width = 27, 33
+    if request.param == "ragged":
+        return masked(equal(height, width), ragged(height, width))
+    if request.param == "terraced":
+        return masked(terraced(height, width), ragged(height, width))
+    if request.param == "jumping":
+        return jumping(height, width, generator)
+    if request.param == "strips":
+        strips = equal(height, width)
+        return Weighted(right=0 * strips.right, down=strips.down, anchor=strips.anchor)
+    return (
+        equal(height, width)
+        if request.param == "equal"
+        else masked(equal(height, width), torch.zeros(height, width, dtype=torch.bool))
+    )
+
+
+def system(weighted, **options):
+    return RasterSystem(weighted.right, weighted.down, weighted.anchor, **options)
+
+
+def applied(weighted, heights):
+    right, down = differences(heights)
+    image = differences_transposed(weighted.right * right, weighted.down * down)
+    return image + weighted.anchor * heights
+
+
+def random(generator, *shape):
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def component_means(weighted, heights):
+    """Move every height to the mean of those it hangs together with, by brute force."""
+    reach = ((weighted.dense() != 0) | torch.eye(heights.numel(), dtype=torch.bool)).double()
+    for _ in range(12):  # paths double in length
+        reach = (reach @ reach).sign()
+    return (reach @ heights.flatten() / reach.sum(dim=1)).reshape(heights.shape)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_heights_come_back_from_their_own_source_up_to_the_mean_of_each_part(
+    weighted, method, generator
+):
+    heights = random(generator, *weighted.shape)
+    found = system(weighted, method=method).solve(applied(weighted, heights))
+    expected = heights - component_means(weighted, heights)
+    # A plateau tied by 1e-8 amplifies the rounding of its source by as much.
+    assert_close(found, expected, atol=3e-6, rtol=0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_with_anchors_the_solution_is_that_of_the_dense_matrix(weighted, method, generator):
+    anchor = 0.1 * (torch.rand(weighted.shape, generator=generator) < 0.2).double()
+    anchor[:2, :2] = 1e-6  # an island held by next to nothing
+    held = Weighted(right=weighted.right, down=weighted.down, anchor=anchor)
+    matrix = held.dense()
+    inside = matrix.diagonal() > 0
+    joined = (component_means(held, (anchor > 0).double()) > 0).flatten()
+    source = random(generator, *weighted.shape)
+    found = system(held, method=method, free="mean_zero").solve(source).flatten()
+    dense = matrix[joined][:, joined]
+    scale = dense.diagonal().rsqrt()
+    dense = scale[:, None] * dense * scale
+    expected = scale * torch.linalg.solve(dense, scale * source.flatten()[joined])
+    apart = (found[joined] - expected).abs().max()
+    assert apart <= 1e-6 * expected.abs().max()
+    assert (found[~inside] == 0).all()
+
+
+@pytest.mark.parametrize("method", [*METHODS, "cosine"])
+@pytest.mark.parametrize("shape", [(24, 31), (1, 40), (40, 1), (1, 1)])
+def test_all_methods_agree_on_equal_weights(method, shape, generator):
+    weighted = equal(*shape, anchor=0.01)
+    scaled = Weighted(right=2 * weighted.right, down=5 * weighted.down, anchor=weighted.anchor)
+    source = random(generator, *shape)
+    found = system(scaled, method=method).solve(source)
+    expected = torch.linalg.solve(scaled.dense(), source.flatten()).reshape(shape)
+    assert_close(found, expected, rtol=1e-8, atol=1e-8)
+    assert system(scaled, method="auto").method == "cosine"
+
+
+def test_the_operator_is_symmetric_and_so_is_its_inverse(weighted, generator):
+    one, other = random(generator, 2, *weighted.shape)
+    assert_close((one * applied(weighted, other)).sum(), (other * applied(weighted, one)).sum())
+    solver = system(weighted, method="multigrid", tolerance=1e-13)
+    first, second = solver.solve(torch.stack([one, other]))
+    size = first.abs().max() * other.abs().max() * one.numel()
+    assert abs((first * other).sum() - (second * one).sum()) <= 1e-9 * size
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_quarter_turn_of_the_raster_turns_the_answer(method, generator):
+    weighted = masked(terraced(30, 22, drop=1e-4), ragged(30, 22))
+    source = random(generator, 30, 22)
+    found = system(weighted, method=method).solve(source)
+    # A turn by 90 degrees makes steps down of steps to the right and reverses the others.
+    turned = RasterSystem(weighted.down.rot90(), weighted.right.rot90(), method=method)
+    assert_close(turned.solve(source.rot90()), found.rot90(), rtol=1e-6, atol=1e-6)
+
+
+def bumps(x, y):
+    return torch.sin(3 * x) * torch.cos(2 * y) + x * y
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("aspect", [1, 3])
+def test_the_error_falls_as_the_spacing_squared(method, aspect):
+    """On a ring, whose border cuts through pixels, with pixels as wide as high, or not."""
+    errors = []
+    for count in (24, 48, 96):
+        width, height = 2 / count, 2 / count / aspect
+        x = torch.linspace(-1 + width / 2, 1 - width / 2, count, dtype=torch.float64)
+        y = torch.linspace(-1 + height / 2, 1 - height / 2, count * aspect, dtype=torch.float64)
+        y, x = torch.meshgrid(y, x, indexing="ij")
+        radius = (x**2 + y**2).sqrt()
+        weight = ((radius < 0.95) & (radius > 0.3)).double()
+        slopes = 3 * (3 * x).cos() * (2 * y).cos() + y, -2 * (3 * x).sin() * (2 * y).sin() + x
+        solver = RasterSystem(*edge_weights(weight, width, height), method=method)
+        found = solver.fit_steps(*steps_from_slopes(*slopes, width, height))
+        wanted = bumps(x, y) - (bumps(x, y) * weight).sum() / weight.sum()
+        errors.append(float(((found - wanted) * weight).abs().max()))
+    assert errors[0] / errors[1] > 3.4
+    assert errors[1] / errors[2] > 3.4
+
+
+def test_pixels_that_are_not_square_weigh_steps_by_the_area_over_the_squared_distance():
+    right, down = edge_weights(torch.tensor([[1.0, 3.0], [0.0, 5.0]]), 2.0, 1.0)
+    assert_close(right, torch.tensor([[1.0], [0.0]]))  # (1 + 3) / 2 * 2 / 4
+    assert_close(down, torch.tensor([[0.0, 8.0]]))  # (3 + 5) / 2 * 2 / 1
+
+
+def test_steps_without_weight_may_be_anything():
+    right, down = torch.ones(3, 3), torch.ones(2, 4)
+    right[0], down[0] = 0, 0
+    solver = RasterSystem(right, down)
+    steps = torch.where(right > 0, 1.0, torch.nan), torch.where(down > 0, 0.5, torch.inf)
+    expected = torch.tensor([[-1.75, -0.75, 0.25, 1.25], [-1.25, -0.25, 0.75, 1.75]])
+    assert_close(solver.fit_steps(*steps)[1:], expected)
+    assert (solver.fit_steps(*steps)[0] == 0).all()
+
+
+def test_known_heights_are_met_where_they_are_anchored():
+    right, down = torch.ones(5, 6), torch.ones(4, 7)
+    anchor = torch.zeros(5, 7)
+    anchor[0, 0] = anchor[4, 6] = 1e6
+    heights = torch.full((5, 7), torch.nan)
+    heights[0, 0], heights[4, 6] = 2.0, 7.0
+    found = RasterSystem(right, down, anchor).fit_steps(0 * right, 0 * down, heights)
+    assert_close(found[[0, 4], [0, 6]], torch.tensor([2.0, 7.0]), atol=1e-4, rtol=0)
+    assert ((found > 1.999) & (found < 7.001)).all()  # harmonic in between
+
+
+@pytest.mark.parametrize("method", [*METHODS, "cosine"])
+@pytest.mark.parametrize("held", [False, True])
+def test_gradients_reach_weights_anchors_and_source(method, held, generator):
+    weighted = equal(3, 4, anchor=0.3 if held else 0.0)
+    inputs = [weighted.right, weighted.down, weighted.anchor, random(generator, 2, 3, 4)]
+    if method != "cosine":
+        inputs[0] = 0.5 + torch.rand(3, 3, generator=generator, dtype=torch.float64)
+        inputs[0][0, 1] = inputs[1][0, 2] = 0
+    free = [inputs[0] > 0, inputs[1] > 0]
+    source = inputs[3].requires_grad_()
+    leaves = [part[where].requires_grad_() for part, where in zip(inputs, free, strict=False)]
+
+    def heights(right, down, source, anchor=weighted.anchor):
+        filled = [
+            torch.zeros(where.shape, dtype=torch.float64).masked_scatter(where, part)
+            for part, where in zip((right, down), free, strict=True)
+        ]
+        return RasterSystem(*filled, anchor, method=method, tolerance=1e-14).solve(source)
+
+    if method == "cosine":  # cannot be asked for weights a little off equal ones
+        solver = RasterSystem(*(part.detach() for part in inputs[:3]), method="cosine")
+        assert torch.autograd.gradcheck(solver.solve, [source])
+        leaf = [part.detach().requires_grad_() for part in inputs[:3]]
+        found = [
+            torch.autograd.grad(RasterSystem(*leaf, method=one).solve(source).pow(3).sum(), leaf)
+            for one in ("cosine", "cholesky")
+        ]
+        for first, second in zip(*found, strict=True):
+            assert_close(first, second)
+        return
+    assert torch.autograd.gradcheck(heights, [*leaves, source])
+    assert torch.autograd.gradgradcheck(heights, [*leaves, source], atol=1e-4)
+    if held:
+        anchor = weighted.anchor.clone().requires_grad_()
+        assert torch.autograd.gradcheck(
+            lambda anchor: heights(leaves[0], leaves[1], source, anchor), [anchor]
+        )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_float32_rasters_are_solved_in_float64(method, generator):
+    weighted = terraced(30, 30, drop=1e-3)
+    single = [part.float() for part in (weighted.right, weighted.down, weighted.anchor)]
+    source = applied(weighted, random(generator, 30, 30)).float()
+    found = RasterSystem(*single, method=method).solve(source)
+    assert found.dtype == torch.float32
+    exact = Weighted(*(part.double() for part in single))
+    expected = system(exact, method=method).solve(source.double())
+    assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_refreshed_weights_give_what_a_new_system_gives(generator):
+    weighted = masked(equal(60, 50), ragged(60, 50))
+    source = random(generator, 60, 50)
+    former = system(weighted, method="multigrid")
+    for spread in (0.05, 4.0):  # the hierarchy is kept, then not
+        factor = [
+            10 ** (spread * random(generator, *part.shape))
+            for part in (weighted.right, weighted.down)
+        ]
+        changed = weighted.right * factor[0], weighted.down * factor[1]
+        expected = RasterSystem(*changed, method="multigrid").solve(source)
+        assert_close(former.refreshed(*changed).solve(source), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_cuts_made_by_refreshing_are_seen(generator):
+    weighted = equal(30, 30)
+    cut = weighted.right.clone()
+    cut[:, 14] = 0
+    refreshed = system(weighted, method="multigrid").refreshed(cut, weighted.down)
+    found = refreshed.solve(random(generator, 30, 30))
+    assert_close(found[:, :15].mean(), torch.zeros((), dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+def test_a_start_near_the_solution_saves_cycles(generator):
+    weighted = terraced(120, 120)
+    solver = system(weighted, method="multigrid")
+    source = applied(weighted, random(generator, 120, 120))
+    cold = solver.iterate(source)
+    warm = solver.iterate(source, cold.values.view(120, 120) + 3.0)
+    assert warm.iterations < cold.iterations / 3
+    assert_close(warm.values, cold.values, atol=1e-4, rtol=0)
+
+
+def test_cycles_do_not_grow_with_jumps_or_size(generator):
+    cycles = [
+        system(weighted, method="multigrid").iterate(random(generator, *weighted.shape)).iterations
+        for weighted in (
+            equal(100, 100),
+            terraced(100, 100),
+            terraced(300, 300),
+            jumping(100, 100, generator),
+            jumping(300, 300, generator),
+        )
+    ]
+    assert max(cycles) <= 35, cycles  # 16 to 23 when written
+
+
+def test_refusals_say_what_is_wrong():
+    right, down = torch.ones(3, 3), torch.ones(2, 4)
+    bad = right.clone()
+    bad[1, 2] = torch.nan
+    with pytest.raises(InputError, match=r"the moon.*1 weights of steps to the right.*row 1"):
+        RasterSystem(bad, down, what="the moon")
+    with pytest.raises(InputError, match="anchors are negative"):
+        RasterSystem(right, down, torch.full((3, 4), -1.0))
+    with pytest.raises(SingularSystemError, match=r"1 components without any anchor \(12 of 12"):
+        RasterSystem(right, down, free="refuse")
+    with pytest.raises(InputError, match="not the same everywhere"):
+        RasterSystem(right * torch.tensor([1.0, 2, 3]), down, method="cosine")
+
+
+def test_a_solve_that_does_not_converge_says_how_far_it_came(generator, monkeypatch):
+    monkeypatch.setattr("pimper_torch.linalg.multigrid._MOST_CYCLES", 3)
+    solver = system(equal(100, 100), method="multigrid", what="the moon")
+    with pytest.raises(SingularSystemError, match=r"the moon.*after 3 iterations.*residual is"):
+        solver.solve(random(generator, 100, 100))
+
+
+def test_a_source_that_is_not_finite_is_refused():
+    source = torch.ones(30, 30)
+    source[3, 4] = torch.nan
+    for method in METHODS:
+        with pytest.raises(SingularSystemError):
+            RasterSystem(torch.ones(30, 29), torch.ones(29, 30), method=method).solve(source)
