@@ -8,14 +8,16 @@ both sides. That problem has many minima. It is solved by graduated non-convexit
 least squares :math:`\sigma` falls to its last value, and the weights then settle; every linear
 system is solved to the end, so where that leads does not depend on how.
 
-At a crease, and where something ends in front of something else, the slope changes on one step
-by more than beside it, and what normals predict there is wrong by up to that change. Such
-steps prove nothing about a jump, and are not asked: they, and all others that were given up,
-only tie. Parts that hang together by ties alone so lie where the mean of their border says.
+At a crease, and where something ends in front of something else, the slope along a step
+changes on it by more than beside it, and what normals predict there is wrong by up to that
+change. Where the slope across a step changes so, both sides rise differently and meet in one
+point at most. Such steps prove nothing, and are not asked: they, and all others that were
+given up, only tie. Parts that hang together by ties alone, whose places normals do not tell,
+so lie where the mean of their border says.
 
 Source: Black & Rangarajan, IJCV 19(1), 1996, for the loss and its graduation; the division in
 continuous parts and borders follows Milano, Chung, Ott & Siegwart, 2025, though here parts are
-what the weights leave together and never fixed. The treatment of kinks is ours.
+what the weights leave together and never fixed. Kinks and twists are ours.
 """
 
 from dataclasses import dataclass
@@ -34,6 +36,9 @@ from pimper_torch.records import Convergence, Record, StopCause
 
 # The first scale, in pixels, and by how much each round divides it.
 _FIRST_SCALE, _NARROWER = 3.0, 3.0
+
+# The twist at which a step starts with a quarter of its weight.
+_TWIST = 1.0
 
 # Of the linear systems' solutions, in their energy; what remains is far below any scale.
 _TOLERANCE = 1e-8
@@ -58,6 +63,7 @@ class DiscontinuityConfig:
             normals do not tear the surface.
         kink: A step whose slope changes by so much more than on the steps beside it is not
             asked about jumps; about the tangent of the angle of a crease.
+        twist: Likewise of the slope across the step, which no crease along the raster has.
         tie: Weight of steps that are given up or not asked.
         tolerance: Mean change of the weights at which they have settled.
         max_iterations: Linear systems at most.
@@ -66,12 +72,13 @@ class DiscontinuityConfig:
     scale_px: float = 0.3
     noise_scales: float = 6.0
     kink: float = 2.0
-    tie: float = 1e-3
+    twist: float = 1.0
+    tie: float = 1e-4
     tolerance: float = 3e-4
     max_iterations: int = 40
 
     def __post_init__(self) -> None:
-        for name in ("scale_px", "noise_scales", "kink", "tolerance"):
+        for name in ("scale_px", "noise_scales", "kink", "twist", "tolerance"):
             value = getattr(self, name)
             require(value > 0, name, value, "above 0")
         require(0 < self.tie < 1, "tie", self.tie, "in (0, 1)")
@@ -118,11 +125,15 @@ def find_discontinuities(
     """
     with torch.no_grad():
         inside = weight_right > 0, weight_down > 0
-        asked = (
-            steps.known_right & (steps.excess_right < config.kink) & inside[0],
-            steps.known_down & (steps.excess_down < config.kink) & inside[1],
+        calm = (
+            (steps.kink_right < config.kink) & (steps.twist_right < config.twist),
+            (steps.kink_down < config.kink) & (steps.twist_down < config.twist),
         )
-        share = inside[0].double(), inside[1].double()
+        asked = steps.known_right & calm[0] & inside[0], steps.known_down & calm[1] & inside[1]
+        share = (
+            torch.where(asked[0], 1.0, config.tie) * inside[0],
+            torch.where(asked[1], 1.0, config.tie) * inside[1],
+        )
         system, solution = None, None
         scale, cause = _FIRST_SCALE, StopCause.LIMIT
         for taken in range(1, config.max_iterations + 1):

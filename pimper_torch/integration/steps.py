@@ -41,9 +41,12 @@ class Steps(Record):
         down: From each pixel to that below.
         known_right: True where both pixels are inside with normals to be trusted.
         known_down: Likewise.
-        excess_right: By how much more the slope changes on the step than on those before and
-            after it: 0 on smooth surface, the size of its kink at a crease or an edge of depth.
-        excess_down: Likewise.
+        kink_right: By how much more the slope along the step changes on it than on those before
+            and after: 0 on smooth surface, the size of the kink at a crease or an edge of depth.
+        kink_down: Likewise.
+        twist_right: Likewise of the slope across the step, which changes where the surface
+            tears: the sides of a step that rise differently meet in one point at most.
+        twist_down: Likewise.
         unit_right: Change of the unknown on a step of slope 1.
         unit_down: Likewise.
         inside: The pixels.
@@ -55,8 +58,10 @@ class Steps(Record):
     down: Float[Tensor, "steps_down width"]
     known_right: Bool[Tensor, "height steps_right"]
     known_down: Bool[Tensor, "steps_down width"]
-    excess_right: Float[Tensor, "height steps_right"]
-    excess_down: Float[Tensor, "steps_down width"]
+    kink_right: Float[Tensor, "height steps_right"]
+    kink_down: Float[Tensor, "steps_down width"]
+    twist_right: Float[Tensor, "height steps_right"]
+    twist_down: Float[Tensor, "steps_down width"]
     unit_right: float
     unit_down: float
     inside: Bool[Tensor, "height width"]
@@ -170,16 +175,20 @@ def _steps(
     known = valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]
     inside = mask[:, 1:] & mask[:, :-1], mask[1:] & mask[:-1]
     across, along = slopes.unbind(dim=-1)
-    right, excess_right = _curved(*between[0](across[:, :-1], across[:, 1:]), known[0])
-    down, excess_down = _curved(*between[1](along.mT[:, :-1], along.mT[:, 1:]), known[1].mT)
+    right, kink_right = _curved(*between[0](across[:, :-1], across[:, 1:]), known[0])
+    down, kink_down = _curved(*between[1](along.mT[:, :-1], along.mT[:, 1:]), known[1].mT)
+    twist_right = _excess(along.diff(dim=1), known[0])
+    twist_down = _excess(across.diff(dim=0).mT, known[1].mT).mT
     return Steps(
         slopes=slopes,
         right=torch.where(inside[0], right, 0),
         down=torch.where(inside[1], down.mT, 0),
         known_right=known[0],
         known_down=known[1],
-        excess_right=excess_right,
-        excess_down=excess_down.mT,
+        kink_right=kink_right,
+        kink_down=kink_down.mT,
+        twist_right=twist_right,
+        twist_down=twist_down,
         unit_right=unit[0],
         unit_down=unit[1],
         inside=mask,
@@ -197,13 +206,30 @@ def _curved(
     The step between tangent planes is wrong by a twelfth of the surface's third derivative,
     which on a sphere adds up from pixel to pixel; how planes turn before and after tells it.
     """
-    has, wide = pad(known, (1, 1)), pad(torch.where(known, turn, 0), (1, 1))
-    before, after = wide[:, :-2], wide[:, 2:]
-    excess = (wide[:, 1:-1].abs() - torch.maximum(before.abs(), after.abs())).clamp_min(0)
+    before, after = _beside(turn, known)
+    has_before, has_after = _beside(known.to(turn), known)
+    kink = _excess(turn, known)
     bend = after - before
-    smooth = known & has[:, :-2] & has[:, 2:]
-    smooth = smooth & (bend.abs() < _SMOOTH_BEND) & (excess < _SMOOTH_EXCESS)
-    return step - torch.where(smooth, bend, 0) / 24, excess.detach()
+    smooth = known & (has_before * has_after > 0)
+    smooth = smooth & (bend.abs() < _SMOOTH_BEND) & (kink < _SMOOTH_EXCESS)
+    return step - torch.where(smooth, bend, 0) / 24, kink
+
+
+def _excess(
+    change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
+) -> Float[Tensor, "line step"]:
+    """Tell by how much more a slope changes on a step than beside it; no gradient."""
+    before, after = _beside(change.detach(), known)
+    beside = torch.maximum(before.abs(), after.abs())
+    return torch.where(known, (change.detach().abs() - beside).clamp_min(0), 0)
+
+
+def _beside(
+    change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
+) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
+    """Give the changes on the steps before and after each; 0 where those are not known."""
+    wide = pad(torch.where(known, change, 0), (1, 1))
+    return wide[:, :-2], wide[:, 2:]
 
 
 def _filled(

@@ -205,6 +205,19 @@ def test_depth_may_jump_where_the_surface_goes_round_the_jump(noise, bar):
     assert torn.continuity.convergence.converged.all()
 
 
+def test_stripes_that_rise_and_sink_come_apart_along_their_sides():
+    # From plain least squares alone every stripe looks flat: only the twist tells its sides.
+    x, y = centres(40, 48)
+    up = (torch.arange(48) // 8 % 2 == 0).expand(40, 48)
+    slope = torch.where(y > 0, 0.0, torch.where(up, 1.0, -1.0))
+    normals = torch.stack([torch.zeros_like(x), slope, -torch.ones_like(x)], dim=-1)
+    found = integrate_normal_map(normals)
+    assert misfit(found, slope * y) < 0.5
+    sides = found.continuity.right[:18, 7::8]
+    assert (sides < 0.01).all()
+    assert (found.continuity.down[:18] > 0.9).all()
+
+
 def test_noise_alone_does_not_tear_the_surface():
     generator = torch.Generator().manual_seed(8)
     wobble = 0.1 * torch.randn(2, 40, 40, generator=generator, dtype=torch.float64)

@@ -1,0 +1,213 @@
+"""Integration of normal maps: error and seconds, method by method.
+
+    python benchmarks/normal_integration.py FOLDER [--figure FILE]
+
+FOLDER holds ``diligent/NAME`` with ``normal_map.png, mask.png, K.txt, depth_gt.npz``, and next
+to it maps without depth, as the bilateral-integration set distributes them. The error is the
+mean absolute error of depth in mm after the scale that the median ratio gives; ``published`` is
+bilateral normal integration (Cao et al. 2022). ``weights from the truth`` solves once, with the
+robust weights at the true depth: what is left is in the normals themselves. Where there is no
+depth, the angle between the given normals and those of the surface found, over steps that it
+takes, tells whether creases survive.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import matplotlib as mpl
+import torch
+from matplotlib import pyplot as plt
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.datasets.diligent import NormalMap, read_normal_map
+from pimper_torch.integration.normal_map import IntegratedMap, integrate_normal_map
+from pimper_torch.integration.steps import orthographic_steps, perspective_steps
+from pimper_torch.linalg.rasters import RasterSystem
+
+PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1": 0.635}
+METHODS = ("frankot-chellappa", "cosine", "weighted", "discontinuities")
+# At the true depth residuals are noise and rounding; what is beyond is a jump.
+TRUE_SCALE_PX = 0.1
+
+
+def main() -> None:
+    """Print two tables, and draw the maps without depth."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args()
+    with_depth(options.folder / "diligent")
+    without = sorted(
+        path.parent for path in options.folder.glob("*/normal_map.png") if path.parent.is_dir()
+    )
+    without_depth(without, options.figure)
+
+
+def with_depth(folder: Path) -> None:
+    """Print errors and seconds where the depth is known."""
+    print("| method | " + " | ".join(PUBLISHED) + " | mean | s, all |")  # noqa: T201
+    print("|---|" + "--:|" * (len(PUBLISHED) + 2))  # noqa: T201
+    published = sum(PUBLISHED.values()) / len(PUBLISHED)
+    row("published", list(PUBLISHED.values()), published, "")
+    maps = {name: cropped(read_normal_map(folder / name)) for name in PUBLISHED}
+    for method in METHODS:
+        errors, began = [], time.perf_counter()
+        found = [integrate(one, method) for one in maps.values()]
+        seconds = time.perf_counter() - began
+        errors = [
+            depth_error(one, result.depth) for one, result in zip(maps.values(), found, strict=True)
+        ]
+        row(method, errors, sum(errors) / len(errors), f"{seconds:.1f}")
+    errors = [depth_error(one, with_true_weights(one)) for one in maps.values()]
+    row("weights from the truth", errors, sum(errors) / len(errors), "")
+    print()  # noqa: T201
+
+
+def row(name: str, errors: list[float], mean: float, seconds: str) -> None:
+    """Print one line."""
+    cells = " | ".join(f"{error:.3f}" for error in errors)
+    print(f"| {name} | {cells} | {mean:.3f} | {seconds} |", flush=True)  # noqa: T201
+
+
+def cropped(one: NormalMap) -> NormalMap:
+    """Cut a map to its mask."""
+    rows, columns = one.mask.any(dim=1).nonzero()[:, 0], one.mask.any(dim=0).nonzero()[:, 0]
+    part = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    K = one.intrinsics
+    if K is not None:
+        K = K.clone()
+        K[0, 2] -= int(columns[0])
+        K[1, 2] -= int(rows[0])
+    return one.replace(
+        normals=one.normals[part].double(),
+        mask=one.mask[part],
+        intrinsics=K,
+        depth=None if one.depth is None else one.depth[part].double(),
+    )
+
+
+def integrate(one: NormalMap, method: str) -> IntegratedMap:
+    """Integrate as a user would."""
+    return integrate_normal_map(one.normals, one.mask, intrinsics=one.intrinsics, method=method)
+
+
+def depth_error(one: NormalMap, depth: Tensor) -> float:
+    """Give the mean absolute error after the scale of the median ratio."""
+    assert one.depth is not None
+    true, found = one.depth[one.mask], depth[one.mask]
+    return float((found * (true / found).median() - true).abs().mean())
+
+
+def with_true_weights(one: NormalMap) -> Tensor:
+    """Solve with the weights that the true depth gives."""
+    assert one.depth is not None
+    assert one.intrinsics is not None
+    steps = perspective_steps(one.normals, one.mask, one.intrinsics)
+    unknown = torch.where(one.mask, one.depth, 1).log()
+    inside = (
+        one.mask[:, 1:] & one.mask[:, :-1],
+        one.mask[1:] & one.mask[:-1],
+    )
+    apart = (
+        unknown.diff(dim=1) / steps.unit_right - steps.right,
+        unknown.diff(dim=0) / steps.unit_down - steps.down,
+    )
+    weights = [
+        within * (1 + (residual / TRUE_SCALE_PX).square()).pow(-2).clamp_min(1e-6)
+        for residual, within in zip(apart, inside, strict=True)
+    ]
+    return RasterSystem(*weights).fit_steps(*steps.wanted).exp()
+
+
+def without_depth(folders: list[Path], figure: Path | None) -> None:
+    """Print how well the surface found has the normals given, and draw it."""
+    print("| map | method | steps given up % | normals, deg: mean | 99 % | s |")  # noqa: T201
+    print("|---|---|--:|--:|--:|--:|")  # noqa: T201
+    panels = []
+    for folder in folders:
+        one = cropped(read_normal_map(folder))
+        found = {}
+        for method in ("weighted", "discontinuities"):
+            began = time.perf_counter()
+            found[method] = result = integrate(one, method)
+            seconds = time.perf_counter() - began
+            angle = turned_by(one, result)
+            given_up = torch.nan
+            if result.continuity is not None:
+                shares = result.continuity.right, result.continuity.down
+                inside = torch.cat([share[share > 0] for share in shares])
+                given_up = 100 * float((inside < 0.25).double().mean())
+            print(  # noqa: T201
+                f"| {folder.name} | {method} | {given_up:.2f} | {float(angle.mean()):.2f} "
+                f"| {float(angle.quantile(0.99)):.2f} | {seconds:.1f} |",
+                flush=True,
+            )
+        panels.append((folder.name, one, found))
+    if figure is not None:
+        draw(panels, figure)
+
+
+def turned_by(one: NormalMap, found: IntegratedMap) -> Tensor:
+    """Give the angle between the normals given and those of the surface, by its own steps."""
+    depth, K = found.depth, one.intrinsics
+    unknown = depth if K is None else torch.where(one.mask, depth, 1).log()
+    if K is None:
+        steps = orthographic_steps(one.normals, one.mask)
+    else:
+        steps = perspective_steps(one.normals, one.mask, K)
+    across = unknown.diff(dim=1) / steps.unit_right
+    along = unknown.diff(dim=0) / steps.unit_down
+    kept = [steps.known_right, steps.known_down]
+    if found.continuity is not None:
+        kept[0] = kept[0] & (found.continuity.right > 0.25)
+        kept[1] = kept[1] & (found.continuity.down > 0.25)
+    slope = torch.stack([_mean_of_kept(across, kept[0], 1), _mean_of_kept(along, kept[1], 0)], -1)
+    own = normalize(torch.cat([slope, -torch.ones_like(slope[..., :1])], dim=-1), dim=-1)
+    given = normalize(torch.cat([steps.slopes, -torch.ones_like(slope[..., :1])], dim=-1), dim=-1)
+    cosine = (own * given).sum(dim=-1).clamp(-1, 1)
+    seen = slope.isfinite().all(dim=-1) & steps.valid
+    return cosine[seen].acos().rad2deg()
+
+
+def _mean_of_kept(steps: Tensor, kept: Tensor, axis: int) -> Tensor:
+    """Average the steps on both sides of a pixel that the surface takes; NaN without any."""
+    total = torch.where(kept, steps, 0)
+    shape = list(total.shape)
+    shape[axis] = 1
+    edge, none = total.new_zeros(shape), kept.new_zeros(shape)
+    summed = torch.cat([total, edge], dim=axis) + torch.cat([edge, total], dim=axis)
+    count = torch.cat([kept, none], dim=axis).int() + torch.cat([none, kept], dim=axis).int()
+    return summed / torch.where(count > 0, count, torch.nan)
+
+
+def draw(panels: list[tuple[str, NormalMap, dict[str, IntegratedMap]]], figure: Path) -> None:
+    """Draw normals, both surfaces, and the steps given up."""
+    mpl.use("Agg")
+    names = "normals", "least squares", "discontinuities", "steps given up"
+    canvas, axes = plt.subplots(len(panels), 4, figsize=(10, 2.2 * len(panels)), squeeze=False)
+    for line, (name, one, found) in zip(axes, panels, strict=True):
+        line[0].imshow(torch.where(one.mask[..., None], (one.normals + 1) / 2, 1).clamp(0, 1))
+        line[0].set_ylabel(name)
+        torn = found["discontinuities"]
+        for place, method in ((1, "weighted"), (2, "discontinuities")):
+            line[place].imshow(
+                torch.where(one.mask, found[method].depth, torch.nan), cmap="viridis"
+            )
+        assert torn.continuity is not None
+        lost = torch.zeros_like(torn.depth)
+        lost[:, 1:] += (torn.continuity.right < 0.25) & (torn.continuity.right > 0)
+        lost[1:] += (torn.continuity.down < 0.25) & (torn.continuity.down > 0)
+        line[3].imshow(torch.where(one.mask, lost.clamp_max(1), torch.nan), cmap="magma")
+        for panel in line:
+            panel.set_xticks([])
+            panel.set_yticks([])
+    for panel, title in zip(axes[0], names, strict=True):
+        panel.set_title(title, fontsize=9)
+    canvas.tight_layout()
+    canvas.savefig(figure, dpi=80)
+
+
+if __name__ == "__main__":
+    main()
