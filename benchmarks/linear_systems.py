@@ -4,7 +4,8 @@
 
 Every row is measured in a process of its own, so that peak memory is its own; it includes the
 0.3 GB that importing the package takes. Seconds are the best of three runs; of one for rivals
-and for more than a million unknowns. ``--products`` compares ways to multiply with the matrix instead.
+and for more than a million unknowns. ``--products`` compares ways to multiply with the matrix
+instead.
 """
 
 import argparse
