@@ -21,7 +21,7 @@ from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 # Of the error's energy norm next to the solution's. A digit costs one to two cycles.
 DEFAULT_TOLERANCE = 1e-10
 
-# The hardest weights of the benchmark take 30 cycles.
+# The hardest systems of the benchmark take 25 cycles.
 _MOST_CYCLES = 300
 
 # An answer whose residual, with the diagonal scaled to 1, is larger next to the right-hand

@@ -29,7 +29,8 @@ from pimper_torch.linalg.stencil import (
 
 Method = Literal["auto", "cholesky", "multigrid", "cosine"]
 
-# Up to here a factor is quicker than a hierarchy on the CPU, and its solutions are exact.
+# Here a factor takes twice as long to make as a hierarchy (0.17 s against 0.08 s) and a third
+# as long to use; below it is as quick in all, and its solutions are exact.
 _CHOLESKY_PIXELS = 20_000
 
 
