@@ -1,1 +1,1 @@
-"""Linear algebra the stages share: sparse systems, and Poisson's equation on rasters."""
+"""Linear algebra the stages share: least squares on rasters and meshes, and its solvers."""

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 # An entry is strong if it is at least this share of the largest of a row; compared by
-# iterations on weights that vary over 0 to 10 orders, where 0.1 takes up to 1.7 times as many.
+# iterations on weights that vary over 0 to 10 orders, where 0.1 takes up to 1.6 times as many.
 _STRONG = 0.25
 
 # An unknown whose neighbours make up less than this share of its diagonal is determined by its

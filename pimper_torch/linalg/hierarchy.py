@@ -2,7 +2,7 @@
 
 Coarse unknowns and matrices are found by scipy on the CPU, once; cycles run in torch on the
 device of the system. On the CPU products go through scipy all the same: torch's own compressed
-rows are 4 times slower there, see ``benchmarks/README.md``.
+rows take up to 4 times as long there for less than a million unknowns.
 """
 
 import dataclasses
@@ -29,6 +29,11 @@ _WORTHWHILE = 0.8
 # Smoothing leaves alone what Chebyshev's polynomial expects of the coarse unknowns: the part
 # of the spectrum, [0, 2], below 2 / _SPAN.
 _SPAN = 4
+
+# Coarse levels of other values are kept if none of them has left this factor. Measured: noise
+# of a factor 1.26 (one sigma) on weights over 8 decades takes 27 cycles instead of 16; one new
+# strong tie in a thousand makes all that is kept useless.
+_KEPT_FACTOR = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,9 +117,14 @@ class Hierarchy:
 
 
 def sparse_product(matrix: csr_array, device: torch.device) -> Product:
-    """Give the product of a sparse matrix with vectors on a device."""
+    """Give the product of a sparse matrix with vectors on a device, the quickest way."""
     if device.type == "cpu":
         return lambda vector: torch.from_numpy(matrix @ vector.numpy())
+    return torch_product(matrix, device)
+
+
+def torch_product(matrix: csr_array, device: torch.device) -> Product:
+    """Give the product by torch's own compressed rows."""
     with warnings.catch_warnings():  # that compressed rows are in beta state
         warnings.simplefilter("ignore", UserWarning)
         moved = torch.sparse_csr_tensor(
@@ -125,6 +135,13 @@ def sparse_product(matrix: csr_array, device: torch.device) -> Product:
             check_invariants=False,
         ).to(device)
     return lambda vector: moved @ vector
+
+
+def may_keep(new: Float[Tensor, "..."], old: Float[Tensor, "..."]) -> bool:
+    """Tell whether a hierarchy made from ``old`` entries serves for ``new`` ones."""
+    ordered = torch.minimum(new.abs(), old.abs()), torch.maximum(new.abs(), old.abs())
+    same_signs = bool((new.sign() == old.sign()).all())
+    return same_signs and bool((ordered[1] <= _KEPT_FACTOR * ordered[0]).all())
 
 
 def _smooth(

@@ -13,6 +13,7 @@ from pimper_torch.linalg.hierarchy import (
     Hierarchy,
     Product,
     dominant_diagonal,
+    may_keep,
     sparse_product,
 )
 from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
@@ -20,7 +21,7 @@ from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 # Of the error's energy norm next to the solution's. A digit costs one to two cycles.
 DEFAULT_TOLERANCE = 1e-10
 
-# The hardest weights of the benchmark take 30 cycles.
+# The hardest systems of the benchmark take 25 cycles.
 _MOST_CYCLES = 300
 
 # An answer whose residual, with the diagonal scaled to 1, is larger next to the right-hand
@@ -136,13 +137,10 @@ class Multigrid:
         what: str = "the linear system",
         tolerance: float = DEFAULT_TOLERANCE,
     ) -> None:
-        self.rows, self.cols = rows, cols
-        self._values, self._size, self._what, self._tolerance = values, size, what, tolerance
+        self.rows, self.cols, self._origin = rows, cols, values.detach()
+        self._size, self._what, self._tolerance = size, what, tolerance
         matrix = _compressed(rows, cols, values, size)
-        diagonal = torch.from_numpy(matrix.diagonal())
-        refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
-        self._diagonal = diagonal.to(values.device)
-        self._product = sparse_product(matrix, values.device)
+        self._take(matrix, values)
         self._hierarchy = Hierarchy(matrix, values.device, self._product)
 
     def solve(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
@@ -181,20 +179,26 @@ class Multigrid:
     def refreshed(self, values: Float[Tensor, " entry"]) -> "Multigrid":
         """Prepare the matrix with other values of the same entries.
 
-        Coarse levels are kept, and cycles are then a worse guess at the inverse: right where
-        values change by some ten percent, and wrong where they jump.
+        Coarse levels are kept while every value is within a factor two of the one they were
+        made from; else this is as a new matrix.
         """
+        new, old = values.detach(), self._origin
+        if not may_keep(new, old.to(new)):
+            return Multigrid(self.rows, self.cols, values, self._size, self._what, self._tolerance)
         other = object.__new__(Multigrid)
         other.__dict__.update(self.__dict__)
         matrix = _compressed(self.rows, self.cols, values, self._size)
-        diagonal = torch.from_numpy(matrix.diagonal())
-        refuse_hopeless(torch.from_numpy(matrix.data), diagonal, self._what)
-        other._values = values
-        other._diagonal = diagonal.to(values.device)
-        other._product = sparse_product(matrix, values.device)
+        other._take(matrix, values)
         dominant = torch.from_numpy(dominant_diagonal(matrix)).to(values.device)
         other._hierarchy = self._hierarchy.with_product(other._product, dominant)
         return other
+
+    def _take(self, matrix: csr_array, values: Float[Tensor, " entry"]) -> None:
+        diagonal = torch.from_numpy(matrix.diagonal())
+        refuse_hopeless(torch.from_numpy(matrix.data), diagonal, self._what)
+        self._values = values
+        self._diagonal = diagonal.to(values.device)
+        self._product = sparse_product(matrix, values.device)
 
 
 def _compressed(

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.geometry.lattice import Lattice
-from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.geometry.surfaces import face_pairs
+from pimper_torch.linalg.meshes import Elements, cotangent_laplacian, elements, lumped_mass
 from pimper_torch.records import Record
 
 # Fidelity, as a share of the usual, that ties what no patch supports to the flat facets: it
@@ -73,20 +73,16 @@ def assemble(
     Constant to autograd: it holds the geometry of the flat facets only.
     """
     weights = seam_weight(lattice.barycentric.double())
-    gradients, area = _elements(lattice)
-    share = (area * fidelity.double()[lattice.face_facet] / 3)[:, None].expand(-1, 3)
-    count = len(lattice.points)
-    mass = area.new_zeros(count).index_add(0, lattice.faces.flatten(), share.flatten())
+    mesh = _elements(lattice)
+    mass = lumped_mass(mesh, fidelity.double()[lattice.face_facet])
     mass = mass * (1 - weights) * torch.where(supported, 1, _TIE)
-    shape = torch.maximum(area, _LEAST_SHAPE * gradients.square().sum(-1).amax(dim=1))
-    smoothness = weights[lattice.faces].mean(dim=1) / (4 * shape)
-    blocks = smoothness[:, None, None] * (gradients @ gradients.mT)
-    rows, cols = lattice.faces[:, :, None], lattice.faces[:, None, :]
-    diagonal = torch.arange(count, device=mass.device)
+    seams = weights[lattice.faces].mean(dim=1)
+    rows, cols, values = cotangent_laplacian(mesh, seams, _LEAST_SHAPE)
+    diagonal = torch.arange(mesh.count, device=mass.device)
     return System(
-        rows=torch.cat([rows.expand_as(blocks).flatten(), diagonal]),
-        cols=torch.cat([cols.expand_as(blocks).flatten(), diagonal]),
-        values=torch.cat([blocks.flatten(), mass]),
+        rows=torch.cat([rows, diagonal]),
+        cols=torch.cat([cols, diagonal]),
+        values=torch.cat([values, mass]),
         mass=mass,
     )
 
@@ -141,7 +137,7 @@ def plane_pull(
     support keeps its shape.
     """
     weights = seam_weight(lattice.barycentric.double())
-    gradients, _ = _elements(lattice)
+    gradients = _elements(lattice).turned
     slope = trends[lattice.face_facet]
     pull = weights[lattice.faces].mean(dim=1)[:, None, None] / 2 * (gradients @ slope.mT)
     total = trends.new_zeros(len(lattice.points), 3)
@@ -163,14 +159,8 @@ def plane_pull(
     return total
 
 
-def _elements(lattice: Lattice) -> tuple[Float[Tensor, "face 3 3"], Float[Tensor, " face"]]:
-    """Give the hat functions' gradients times twice the area, and the areas."""
-    points = lattice.points.detach().double()
-    doubled = face_normals(points, lattice.faces)
-    corners = points[lattice.faces]
-    opposite = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
-    normal = normalize(doubled, dim=-1)[:, None].expand_as(opposite)
-    return torch.linalg.cross(normal, opposite), doubled.norm(dim=-1) / 2
+def _elements(lattice: Lattice) -> Elements:
+    return elements(lattice.points.detach().double(), lattice.faces)
 
 
 def _per_facet(

@@ -1,0 +1,104 @@
+r"""Linear finite elements on triangle meshes: gradient, divergence, Laplacian and mass.
+
+A function is its values at the vertices, linear on every face. With :math:`G` the gradient,
+:math:`A` the areas of the faces and :math:`w` a weight of each, the operators are tied by
+
+.. math:: \mathrm{div} = -G^T A, \qquad L = G^T A\, w\, G
+
+so that the least-squares fit of heights to slopes :math:`p`, :math:`\min \int w |\nabla z - p|^2`,
+is :math:`L z = -\mathrm{div}(w p)`: a graph Laplacian with half the cotangents of the angles
+opposite to an edge.
+
+Source: Dziuk, in Partial Differential Equations and Calculus of Variations, 1988.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.surfaces import face_normals
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Elements:
+    """The faces of a mesh as its functions see them.
+
+    Attributes:
+        faces: Vertices of each face.
+        turned: Of each corner, the gradient of the function that is 1 there and 0 at the
+            other two, times twice the area: the opposite edge, turned into the face.
+        area: Of each face.
+        count: Vertices of the mesh.
+    """
+
+    faces: Int[Tensor, "face 3"]
+    turned: Float[Tensor, "face 3 3"]
+    area: Float[Tensor, " face"]
+    count: int
+
+
+def elements(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> Elements:
+    """Measure the faces of a mesh; differentiable, and in the dtype of the vertices."""
+    doubled = face_normals(vertices, faces)
+    corners = vertices[faces]
+    opposite = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
+    normal = normalize(doubled, dim=-1)[:, None].expand_as(opposite)
+    return Elements(
+        faces=faces,
+        turned=torch.linalg.cross(normal, opposite),
+        area=doubled.norm(dim=-1) / 2,
+        count=len(vertices),
+    )
+
+
+def gradient(
+    mesh: Elements, values: Float[Tensor, "vertex channel"]
+) -> Float[Tensor, "face channel 3"]:
+    """Give the gradient on every face, within its plane; a face without area has none, NaN."""
+    return values[mesh.faces].mT @ mesh.turned / (2 * mesh.area)[:, None, None]
+
+
+def divergence(
+    mesh: Elements, field: Float[Tensor, "face channel 3"]
+) -> Float[Tensor, "vertex channel"]:
+    """Give what flows out round each vertex, times the area it stands for.
+
+    Minus the transpose of :func:`gradient` with areas as weights; nothing flows through the
+    border. Constant fields have none at vertices inside a plane.
+    """
+    flow = mesh.turned @ field.mT / -2
+    total = flow.new_zeros(mesh.count, field.shape[1])
+    return total.index_add(0, mesh.faces.flatten(), flow.flatten(0, 1))
+
+
+def cotangent_laplacian(
+    mesh: Elements, weight: Float[Tensor, " face"], least_shape: float = 0.0
+) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
+    r"""Give the entries of :math:`\int w \nabla \varphi_i \cdot \nabla \varphi_j`.
+
+    Args:
+        mesh: Its faces.
+        weight: Of each face.
+        least_shape: A needle's area is taken as at least this share of its longest edge
+            squared: its cotangents would otherwise spoil the condition of the whole matrix.
+
+    Returns:
+        Rows, columns and values; entries named twice add up. Positive semidefinite: constants
+        of a component are free. Differentiable in the weights and, through the elements, in
+        the vertices.
+    """
+    longest = mesh.turned.square().sum(-1).amax(dim=1)
+    shape = torch.maximum(mesh.area, least_shape * longest)
+    blocks = (weight / (4 * shape))[:, None, None] * (mesh.turned @ mesh.turned.mT)
+    rows = mesh.faces[:, :, None].expand_as(blocks)
+    cols = mesh.faces[:, None, :].expand_as(blocks)
+    return rows.flatten(), cols.flatten(), blocks.flatten()
+
+
+def lumped_mass(mesh: Elements, density: Float[Tensor, " face"]) -> Float[Tensor, " vertex"]:
+    """Give each vertex a third of the mass of every face round it."""
+    share = (mesh.area * density / 3)[:, None].expand(-1, 3)
+    return share.new_zeros(mesh.count).index_add(0, mesh.faces.flatten(), share.flatten())

@@ -1,0 +1,192 @@
+import numpy as np
+import pytest
+import torch
+from scipy.sparse import csr_array
+from torch.testing import assert_close
+
+from pimper_torch.linalg import hierarchy
+from pimper_torch.linalg.aggregation import prolongation
+from pimper_torch.linalg.hierarchy import Hierarchy, sparse_product
+from pimper_torch.linalg.multigrid import Multigrid
+from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.systems import prepare
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(6451)
+
+
+def random(generator, *shape):
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def entries(size, generator, decades=6.0, anchor=1e-3):
+    """A path with shortcuts, its weights of every size."""
+    start = torch.cat([torch.arange(size - 1), torch.randint(size, (size,), generator=generator)])
+    end = torch.cat([torch.arange(1, size), torch.randint(size, (size,), generator=generator)])
+    apart = start != end
+    start, end = start[apart], end[apart]
+    weight = 10 ** (-decades * torch.rand(len(start), generator=generator, dtype=torch.float64))
+    loop = torch.arange(size)
+    held = anchor * torch.rand(size, generator=generator, dtype=torch.float64)
+    rows = torch.cat([start, end, start, end, loop])
+    cols = torch.cat([start, end, end, start, loop])
+    return rows, cols, torch.cat([weight, weight, -weight, -weight, held])
+
+
+def compressed(rows, cols, values, size):
+    matrix = torch.zeros(size, size, dtype=torch.float64)
+    return csr_array(matrix.index_put((rows, cols), values, accumulate=True).numpy())
+
+
+@pytest.mark.parametrize("columns", [(), (2,), (0,), (2, 2)])
+def test_solutions_are_those_of_the_factor(columns, generator):
+    parts = entries(1500, generator)
+    rhs = random(generator, 1500, *columns)
+    found = Multigrid(*parts, size=1500).solve(rhs)
+    expected = SparseCholesky(*parts, size=1500).solve(rhs)
+    assert_close(found, expected, rtol=1e-6, atol=1e-6 * float(expected.abs().sum() > 0))
+
+
+def test_the_cycle_is_symmetric_and_positive(generator):
+    matrix = compressed(*entries(500, generator), 500)
+    cycle = Hierarchy(matrix, CPU)
+    assert cycle.num_levels > 1
+    inverse = torch.stack([cycle.precondition(unit) for unit in torch.eye(500).double()])
+    assert (inverse - inverse.T).abs().max() <= 1e-9 * inverse.abs().max()
+    assert torch.linalg.eigvalsh(inverse).min() > 0
+    # What is left after a cycle of a good one: the spectrum of M A is within (0, 1 + small].
+    spectrum = torch.linalg.eigvals(inverse @ torch.from_numpy(matrix.toarray())).real
+    assert spectrum.max() < 1.5
+    assert spectrum.min() > 0.02
+
+
+def test_constants_are_carried_to_the_coarse_unknowns_exactly(generator):
+    matrix = compressed(*entries(900, generator, anchor=0.0), 900)
+    spread = prolongation(matrix)
+    assert spread.shape[1] < 450
+    assert_close(torch.from_numpy(spread.sum(axis=1)), torch.ones(900).double())
+
+
+def test_unknowns_tied_to_nothing_are_no_coarse_unknowns():
+    matrix = csr_array(np.diag([1.0, 2.0, 3.0]))
+    assert prolongation(matrix).shape == (3, 0)
+    tied = np.array([[1.0, -1, 0, 0], [-1, 1, 0, 0], [0, 0, 5, -0.01], [0, 0, -0.01, 5]])
+    spread = prolongation(csr_array(tied)).toarray()
+    assert spread.shape == (4, 1)
+    assert (spread[2:] == 0).all()
+
+
+def test_a_light_unknown_follows_a_heavy_one_but_ties_no_two_heavy_ones():
+    """0 = 1 and 3 = 4 are heavy pairs; 2, light, hangs between 1 and 3."""
+    matrix = np.zeros((5, 5))
+    for one, other, weight in ((0, 1, 1.0), (1, 2, 1e-4), (2, 3, 2e-4), (3, 4, 1.0)):
+        matrix[[one, other], [one, other]] += weight
+        matrix[one, other] = matrix[other, one] = -weight
+    spread = prolongation(csr_array(matrix)).toarray()
+    assert spread.shape == (5, 2)
+    assert (spread.argmax(axis=1) == spread.argmax(axis=1)[[0, 0, 3, 3, 3]]).all()
+    assert spread.argmax(axis=1)[0] != spread.argmax(axis=1)[3]
+
+
+def test_a_matrix_that_smoothing_alone_solves_needs_no_levels(generator):
+    size = 3000
+    rows, cols, values = entries(size, generator, decades=1.0, anchor=0.0)
+    loop = torch.arange(size)
+    parts = (
+        torch.cat([rows, loop]),
+        torch.cat([cols, loop]),
+        torch.cat([values, torch.full((size,), 1e4, dtype=torch.float64)]),
+    )
+    system = Multigrid(*parts, size=size)
+    rhs = random(generator, size)
+    assert_close(system.solve(rhs), SparseCholesky(*parts, size=size).solve(rhs))
+    assert system.iterate(rhs).iterations < 8
+
+
+def test_torchs_compressed_rows_give_the_same_products(generator):
+    """What CUDA runs on, checked on the CPU."""
+    matrix = compressed(*entries(300, generator), 300)
+    vector = random(generator, 300)
+    assert_close(hierarchy.torch_product(matrix, CPU)(vector), sparse_product(matrix, CPU)(vector))
+
+
+def test_gradients_reach_matrix_and_right_hand_side(generator, monkeypatch):
+    monkeypatch.setattr(hierarchy, "_DENSE", 3)  # so that there are cycles to differentiate
+    rows, cols, values = entries(7, generator, decades=1.0, anchor=0.3)
+    assert Hierarchy(compressed(rows, cols, values, 7), CPU).num_levels > 1
+    rhs = random(generator, 7).requires_grad_()
+    half = (len(values) - 7) // 4
+    weight = values[:half].clone().requires_grad_()
+
+    def solve(weight, rhs):
+        filled = torch.cat([weight, weight, -weight, -weight, values[-7:]])
+        return Multigrid(rows, cols, filled, size=7, tolerance=1e-14).solve(rhs)
+
+    assert torch.autograd.gradcheck(solve, [weight, rhs])
+
+
+@pytest.mark.parametrize("spread", [0.2, 5.0])
+def test_refreshed_values_are_solved_for(spread, generator):
+    rows, cols, values = entries(1200, generator)
+    system = Multigrid(rows, cols, values, size=1200)
+    loose = 1 + spread * torch.rand(1200, generator=generator, dtype=torch.float64)
+    changed = values * loose[rows] * loose[cols]
+    assert hierarchy.may_keep(changed, values) == (spread < 1)
+    rhs = random(generator, 1200)
+    expected = SparseCholesky(rows, cols, changed, size=1200).solve(rhs)
+    assert_close(system.refreshed(changed).solve(rhs), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_levels_are_kept_only_for_values_near_those_they_were_made_from():
+    old = torch.tensor([1.0, -2.0, 0.0, 1e-8])
+    assert hierarchy.may_keep(torch.tensor([1.9, -1.1, 0.0, 1.5e-8]), old)
+    for place, value in ((0, 2.1), (1, -0.9), (1, 2.0), (2, 1e-9), (3, 0.0)):
+        new = old.clone()
+        new[place] = value
+        assert not hierarchy.may_keep(new, old)
+
+
+def test_float32_input_gets_a_float32_answer(generator):
+    rows, cols, values = entries(1200, generator, decades=2.0, anchor=1.0)
+    rhs = random(generator, 1200).float()
+    found = Multigrid(rows, cols, values.float(), size=1200).solve(rhs)
+    expected = SparseCholesky(rows, cols, values.float(), size=1200).solve(rhs)
+    assert found.dtype == torch.float32
+    assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_an_indefinite_matrix_is_refused_with_iterations_and_residual(generator):
+    rows, cols, values = entries(900, generator, decades=1.0, anchor=0.0)
+    loop = torch.arange(900)
+    shifted = torch.cat([values, torch.full((900,), -0.05, dtype=torch.float64)])
+    with pytest.raises(SingularSystemError, match=r"the seams.*after \d+ iterations"):
+        Multigrid(
+            torch.cat([rows, loop]), torch.cat([cols, loop]), shifted, 900, "the seams"
+        ).solve(random(generator, 900))
+
+
+def test_hopeless_entries_are_refused_as_by_the_factor():
+    index = torch.tensor([0, 2])
+    with pytest.raises(SingularSystemError, match="unknown 1"):
+        Multigrid(index, index, torch.ones(2), size=3)
+    with pytest.raises(SingularSystemError, match="finite"):
+        Multigrid(index[:1], index[:1], torch.tensor([torch.nan]), size=1)
+
+
+def test_the_method_suits_the_matrix(generator, monkeypatch):
+    monkeypatch.setattr("pimper_torch.linalg.systems._CHOLESKY_UNKNOWNS", 100)
+    rows, cols, values = entries(200, generator)
+    assert isinstance(prepare(rows, cols, values, 200), Multigrid)
+    loop = torch.arange(200)  # positive couplings, made definite
+    blocks = torch.cat([values.abs(), torch.full((200,), 50.0, dtype=torch.float64)])
+    whole = torch.cat([rows, loop]), torch.cat([cols, loop]), blocks
+    assert isinstance(prepare(*whole, 200), SparseCholesky)
+    assert isinstance(prepare(rows, cols, values, 200, method="cholesky"), SparseCholesky)
+    small = entries(50, generator)
+    assert isinstance(prepare(*small, 50), SparseCholesky)
+    assert isinstance(prepare(*small, 50, method="multigrid"), Multigrid)
