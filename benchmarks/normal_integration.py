@@ -23,7 +23,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.datasets.diligent import NormalMap, read_normal_map
 from pimper_torch.integration.normal_map import IntegratedMap, integrate_normal_map
-from pimper_torch.integration.steps import orthographic_steps, perspective_steps
+from pimper_torch.integration.steps import Steps, orthographic_steps, perspective_steps
 from pimper_torch.linalg.rasters import RasterSystem
 
 PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1": 0.635}
@@ -53,7 +53,7 @@ def with_depth(folder: Path) -> None:
     row("published", list(PUBLISHED.values()), published, "")
     maps = {name: cropped(read_normal_map(folder / name)) for name in PUBLISHED}
     for method in METHODS:
-        errors, began = [], time.perf_counter()
+        began = time.perf_counter()
         found = [integrate(one, method) for one in maps.values()]
         seconds = time.perf_counter() - began
         errors = [
@@ -62,6 +62,10 @@ def with_depth(folder: Path) -> None:
         row(method, errors, sum(errors) / len(errors), f"{seconds:.1f}")
     errors = [depth_error(one, with_true_weights(one)) for one in maps.values()]
     row("weights from the truth", errors, sum(errors) / len(errors), "")
+    print("\nMean by which true steps leave those of the normals, in thousandths of a pixel:")  # noqa: T201
+    for axis, name in enumerate(("right", "down")):
+        means = [1e3 * true_bias(one)[axis] for one in maps.values()]
+        print(name + ": " + ", ".join(f"{mean:.1f}" for mean in means))  # noqa: T201
     print()  # noqa: T201
 
 
@@ -102,23 +106,35 @@ def depth_error(one: NormalMap, depth: Tensor) -> float:
 
 def with_true_weights(one: NormalMap) -> Tensor:
     """Solve with the weights that the true depth gives."""
+    steps, _, weights = at_the_truth(one)
+    return RasterSystem(*weights).fit_steps(*steps.wanted).exp()
+
+
+def true_bias(one: NormalMap) -> list[float]:
+    """Give the mean residual of steps to the right and down at the true depth, jumps apart."""
+    _, apart, weights = at_the_truth(one)
+    return [
+        float((weight * residual).sum() / weight.sum())
+        for residual, weight in zip(apart, weights, strict=True)
+    ]
+
+
+def at_the_truth(one: NormalMap) -> tuple[Steps, list[Tensor], list[Tensor]]:
+    """Give the steps wanted, by how many pixels the true depth leaves them, and weights."""
     assert one.depth is not None
     assert one.intrinsics is not None
     steps = perspective_steps(one.normals, one.mask, one.intrinsics)
     unknown = torch.where(one.mask, one.depth, 1).log()
-    inside = (
-        one.mask[:, 1:] & one.mask[:, :-1],
-        one.mask[1:] & one.mask[:-1],
-    )
-    apart = (
-        unknown.diff(dim=1) / steps.unit_right - steps.right,
-        unknown.diff(dim=0) / steps.unit_down - steps.down,
-    )
+    inside = one.mask[:, 1:] & one.mask[:, :-1], one.mask[1:] & one.mask[:-1]
+    apart = [
+        torch.where(inside[0], unknown.diff(dim=1) / steps.unit_right - steps.right, 0),
+        torch.where(inside[1], unknown.diff(dim=0) / steps.unit_down - steps.down, 0),
+    ]
     weights = [
         within * (1 + (residual / TRUE_SCALE_PX).square()).pow(-2).clamp_min(1e-6)
         for residual, within in zip(apart, inside, strict=True)
     ]
-    return RasterSystem(*weights).fit_steps(*steps.wanted).exp()
+    return steps, apart, weights
 
 
 def without_depth(folders: list[Path], figure: Path | None) -> None:
