@@ -2,9 +2,10 @@
 
     python benchmarks/alignment.py [--facets 5000] [--side 60] [--noise 0.0] [--only METHOD]
 
-Facets of a subdivided icosahedron on the unit sphere; every patch has the sphere's relief in
-closed form, spoiled by a bas-relief transform of its own: tilts of 0.15, scales of a factor
-1.4, offsets of a fiftieth of an edge, one standard deviation each. ``--noise`` adds waves of
+Facets of a subdivided icosahedron on a sphere with bumps of a facet's size; every patch has
+the exact relief, spoiled by a bas-relief transform of its own: tilts of 0.15, scales of a
+factor 1.4, offsets of a fiftieth of an edge, one standard deviation each; ``--what scale``
+spoils scales only. ``--noise`` adds waves of
 a quarter edge's length to each patch, in shares of the relief's own root mean square. Times
 are the best of ``--repeat`` runs, memory is what the process holds above its size before.
 """
@@ -19,7 +20,7 @@ import trimesh
 from torch import Tensor
 
 from pimper_torch.alignment.align import Align, AlignConfig
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
@@ -34,9 +35,13 @@ from pimper_torch.records import (
     Templates,
 )
 
+# Wavelength over 2 pi and height of the bumps: a fold of 0.2 rad over an edge of 0.06.
+BUMP = (0.03, 0.004)
+
 METHODS: dict[str, AlignConfig] = {
     "bas-relief": AlignConfig(),
     "published": AlignConfig(offset=False, outlier=float("inf")),
+    "scale": AlignConfig(method="scale"),
 }
 
 
@@ -46,13 +51,17 @@ def main() -> None:
     parser.add_argument("--facets", type=int, default=5000)
     parser.add_argument("--side", type=int, default=60)
     parser.add_argument("--noise", type=float, default=0.0)
+    parser.add_argument("--what", choices=["bas-relief", "scale"], default="bas-relief")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--only", nargs="+", choices=list(METHODS), default=list(METHODS))
     options = parser.parse_args()
     generator = torch.Generator().manual_seed(0)
     patches = sphere_patches(options.facets, options.side)
-    truth = with_relief(patches, sphere_relief)
-    bad = spoil(truth, random_transforms(patches.num_patches, truth, generator))
+    truth = with_relief(patches, bumpy_relief)
+    transforms = random_transforms(patches.num_patches, truth, generator)
+    if options.what == "scale":
+        transforms[:, [0, 1, 3]] = 0
+    bad = spoil(truth, transforms)
     if options.noise > 0:
         bad = add_waves(bad, options.noise * rms(truth), generator)
     sizes = [bucket.depth.shape[1:] for bucket in patches.buckets]
@@ -85,7 +94,12 @@ def sphere_patches(facets: int, side: int) -> PatchSet:
     while 20 * 4**levels < facets:
         levels += 1
     ball = trimesh.creation.icosphere(subdivisions=levels)
-    vertices = torch.from_numpy(ball.vertices.copy()).float()
+    directions = torch.from_numpy(ball.vertices.copy())
+    vertices = directions
+    for _ in range(30):
+        ripple = torch.sin(vertices / BUMP[0]).sum(dim=1, keepdim=True)
+        vertices = directions * (1 + BUMP[1] * ripple) / 2 + vertices / 2
+    vertices = vertices.float()
     faces = torch.from_numpy(ball.faces.copy()).long()[:facets]
     edge = (vertices[faces[:, 0]] - vertices[faces[:, 1]]).norm(dim=-1).mean()
     overlap = 6.0
@@ -107,11 +121,22 @@ def sphere_patches(facets: int, side: int) -> PatchSet:
     return Decompose(DecomposeConfig(overlap_samples=overlap))(coarse, cameras)
 
 
-def sphere_relief(templates: Templates) -> Tensor:
-    """Give the near side of the unit sphere along each patch's z."""
-    center = transform(templates.patch_from_world, torch.zeros(1, 3))[:, None]
-    x, y, _ = (templates.points_patch - center).unbind(dim=-1)
-    return center[..., 2] - (1 - x**2 - y**2).clamp_min(0).sqrt()
+def bumpy_relief(templates: Templates) -> Tensor:
+    """Give the near side of a unit sphere with bumps, along each patch's z, by Newton's steps."""
+    world_from_patch = invert_rigid(templates.patch_from_world.double())
+    flat = templates.points_patch.double().flatten(1, 2)
+    along = world_from_patch[:, None, :3, 2]
+    depth = torch.zeros_like(flat[..., 0])
+    wave, height = BUMP
+    for _ in range(12):
+        points = transform(world_from_patch, torch.cat([flat[..., :2], depth[..., None]], dim=-1))
+        phase = points / wave
+        ripple = torch.sin(phase)
+        radius = points.norm(dim=-1)
+        gap = radius - 1 - height * ripple.sum(dim=-1)
+        slope = points / radius[..., None] - height / wave * torch.cos(phase)
+        depth = depth - gap / (slope * along).sum(dim=-1).clamp_max(-0.3)
+    return depth.reshape(templates.depth.shape).to(templates.depth)
 
 
 def with_relief(patches: PatchSet, relief: Callable[[Templates], Tensor]) -> DepthPatches:

@@ -14,7 +14,6 @@ from pimper_torch.alignment.anchors import (
     vertex_anchors,
 )
 from pimper_torch.alignment.overlaps import (
-    Overlaps,
     Seams,
     find_seams,
     meet_overlaps,
@@ -159,9 +158,10 @@ class Align(nn.Module):
     holds the common tilt and shift; without a prior, ``scale_limit`` alone would stop the
     flattening where reliefs have nothing in common.
 
-    *Who stays.* A patch that meets no neighbour stays as it is, on the mesh, and so does one
-    whose relief lies elsewhere than that of every neighbour it meets even after all;
-    their verdicts tell, an :class:`~pimper_torch.records.AlignVerdict` each.
+    *Who stays.* A patch that meets no neighbour stays on the mesh, where its own anchors
+    alone put it, and so does one whose relief lies elsewhere than that of every neighbour it
+    meets even after all; their verdicts tell, an :class:`~pimper_torch.records.AlignVerdict`
+    each. One without relief stays as it is.
 
     Rigid motions and the scale of the world change nothing. Differentiable in the depths
     through all rounds; which samples meet, and what they and the anchors weigh by distance,
@@ -203,43 +203,56 @@ class Align(nn.Module):
         transforms = identity.expand(patches.num_patches, 4)
         apart = []
         for done in range(config.rounds):
-            overlaps = meet_overlaps(seams, patches, depths.buckets, transforms * problem.in_scene)
-            if not bool(overlaps.met.any()):
+            pulls = self._met(problem, depths, transforms)
+            if not bool((pulls.weight > 0).any()):
                 return depths
-            pulls = self._pulls(problem, overlaps, transforms)
             apart.append(_root_mean_square(pulls, transforms))
             transforms = self._solve_round(pulls, transforms, fresh=done == 0)
             report(done + 1, config.rounds)
         with torch.no_grad():
-            verdict, _ = self._judged(problem, depths, transforms)
-            disputed = verdict == int(AlignVerdict.DISPUTED)
-        transforms = torch.where(disputed[:, None], identity, transforms)
+            pulls = self._met(problem, depths, transforms)
+            verdict = self._judged(pulls, transforms)
+        borne_out = (verdict == int(AlignVerdict.ALIGNED))[:, None]
+        on_mesh = self._on_mesh(problem, pulls, transforms)
+        transforms = torch.where(borne_out, transforms, on_mesh)
         with torch.no_grad():
-            _, left = self._judged(problem, depths, transforms)
-            mismatch = torch.stack([*apart, left]) * problem.unit
+            if not bool(borne_out.all()):
+                pulls = self._met(problem, depths, transforms)
+            mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * problem.unit
         return depths.replace(
             buckets=_apply(depths, transforms * problem.in_scene, verdict),
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
         )
 
-    def _judged(
-        self, problem: _Problem, depths: DepthPatches, transforms: Float[Tensor, "face 4"]
-    ) -> tuple[Int[Tensor, " face"], Float[Tensor, ""]]:
-        """Meet the overlaps once more: who is borne out, and how far reliefs are apart."""
-        overlaps = meet_overlaps(
-            problem.seams, problem.patches, depths.buckets, transforms * problem.in_scene
-        )
-        pulls = self._pulls(problem, overlaps, transforms)
+    def _judged(self, pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Int[Tensor, " face"]:
         met = pulls.weight > 0
         distance = mismatches(pulls, transforms).norm(dim=-1)
         reliable = reliable_seams(trust_by_distance(distance, met, self.config.outlier), met)
-        verdict = judge_patches(pulls.facets, met.any(dim=1), reliable, len(transforms))
-        return verdict, _root_mean_square(pulls, transforms)
+        return judge_patches(pulls.facets, met.any(dim=1), reliable, len(transforms))
 
-    def _pulls(
-        self, problem: _Problem, overlaps: Overlaps, transforms: Float[Tensor, "face 4"]
+    def _on_mesh(
+        self, problem: _Problem, pulls: Pulls, transforms: Float[Tensor, "face 4"]
+    ) -> Float[Tensor, "face 4"]:
+        """Put every relief where its own anchors alone have it, whatever its neighbours say."""
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
+        everyone = torch.ones_like(transforms[:, 0])
+        held = self._anchored(pulls, problem, _noise(pulls, distance), everyone)
+        nothing = torch.zeros_like(distance[:, 0]), torch.zeros_like(pulls.curvature)
+        found = torch.zeros_like(transforms).index_fill(1, everyone.new_tensor([2]).long(), 1)
+        for solve in range(_REWEIGHTINGS):
+            believed = held if solve == 0 else self._believed(held, found, distance)
+            found = solve_transforms(believed, found, *nothing)
+            found = _limit_scales(found, self.config.scale_limit)
+        return found
+
+    def _met(
+        self, problem: _Problem, depths: DepthPatches, transforms: Float[Tensor, "face 4"]
     ) -> Pulls:
+        """Meet the overlaps as transformed so far, and list what follows from that."""
         seams, unit = problem.seams, problem.unit
+        overlaps = meet_overlaps(
+            seams, problem.patches, depths.buckets, transforms * problem.in_scene
+        )
         met = overlaps.met.flatten(1)
         prior = unit.new_full((4,), self.config.prior)
         if self.config.method == "scale":
@@ -259,12 +272,10 @@ class Align(nn.Module):
             corner_weight=torch.zeros_like(corners[..., 0]),
             prior_weight=prior,
         )
-        with torch.no_grad():
-            distance = mismatches(pulls, transforms).norm(dim=-1)
-            noise = common_distance(distance, met) / 2**0.5 if bool(met.any()) else unit
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
         touching = seams.facets[met.any(dim=1)].flatten()
         moves = torch.zeros_like(corners[:, 0, 0]).index_fill(0, touching, 1)
-        return self._anchored(pulls, problem, noise, moves)
+        return self._anchored(pulls, problem, _noise(pulls, distance), moves)
 
     def _anchored(
         self,
@@ -343,6 +354,16 @@ class Align(nn.Module):
         stiffness = seam_stiffness(pulls.curvature, scales, _FLAT)
         apart = (pulls.weight * distance.square()).sum(dim=1)
         return stiffness, (stiffness.square() * apart)[:, None] * pulls.curvature * scales
+
+
+def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
+    """Estimate by how much one relief is off, from how far two are apart."""
+    met = pulls.weight > 0
+    return (
+        common_distance(distance, met) / 2**0.5
+        if bool(met.any())
+        else torch.ones_like(distance.sum())
+    )
 
 
 def _with_scales_held(pulls: Pulls) -> Pulls:
