@@ -30,6 +30,7 @@ from pimper_torch.alignment.system import (
 from pimper_torch.alignment.trust import (
     common_distance,
     judge_patches,
+    overlapping_seams,
     reliable_seams,
     trust_by_distance,
     trust_by_sides,
@@ -86,7 +87,7 @@ class AlignConfig:
     offset: bool = True
     curvature: bool = True
     rounds: int = 3
-    rows: int = 5
+    rows: int = 3
     columns: int = 12
     reach_samples: float = 5.0
     anchor: float = 1.0
@@ -228,7 +229,7 @@ class Align(nn.Module):
         met = pulls.weight > 0
         distance = mismatches(pulls, transforms).norm(dim=-1)
         reliable = reliable_seams(trust_by_distance(distance, met, self.config.outlier), met)
-        return judge_patches(pulls.facets, met.any(dim=1), reliable, len(transforms))
+        return judge_patches(pulls.facets, overlapping_seams(met), reliable, len(transforms))
 
     def _on_mesh(
         self, problem: _Problem, pulls: Pulls, transforms: Float[Tensor, "face 4"]

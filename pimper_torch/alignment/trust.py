@@ -21,7 +21,7 @@ _MET_ENOUGH = 0.25
 
 
 def common_distance(
-    distance: Float[Tensor, "seam ray"], met: Bool[Tensor, "seam ray"]
+    distance: Float[Tensor, "seam *ray"], met: Bool[Tensor, "seam *ray"]
 ) -> Float[Tensor, ""]:
     """Give the distance that half of all samples stay below, at least ``SAME_PLACE``."""
     return distance[met].median().clamp_min(SAME_PLACE)
@@ -59,18 +59,22 @@ def trust_by_sides(
     return 2 * torch.sigmoid(-_SIDES_SHARPNESS * worse)
 
 
+def overlapping_seams(met: Bool[Tensor, "seam ray"]) -> Bool[Tensor, " seam"]:
+    """Mark the seams whose two reliefs lie over each other for enough of their length."""
+    return met.sum(dim=1) >= _MET_ENOUGH * met.shape[1]
+
+
 def reliable_seams(
     trust: Float[Tensor, "seam ray"], met: Bool[Tensor, "seam ray"]
 ) -> Bool[Tensor, " seam"]:
-    """Mark the seams whose two reliefs lie in the same place, over enough of their length."""
-    count = met.sum(dim=1)
-    mean = (trust * met).sum(dim=1) / count.clamp_min(1)
-    return (count >= _MET_ENOUGH * met.shape[1]) & (mean >= _RELIABLE)
+    """Mark the overlapping seams whose two reliefs lie in the same place."""
+    mean = (trust * met).sum(dim=1) / met.sum(dim=1).clamp_min(1)
+    return overlapping_seams(met) & (mean >= _RELIABLE)
 
 
 def judge_patches(
     facets: Int[Tensor, "seam 2"],
-    met: Bool[Tensor, " seam"],
+    overlapping: Bool[Tensor, " seam"],
     reliable: Bool[Tensor, " seam"],
     count: int,
 ) -> Int[Tensor, " face"]:
@@ -78,11 +82,11 @@ def judge_patches(
 
     Args:
         facets: The two patches of each seam.
-        met: Whether their reliefs overlap at all.
+        overlapping: Whether their reliefs lie over each other.
         reliable: Whether they also agree.
         count: Patches.
     """
     verdict = torch.full((count,), int(AlignVerdict.ALONE), device=facets.device)
-    verdict[facets[met].flatten()] = int(AlignVerdict.DISPUTED)
-    verdict[facets[met & reliable].flatten()] = int(AlignVerdict.ALIGNED)
+    verdict[facets[overlapping].flatten()] = int(AlignVerdict.DISPUTED)
+    verdict[facets[overlapping & reliable].flatten()] = int(AlignVerdict.ALIGNED)
     return verdict

@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.lattice import Lattice
 from pimper_torch.geometry.surfaces import face_normals, face_pairs
 from pimper_torch.records import Record
+from pimper_torch.refinement.smoothness import charbonnier_weight
 
 # Fidelity, as a share of the usual, that ties what no patch supports to the flat facets: it
 # makes the system definite on an island without support, and is nothing elsewhere.
@@ -60,7 +61,10 @@ class System(Record):
 
 
 def assemble(
-    lattice: Lattice, fidelity: Float[Tensor, " facet"], supported: Bool[Tensor, " vertex"]
+    lattice: Lattice,
+    fidelity: Float[Tensor, " facet"],
+    supported: Bool[Tensor, " vertex"],
+    stiffness: Float[Tensor, " face"] | None = None,
 ) -> System:
     """Assemble the normal equations of the energy.
 
@@ -69,6 +73,7 @@ def assemble(
         fidelity: Lambda of each facet, 1/length^2.
         supported: Where the union is known. Elsewhere the mass is (nearly) zero, and the
             smoothness term alone fills S in.
+        stiffness: Multiplies G on each face; ``None`` is 1.
 
     Constant to autograd: it holds the geometry of the flat facets only.
     """
@@ -80,6 +85,8 @@ def assemble(
     mass = mass * (1 - weights) * torch.where(supported, 1, _TIE)
     shape = torch.maximum(area, _LEAST_SHAPE * gradients.square().sum(-1).amax(dim=1))
     smoothness = weights[lattice.faces].mean(dim=1) / (4 * shape)
+    if stiffness is not None:
+        smoothness = smoothness * stiffness
     blocks = smoothness[:, None, None] * (gradients @ gradients.mT)
     rows, cols = lattice.faces[:, :, None], lattice.faces[:, None, :]
     diagonal = torch.arange(count, device=mass.device)
@@ -126,7 +133,11 @@ def facet_trends(
 
 
 def plane_pull(
-    lattice: Lattice, trends: Float[Tensor, "facet 3 3"], fitted: Bool[Tensor, " facet"]
+    lattice: Lattice,
+    trends: Float[Tensor, "facet 3 3"],
+    fitted: Bool[Tensor, " facet"],
+    stiffness: Float[Tensor, " face"] | None = None,
+    crease: float = float("inf"),
 ) -> Float[Tensor, "vertex 3"]:
     r"""Give the right-hand side that keeps S from sliding along itself.
 
@@ -139,11 +150,22 @@ def plane_pull(
     what they are, whatever G does. Between two facets whose slope could not be fitted the
     crease stays as the coarse mesh has it, for want of anything better: an island without
     support keeps its shape.
+
+    Args:
+        lattice: What the energy is integrated over.
+        trends: J of every facet.
+        fitted: Whether it was fitted.
+        stiffness: What multiplies G on each face; ``None`` is 1.
+        crease: Half the jump of slope at a seam beyond which the crease there pulls no harder,
+            in the way of :func:`~pimper_torch.refinement.smoothness.charbonnier_weight`.
     """
     weights = seam_weight(lattice.barycentric.double())
     gradients, _ = _elements(lattice)
     slope = trends[lattice.face_facet]
-    pull = weights[lattice.faces].mean(dim=1)[:, None, None] / 2 * (gradients @ slope.mT)
+    held = weights[lattice.faces].mean(dim=1)
+    if stiffness is not None:
+        held = held * stiffness
+    pull = held[:, None, None] / 2 * (gradients @ slope.mT)
     total = trends.new_zeros(len(lattice.points), 3)
     total = total.index_add(0, lattice.faces.flatten(), pull.flatten(0, 1))
     on_border = (lattice.barycentric == 0).any(dim=1)[lattice.faces].sum(dim=1) >= 2
@@ -153,14 +175,22 @@ def plane_pull(
     facets = lattice.face_facet[faces]
     seam = (facets[:, 0] != facets[:, 1]) & fitted[facets].any(dim=1)
     faces, ends = faces[seam], ends[seam]
-    weight = weights[ends].mean(dim=1, keepdim=True) / 2
-    for face in faces.unbind(dim=1):
-        corners = lattice.faces[face]
-        opposite = (corners[:, :, None] != ends[:, None, :]).all(dim=-1)
-        inward = (opposite[..., None] * gradients[face]).sum(dim=1)
-        flux = weight * (slope[face] @ inward[..., None])[..., 0]
-        total = total.index_add(0, ends.flatten(), flux.repeat_interleave(2, dim=0))
-    return total
+    corners = lattice.faces[faces]
+    opposite = (corners[..., None] != ends[:, None, None, :]).all(dim=-1)
+    inward = (opposite[..., None] * gradients[faces]).sum(dim=2)
+    jump = (slope[faces] @ inward[..., None])[..., 0].sum(dim=1)  # times the edge's length
+    half = jump.norm(dim=1) / (2 * inward[:, 0].norm(dim=1))
+    weight = weights[ends].mean(dim=1) / 2 * charbonnier_weight(half, crease)
+    return total.index_add(0, ends.flatten(), (weight[:, None] * jump).repeat_interleave(2, dim=0))
+
+
+def face_slopes(lattice: Lattice, places: Float[Tensor, "vertex 3"]) -> Float[Tensor, "face 3 3"]:
+    """Give the gradient of places on every flat face: how it stretches and tilts the face."""
+    gradients, area = _elements(lattice)
+    corners = places.double()[lattice.faces]
+    return (
+        corners.mT @ gradients / (2 * area[:, None, None]).clamp_min(torch.finfo(area.dtype).tiny)
+    )
 
 
 def _elements(lattice: Lattice) -> tuple[Float[Tensor, "face 3 3"], Float[Tensor, " face"]]:
