@@ -21,7 +21,7 @@ _MET_ENOUGH = 0.25
 
 
 def common_distance(
-    distance: Float[Tensor, "seam *ray"], met: Bool[Tensor, "seam *ray"]
+    distance: Float[Tensor, "*sample"], met: Bool[Tensor, "*sample"]
 ) -> Float[Tensor, ""]:
     """Give the distance that half of all samples stay below, at least ``SAME_PLACE``."""
     return distance[met].median().clamp_min(SAME_PLACE)
