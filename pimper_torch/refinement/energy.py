@@ -185,12 +185,21 @@ def plane_pull(
 
 
 def face_slopes(lattice: Lattice, places: Float[Tensor, "vertex 3"]) -> Float[Tensor, "face 3 3"]:
-    """Give the gradient of places on every flat face: how it stretches and tilts the face."""
+    """Give the gradient of places on every flat face: how it stretches and tilts the face.
+
+    Directions out of the face's plane give zero. Differentiable in ``places``.
+    """
     gradients, area = _elements(lattice)
-    corners = places.double()[lattice.faces]
-    return (
-        corners.mT @ gradients / (2 * area[:, None, None]).clamp_min(torch.finfo(area.dtype).tiny)
-    )
+    doubled = (2 * area[:, None, None]).clamp_min(torch.finfo(area.dtype).tiny)
+    return places.double()[lattice.faces].mT @ gradients / doubled
+
+
+def trend_deviation(
+    lattice: Lattice, places: Float[Tensor, "vertex 3"], trends: Float[Tensor, "facet 3 3"]
+) -> Float[Tensor, " face"]:
+    r"""Give :math:`|\nabla S - J|` of every face, J the trend of its facet within its plane."""
+    trend = trends[lattice.face_facet] @ face_slopes(lattice, lattice.points)
+    return (face_slopes(lattice, places) - trend).flatten(1).norm(dim=1)
 
 
 def _elements(lattice: Lattice) -> tuple[Float[Tensor, "face 3 3"], Float[Tensor, " face"]]:

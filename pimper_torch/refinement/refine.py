@@ -13,7 +13,7 @@ from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import Convergence, DepthPatches, PatchSet, StopCause, Surface
-from pimper_torch.refinement.energy import assemble, face_slopes, facet_trends, plane_pull
+from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull, trend_deviation
 from pimper_torch.refinement.smoothness import reweighted
 from pimper_torch.refinement.union import Union, ray_directions, unite
 
@@ -150,8 +150,7 @@ class Refine(nn.Module):
             return factor.solve(rhs)
 
         def deviation(places: Float[Tensor, "vertex 3"]) -> Float[Tensor, " face"]:
-            off = face_slopes(lattice, places) - trends[lattice.face_facet]
-            return off.flatten(1).norm(dim=1)
+            return trend_deviation(lattice, places, trends)
 
         even = fidelity.new_ones(len(lattice.faces))
         if not robust:
