@@ -35,8 +35,8 @@ from pimper_torch.records import (
     Templates,
 )
 
-# Wavelength over 2 pi and height of the bumps: a fold of 0.2 rad over an edge of 0.06.
-BUMP = (0.03, 0.004)
+# Wavelength over 2 pi and height of the bumps: slopes of 0.3 over an edge of 0.06.
+BUMP = (0.03, 0.008)
 
 METHODS: dict[str, AlignConfig] = {
     "bas-relief": AlignConfig(),

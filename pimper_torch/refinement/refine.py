@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -108,7 +108,9 @@ class Refine(nn.Module):
         if not bool(union.supported.any()):
             union = union.replace(supported=torch.ones_like(union.supported))
         points = lattice.points + union.heights[:, None] * directions
-        refined, solves, cause = self._solve(lattice, points, union, spacing)
+        refined, solves, cause = smooth_seams(
+            lattice, points, union.supported, spacing, self.config
+        )
         vertices = refined.to(points)
         apart = (refined - points.double())[union.supported].detach()
         return Surface(
@@ -126,43 +128,57 @@ class Refine(nn.Module):
             ),
         )
 
-    def _solve(
-        self,
-        lattice: Lattice,
-        points: Float[Tensor, "vertex 3"],
-        union: Union,
-        spacing: Float[Tensor, " facet"],
-    ) -> tuple[Float[Tensor, "vertex 3"], int, StopCause]:
-        config = self.config
-        fidelity = (config.smoothing_radius_samples * spacing.double()) ** -2
-        robust = config.smoothness == "robust"
-        trends, fitted = facet_trends(lattice, points, union.supported, len(spacing))
-        crease = config.crease if robust else torch.inf
 
-        def solve(stiffness: Float[Tensor, " face"]) -> Float[Tensor, "vertex 3"]:
-            system = assemble(lattice, fidelity, union.supported, stiffness)
-            rhs = system.mass[:, None] * points.double()
-            if config.hold_planes:
-                rhs = rhs + plane_pull(lattice, trends, fitted, stiffness, crease)
-            factor = SparseCholesky(
-                system.rows, system.cols, system.values, size=len(points), what="the refinement"
-            )
-            return factor.solve(rhs)
+def smooth_seams(
+    lattice: Lattice,
+    points: Float[Tensor, "vertex 3"],
+    supported: Bool[Tensor, " vertex"],
+    spacing: Float[Tensor, " facet"],
+    config: RefineConfig,
+) -> tuple[Float[Tensor, "vertex 3"], int, StopCause]:
+    """Minimise the energy over the lattice.
 
-        def deviation(places: Float[Tensor, "vertex 3"]) -> Float[Tensor, " face"]:
-            return trend_deviation(lattice, places, trends)
+    Args:
+        lattice: The flat facets, subdivided.
+        points: The union: where the patches have each vertex.
+        supported: Where they have it anywhere.
+        spacing: Of each facet's vertices, scene units; the radius is counted in it.
+        config: Radius, smoothness and whether planes are held.
 
-        even = fidelity.new_ones(len(lattice.faces))
-        if not robust:
-            return solve(even), 1, StopCause.CONVERGED
-        return reweighted(
-            solve,
-            deviation,
-            even,
-            scale=config.crease,
-            tolerance=_SETTLED * spacing.double().median(),
-            limit=_MOST_SOLVES,
+    Returns:
+        The places in float64, how many systems were solved, and why that ended.
+
+    Differentiable in ``points``; see :class:`Refine`.
+    """
+    fidelity = (config.smoothing_radius_samples * spacing.double()) ** -2
+    robust = config.smoothness == "robust"
+    trends, fitted = facet_trends(lattice, points, supported, len(spacing))
+    crease = config.crease if robust else torch.inf
+
+    def solve(stiffness: Float[Tensor, " face"]) -> Float[Tensor, "vertex 3"]:
+        system = assemble(lattice, fidelity, supported, stiffness)
+        rhs = system.mass[:, None] * points.double()
+        if config.hold_planes:
+            rhs = rhs + plane_pull(lattice, trends, fitted, stiffness, crease)
+        factor = SparseCholesky(
+            system.rows, system.cols, system.values, size=len(points), what="the refinement"
         )
+        return factor.solve(rhs)
+
+    def deviation(places: Float[Tensor, "vertex 3"]) -> Float[Tensor, " face"]:
+        return trend_deviation(lattice, places, trends)
+
+    even = fidelity.new_ones(len(lattice.faces))
+    if not robust:
+        return solve(even), 1, StopCause.CONVERGED
+    return reweighted(
+        solve,
+        deviation,
+        even,
+        scale=config.crease,
+        tolerance=_SETTLED * spacing.double().median(),
+        limit=_MOST_SOLVES,
+    )
 
 
 def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
