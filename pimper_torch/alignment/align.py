@@ -48,7 +48,8 @@ _FLAT = 3e-3
 # Vertices that were filled in between points of the cloud are guesses.
 _FILLED_VERTEX = 0.1
 
-# Solves within one round, so that weights that depend on the answer settle.
+# Solves within the first round, so that weights that depend on the answer settle; later
+# rounds begin nearer to it and take one less.
 _REWEIGHTINGS = 3
 
 
@@ -214,11 +215,12 @@ class Align(nn.Module):
             pulls = self._met(problem, depths, transforms)
             verdict = self._judged(pulls, transforms)
         borne_out = (verdict == int(AlignVerdict.ALIGNED))[:, None]
-        on_mesh = self._on_mesh(problem, pulls, transforms)
-        transforms = torch.where(borne_out, transforms, on_mesh)
-        with torch.no_grad():
-            if not bool(borne_out.all()):
+        if not bool(borne_out.all()):
+            on_mesh = self._on_mesh(problem, pulls, transforms)
+            transforms = torch.where(borne_out, transforms, on_mesh)
+            with torch.no_grad():
                 pulls = self._met(problem, depths, transforms)
+        with torch.no_grad():
             mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * problem.unit
         return depths.replace(
             buckets=_apply(depths, transforms * problem.in_scene, verdict),
@@ -309,7 +311,7 @@ class Align(nn.Module):
     def _solve_round(
         self, pulls: Pulls, transforms: Float[Tensor, "face 4"], fresh: bool
     ) -> Float[Tensor, "face 4"]:
-        for solve in range(_REWEIGHTINGS):
+        for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
             distance = mismatches(pulls, transforms).norm(dim=-1)
             # Before scales have been tried no disagreement is an outlier's fault.
             system = pulls if fresh and solve < 2 else self._believed(pulls, transforms, distance)

@@ -83,8 +83,11 @@ def _anchors(
     samples = points_world.new_zeros(len(facet), 3).double()
     heights, variance = torch.zeros_like(samples[:, 0]), torch.zeros_like(samples[:, 0])
     known = torch.zeros_like(facet, dtype=torch.bool)
+    order = facet.argsort(stable=True)
+    in_order = facet[order]
     for templates, depths in zip(patches.buckets, buckets, strict=True):
-        which, patch, slot = _members(facet, templates)
+        place, patch, slot = _members(in_order, templates)
+        which = order[place]
         if len(which) == 0:
             continue
         table = which.new_zeros(len(templates.facet), int(slot.max()) + 1)
@@ -110,14 +113,17 @@ def _anchors(
 
 
 def _members(
-    facet: Int[Tensor, " anchor"], templates: Templates
+    in_order: Int[Tensor, " anchor"], templates: Templates
 ) -> tuple[Int[Tensor, " member"], Int[Tensor, " member"], Int[Tensor, " member"]]:
-    """List the anchors of a bucket, the patch of each, and a place among that patch's own."""
-    which = torch.isin(facet, templates.facet).nonzero()[:, 0]
-    order = templates.facet.argsort()
-    patch = order[torch.searchsorted(templates.facet[order], facet[which])]
-    by_patch = patch.argsort(stable=True)
-    which, patch = which[by_patch], patch[by_patch]
-    counts = torch.bincount(patch, minlength=len(templates.facet))
+    """List the anchors of a bucket, the patch of each, and a number among that patch's own.
+
+    Args:
+        in_order: Facets of all anchors, ascending.
+        templates: The bucket.
+    """
+    start = torch.searchsorted(in_order, templates.facet)
+    counts = torch.searchsorted(in_order, templates.facet, right=True) - start
+    patch = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
     first = counts.cumsum(dim=0) - counts
-    return which, patch, torch.arange(len(which), device=facet.device) - first[patch]
+    slot = torch.arange(len(patch), device=patch.device) - first[patch]
+    return start[patch] + slot, patch, slot
