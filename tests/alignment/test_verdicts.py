@@ -10,6 +10,7 @@ from pimper_torch.alignment.trust import (
     trust_by_sides,
 )
 from pimper_torch.records import AlignVerdict
+from pimper_torch.reporting import figures
 
 RADIUS = 2.0
 CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)
@@ -39,6 +40,9 @@ def test_before_alignment_nobody_is_aligned_and_after_it_all_are(
     found = Align()(sphere)
     assert (verdicts(found) == ALIGNED).all()
     assert all(relief.aligned.all() for relief in found.buckets)
+    assert "aligned_patches" not in figures(sphere)
+    assert figures(found)["aligned_patches"] == found.patches.num_patches
+    assert figures(found)["mismatch"] == float(found.mismatch[-1])
 
 
 def test_a_patch_without_relief_is_alone_and_stays_as_it_is(facets_over, reliefs, sphere_relief):
