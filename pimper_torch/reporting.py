@@ -153,7 +153,15 @@ def _(photometric: PhotometricPatches) -> dict[str, int | float]:
 
 @figures.register
 def _(depths: DepthPatches) -> dict[str, int | float]:
-    return {"valid_depths": sum(int(bucket.valid.sum()) for bucket in depths.buckets)}
+    told: dict[str, int | float] = {
+        "valid_depths": sum(int(bucket.valid.sum()) for bucket in depths.buckets)
+    }
+    if all(bucket.verdict is not None for bucket in depths.buckets):
+        told["aligned_patches"] = sum(int(bucket.aligned.sum()) for bucket in depths.buckets)
+    if depths.mismatch is not None:
+        told["mismatch_before"] = float(depths.mismatch[0])
+        told["mismatch"] = float(depths.mismatch[-1])
+    return told
 
 
 @figures.register

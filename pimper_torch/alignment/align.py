@@ -1,29 +1,45 @@
 """Alignment: bas-relief transforms that make neighbouring patches agree."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from pimper_torch.alignment.anchors import (
+    Anchors,
+    anchor_certainty,
+    point_anchors,
+    vertex_anchors,
+)
 from pimper_torch.alignment.overlaps import (
-    Overlaps,
     Seams,
     find_seams,
     meet_overlaps,
-    relief_at_corners,
     transformed,
 )
 from pimper_torch.alignment.system import (
+    PointPulls,
     Pulls,
     curvature_along,
     mismatches,
     seam_stiffness,
     solve_transforms,
 )
+from pimper_torch.alignment.trust import (
+    common_distance,
+    judge_patches,
+    overlapping_seams,
+    reliable_seams,
+    trust_by_distance,
+    trust_by_sides,
+)
 from pimper_torch.config import require
 from pimper_torch.progress import report
-from pimper_torch.records import DepthPatches, Depths
+from pimper_torch.records import AlignVerdict, DepthPatches, Depths, PatchSet, Record
+
+Method = Literal["bas-relief", "scale"]
 
 # An arc over an edge whose middle stands out by 0.7 % of its length has this C; flatter
 # reliefs are not told apart.
@@ -32,10 +48,8 @@ _FLAT = 3e-3
 # Vertices that were filled in between points of the cloud are guesses.
 _FILLED_VERTEX = 0.1
 
-# Reliefs this close, in edge lengths, agree; only beyond it can a sample be an outlier.
-_SAME_PLACE = 5e-3
-
-# Solves within one round, so that weights that depend on the answer settle.
+# Solves within the first round, so that weights that depend on the answer settle; later
+# rounds begin nearer to it and take one less.
 _REWEIGHTINGS = 3
 
 
@@ -44,6 +58,11 @@ class AlignConfig:
     """How patches are brought together.
 
     Attributes:
+        method: What of each relief is unknown. ``bas-relief``: tilt and scale, which is what
+            photometry leaves open. ``scale``: one scale a patch, as when components of a
+            surface are integrated apart and their relative scales are found from their
+            borders; overlap samples are then weighed against their mirror images across
+            the edge too.
         offset: Also let each patch move along its normal: 4 unknowns a patch instead of the
             published 3.
         curvature: Weight seams by the published ``k``; without it all weigh alike.
@@ -52,8 +71,11 @@ class AlignConfig:
         columns: Samples along each line.
         reach_samples: Distance of the outermost lines from the edge, in template samples;
             about ``decompose.overlap_samples``.
-        anchor: Weight of the facets' vertices, where the surface is known to pass, next to
-            the agreement of a seam.
+        anchor: Weight of a facet's vertex, where the surface is known to pass, next to the
+            agreement of a seam. Vertices that are points of the cloud count the less the
+            less certain they are next to the disagreement at the seams.
+        points: The same of each further point of the cloud that lies on a facet; one far
+            off, as an outlier, counts less.
         prior: Weight that holds each transform at the identity. Where neighbours agree but
             for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
             4 %; where they agree in nothing, 1e-4 lets them be flattened.
@@ -62,13 +84,15 @@ class AlignConfig:
             their weight, and quickly more beyond; depth edges run through some overlaps.
     """
 
+    method: Method = "bas-relief"
     offset: bool = True
     curvature: bool = True
     rounds: int = 3
-    rows: int = 5
+    rows: int = 3
     columns: int = 12
     reach_samples: float = 5.0
     anchor: float = 1.0
+    points: float = 1.0
     prior: float = 3e-4
     scale_limit: float = 4.0
     outlier: float = 5.0
@@ -79,9 +103,26 @@ class AlignConfig:
         require(self.columns >= 3, "columns", self.columns, "3 or more")
         require(self.reach_samples > 0, "reach_samples", self.reach_samples, "above 0")
         require(self.anchor >= 0, "anchor", self.anchor, "0 or more")
+        require(self.points >= 0, "points", self.points, "0 or more")
         require(self.prior > 0, "prior", self.prior, "above 0")
         require(self.scale_limit > 1, "scale_limit", self.scale_limit, "above 1")
         require(self.outlier > 0, "outlier", self.outlier, "above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Problem(Record):
+    """What stays the same from round to round; lengths in scene units."""
+
+    patches: PatchSet
+    seams: Seams
+    vertices: Anchors
+    points: Anchors
+    unit: Float[Tensor, ""]
+
+    @property
+    def in_scene(self) -> Float[Tensor, " 4"]:
+        """What carries transforms from units of the edge length to scene units."""
+        return torch.stack([torch.ones_like(self.unit)] * 3 + [self.unit])
 
 
 class Align(nn.Module):
@@ -107,15 +148,30 @@ class Align(nn.Module):
     side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve. Where
     reliefs agree it vanishes.
 
-    *Anchors.* Each relief is to pass through its facet's vertices, which are points of the
-    sparse cloud, so the surface cannot slide or tilt; a weak prior toward the identity
-    decides what nothing else does. A patch that meets no neighbour stays as it is.
+    *The gauge.* Seams alone leave some of h free. Over coplanar facets all is homogeneous:
+    any common affine change, :math:`h_z` and all, of their reliefs leaves them in agreement,
+    and :math:`h = 0` is a solution without error: the flattening one. Between facets at an
+    angle the foot points differ, which no multiple of the reliefs but the right one bridges:
+    folds tell scales, the better the sharper they are. Anchors fix what tilts and shifts the
+    surface: each relief is to pass through its facet's vertices, and through the points of
+    the cloud on the facet, with weights by their uncertainty. Vertices say nothing of scales,
+    points off the plane do. The prior toward the identity decides what nothing else does:
+    without folds and points, the common scale of coplanar facets. Without anchors it also
+    holds the common tilt and shift; without a prior, ``scale_limit`` alone would stop the
+    flattening where reliefs have nothing in common.
+
+    *Who stays.* A patch that meets no neighbour stays on the mesh, where its own anchors
+    alone put it, and so does one whose relief lies elsewhere than that of every neighbour it
+    meets even after all; their verdicts tell, an :class:`~pimper_torch.records.AlignVerdict`
+    each. One without relief stays as it is.
 
     Rigid motions and the scale of the world change nothing. Differentiable in the depths
-    through all rounds; which samples meet is constant.
+    through all rounds; which samples meet, and what they and the anchors weigh by distance,
+    is decided along the way like the rest, verdicts without gradient.
 
-    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; offset, anchors,
-    robust weights and rounds are ours.
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; Milano, Chung,
+    Blum, Siegwart, Ott: continuous components of normal integration, 2025, for joint relative
+    scales with robust weights; offset, anchors and rounds are ours.
     """
 
     def __init__(self, config: AlignConfig | None = None) -> None:
@@ -126,9 +182,9 @@ class Align(nn.Module):
         """Align all patches.
 
         Returns:
-            Changed depths with the transforms that changed them, and how far neighbours
-            were apart before and after each round. Where no patch meets a neighbour, what
-            came in.
+            Changed depths with the transforms that changed them, a verdict each, and how far
+            neighbours were apart before and after each round. Where no patch meets a
+            neighbour, what came in.
 
         Raises:
             SingularSystemError: Depths that are not finite.
@@ -137,74 +193,128 @@ class Align(nn.Module):
         seams = find_seams(patches, config.rows, config.columns, config.reach_samples)
         if len(seams.facets) == 0:
             return depths
-        unit = seams.edge_lengths.median()
-        in_scene = torch.stack([torch.ones_like(unit)] * 3 + [unit])
+        problem = _Problem(
+            patches=patches,
+            seams=seams,
+            vertices=vertex_anchors(patches, depths.buckets),
+            points=point_anchors(patches, depths.buckets),
+            unit=seams.edge_lengths.median(),
+        )
         # h_0 is in units of the edge length here, so that no term of the system has a unit.
-        transforms = unit.new_tensor([0, 0, 1, 0]).expand(patches.num_patches, 4)
-        corners, known = relief_at_corners(patches, depths.buckets)
-        anchors = _with_one(corners / unit), self._corner_weight(depths, known)
+        identity = problem.unit.new_tensor([0, 0, 1, 0])
+        transforms = identity.expand(patches.num_patches, 4)
         apart = []
         for done in range(config.rounds):
-            overlaps = meet_overlaps(seams, patches, depths.buckets, transforms * in_scene)
-            if not bool(overlaps.met.any()):
+            pulls = self._met(problem, depths, transforms)
+            if not bool((pulls.weight > 0).any()):
                 return depths
-            pulls = self._pulls(anchors, seams, overlaps, unit)
             apart.append(_root_mean_square(pulls, transforms))
             transforms = self._solve_round(pulls, transforms, fresh=done == 0)
             report(done + 1, config.rounds)
         with torch.no_grad():
-            overlaps = meet_overlaps(seams, patches, depths.buckets, transforms * in_scene)
-            pulls = self._pulls(anchors, seams, overlaps, unit)
-            mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * unit
+            pulls = self._met(problem, depths, transforms)
+            verdict = self._judged(pulls, transforms)
+        borne_out = (verdict == int(AlignVerdict.ALIGNED))[:, None]
+        if not bool(borne_out.all()):
+            on_mesh = self._on_mesh(problem, pulls, transforms)
+            transforms = torch.where(borne_out, transforms, on_mesh)
+            with torch.no_grad():
+                pulls = self._met(problem, depths, transforms)
+        with torch.no_grad():
+            mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * problem.unit
         return depths.replace(
-            buckets=_apply(depths, transforms * in_scene),
+            buckets=_apply(depths, transforms * problem.in_scene, verdict),
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
         )
 
-    def _corner_weight(
-        self, depths: DepthPatches, known: Bool[Tensor, "face 3"]
-    ) -> Float[Tensor, "face 3"]:
-        coarse = depths.patches.coarse
-        certain = torch.where(coarse.is_point, 1.0, _FILLED_VERTEX)[coarse.mesh.faces]
-        return self.config.anchor * certain.double() * known
+    def _judged(self, pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Int[Tensor, " face"]:
+        met = pulls.weight > 0
+        distance = mismatches(pulls, transforms).norm(dim=-1)
+        reliable = reliable_seams(trust_by_distance(distance, met, self.config.outlier), met)
+        return judge_patches(pulls.facets, overlapping_seams(met), reliable, len(transforms))
 
-    def _pulls(
-        self,
-        anchors: tuple[Float[Tensor, "face 3 4"], Float[Tensor, "face 3"]],
-        seams: Seams,
-        overlaps: Overlaps,
-        unit: Float[Tensor, ""],
+    def _on_mesh(
+        self, problem: _Problem, pulls: Pulls, transforms: Float[Tensor, "face 4"]
+    ) -> Float[Tensor, "face 4"]:
+        """Put every relief where its own anchors alone have it, whatever its neighbours say."""
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
+        everyone = torch.ones_like(transforms[:, 0])
+        held = self._anchored(pulls, problem, _noise(pulls, distance), everyone)
+        nothing = torch.zeros_like(distance[:, 0]), torch.zeros_like(pulls.curvature)
+        found = torch.zeros_like(transforms).index_fill(1, everyone.new_tensor([2]).long(), 1)
+        for solve in range(_REWEIGHTINGS):
+            believed = held if solve == 0 else self._believed(held, found, distance)
+            found = solve_transforms(believed, found, *nothing)
+            found = _limit_scales(found, self.config.scale_limit)
+        return found
+
+    def _met(
+        self, problem: _Problem, depths: DepthPatches, transforms: Float[Tensor, "face 4"]
     ) -> Pulls:
-        corners, corner_weight = anchors
+        """Meet the overlaps as transformed so far, and list what follows from that."""
+        seams, unit = problem.seams, problem.unit
+        overlaps = meet_overlaps(
+            seams, problem.patches, depths.buckets, transforms * problem.in_scene
+        )
         met = overlaps.met.flatten(1)
-        touching = seams.facets[met.any(dim=1)]
-        moves = torch.zeros_like(corner_weight).index_fill(0, touching.reshape(-1), 1)
-        prior = torch.full_like(corners[0, :1, 0], self.config.prior).expand(4).clone()
+        prior = unit.new_full((4,), self.config.prior)
+        if self.config.method == "scale":
+            prior[:2] = torch.inf
         if not self.config.offset:
             prior[3] = torch.inf
         count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
-        return Pulls(
+        corners = _with_one(problem.vertices.samples / unit).reshape(-1, 3, 4)
+        pulls = Pulls(
             facets=seams.facets,
             normals=seams.normals,
             samples=_with_one(overlaps.samples.flatten(2, 3) / unit),
             gap=(overlaps.feet[:, 0] - overlaps.feet[:, 1]).flatten(1, 2) / unit,
-            weight=met.to(corners) / count[:, None],
+            weight=met.to(unit) / count[:, None],
             curvature=curvature_along(overlaps.samples[..., 2], overlaps.met, seams.edge_lengths),
             corners=corners,
-            corner_weight=corner_weight * moves,
+            corner_weight=torch.zeros_like(corners[..., 0]),
             prior_weight=prior,
+        )
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
+        touching = seams.facets[met.any(dim=1)].flatten()
+        moves = torch.zeros_like(corners[:, 0, 0]).index_fill(0, touching, 1)
+        return self._anchored(pulls, problem, _noise(pulls, distance), moves)
+
+    def _anchored(
+        self,
+        pulls: Pulls,
+        problem: _Problem,
+        noise: Float[Tensor, ""],
+        moves: Float[Tensor, " face"],
+    ) -> Pulls:
+        """Add what holds reliefs to vertices and points, for the patches that may move."""
+        unit, vertices, points = problem.unit, problem.vertices, problem.points
+        coarse = problem.patches.coarse
+        is_point = coarse.is_point[coarse.mesh.faces.flatten()]
+        certain = anchor_certainty(vertices.variance / unit.square(), noise)
+        weight = torch.where(is_point, certain, _FILLED_VERTEX) * vertices.known
+        variance = points.variance / unit.square()
+        return pulls.replace(
+            corner_weight=self.config.anchor * weight.reshape(-1, 3) * moves[:, None],
+            points=PointPulls(
+                facet=points.facet,
+                samples=_with_one(points.samples / unit),
+                heights=points.heights / unit,
+                weight=self.config.points
+                * anchor_certainty(variance, noise)
+                * points.known
+                * moves[points.facet],
+                spread=(noise.square() + variance).sqrt(),
+            ),
         )
 
     def _solve_round(
         self, pulls: Pulls, transforms: Float[Tensor, "face 4"], fresh: bool
     ) -> Float[Tensor, "face 4"]:
-        for solve in range(_REWEIGHTINGS):
+        for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
             distance = mismatches(pulls, transforms).norm(dim=-1)
-            system = pulls
             # Before scales have been tried no disagreement is an outlier's fault.
-            if not (fresh and solve < 2):
-                trust = trust_by_distance(distance, pulls.weight > 0, self.config.outlier)
-                system = pulls.replace(weight=pulls.weight * trust)
+            system = pulls if fresh and solve < 2 else self._believed(pulls, transforms, distance)
             terms = self._curvature_terms(system, transforms, distance)
             # What tilts and shifts can mend says nothing about scales.
             only_level = fresh and solve == 0
@@ -215,6 +325,25 @@ class Align(nn.Module):
             if not torch.equal(limited, transforms):
                 transforms = solve_transforms(_with_scales_held(system), limited, *terms)
         return transforms
+
+    def _believed(
+        self,
+        pulls: Pulls,
+        transforms: Float[Tensor, "face 4"],
+        distance: Float[Tensor, "seam ray"],
+    ) -> Pulls:
+        """Lower the weight of samples and points that the transforms so far contradict."""
+        config, met = self.config, pulls.weight > 0
+        trust = trust_by_distance(distance, met, config.outlier)
+        if config.method == "scale":
+            shape = (len(distance), config.rows, config.columns)
+            trust = trust * trust_by_sides(distance.reshape(shape), met.reshape(shape)).flatten(1)
+        points = pulls.points
+        if points is not None:
+            missed = (points.samples * transforms[points.facet]).sum(dim=-1) - points.heights
+            held = (1 + (missed / (config.outlier * points.spread)).square()) ** -2
+            points = points.replace(weight=points.weight * held)
+        return pulls.replace(weight=pulls.weight * trust, points=points)
 
     def _curvature_terms(
         self,
@@ -230,6 +359,16 @@ class Align(nn.Module):
         return stiffness, (stiffness.square() * apart)[:, None] * pulls.curvature * scales
 
 
+def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
+    """Estimate by how much one relief is off, from how far two are apart."""
+    met = pulls.weight > 0
+    return (
+        common_distance(distance, met) / 2**0.5
+        if bool(met.any())
+        else torch.ones_like(distance.sum())
+    )
+
+
 def _with_scales_held(pulls: Pulls) -> Pulls:
     held = pulls.prior_weight.clone()
     held[2] = torch.inf
@@ -241,21 +380,6 @@ def _limit_scales(transforms: Float[Tensor, "face 4"], limit: float) -> Float[Te
     return torch.stack([hx, hy, hz.clamp(1 / limit, limit), h0], dim=-1)
 
 
-def trust_by_distance(
-    distance: Float[Tensor, "seam ray"], met: Bool[Tensor, "seam ray"], outlier: float
-) -> Float[Tensor, "seam ray"]:
-    """Weight samples down that are apart by far more than most.
-
-    Args:
-        distance: Between the two reliefs.
-        met: Where it means something.
-        outlier: A sample this many times the median apart keeps a quarter of its weight
-            (Geman and McClure's function).
-    """
-    common = distance[met].median().clamp_min(_SAME_PLACE)
-    return (1 + (distance / (outlier * common)).square()) ** -2
-
-
 def _with_one(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
     return torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
 
@@ -265,7 +389,9 @@ def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Floa
     return square[pulls.weight > 0].mean().sqrt()
 
 
-def _apply(depths: DepthPatches, transforms: Float[Tensor, "face 4"]) -> tuple[Depths, ...]:
+def _apply(
+    depths: DepthPatches, transforms: Float[Tensor, "face 4"], verdict: Int[Tensor, " face"]
+) -> tuple[Depths, ...]:
     buckets = []
     for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
         own = transforms[templates.facet]
@@ -273,6 +399,10 @@ def _apply(depths: DepthPatches, transforms: Float[Tensor, "face 4"]) -> tuple[D
         # Transforms chain: whoever aligns twice still learns the way from the first relief.
         chained = own[:, 2:3] * relief.transform + own * own.new_tensor([1, 1, 0, 1])
         buckets.append(
-            relief.replace(depth=depth.to(relief.depth), transform=chained.to(relief.transform))
+            relief.replace(
+                depth=depth.to(relief.depth),
+                transform=chained.to(relief.transform),
+                verdict=verdict[templates.facet],
+            )
         )
     return tuple(buckets)

@@ -8,9 +8,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
-from pimper_torch.geometry.reliefs import intersect_relief, sample_raster
+from pimper_torch.geometry.reliefs import intersect_relief
 from pimper_torch.geometry.surfaces import face_pairs
-from pimper_torch.records import CoarseMesh, PatchSet, Record
+from pimper_torch.records import PatchSet, Record
 from pimper_torch.records.patches import Depths, Templates
 
 
@@ -113,26 +113,6 @@ def meet_overlaps(
 
     samples, feet, met = (pick(list(parts)) for parts in zip(*found, strict=True))
     return Overlaps(samples=samples, feet=feet, met=met.all(dim=1))
-
-
-def relief_at_corners(
-    patches: PatchSet, buckets: tuple[Depths, ...]
-) -> tuple[Float[Tensor, "face 3 3"], Bool[Tensor, "face 3"]]:
-    """Give ``(x, y, z)`` of every relief at its facet's corners, and where it exists there."""
-    coarse: CoarseMesh = patches.coarse
-    samples, known, facets = [], [], []
-    for templates, depths in zip(patches.buckets, buckets, strict=True):
-        vertices = coarse.mesh.vertices_world[coarse.mesh.faces[templates.facet]].double()
-        corners = transform(templates.patch_from_world.double(), vertices)[..., :2]
-        place = templates.origin.double(), templates.spacing.double()
-        height = sample_raster(depths.depth[:, None], corners, *place, valid=depths.valid)
-        valid = depths.valid[:, None].to(depths.depth)
-        support = sample_raster(valid, corners, *place)[:, 0]
-        samples.append(torch.cat([corners, height.mT], dim=-1))
-        known.append(support > 0.5)
-        facets.append(templates.facet)
-    order = torch.argsort(torch.cat(facets))
-    return torch.cat(samples)[order], torch.cat(known)[order]
 
 
 def _meet_bucket(

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, normalize
 
+from pimper_torch.coarse.cloud import with_cloud
 from pimper_torch.coarse.fill import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.coarse.select import (
     behind_others,
@@ -125,7 +126,8 @@ class Triangulate(nn.Module):
             reference = named_view(scene.views, config.reference)
         else:
             reference = frontal_view(scene)
-        points, quality = self._trusted(scene, reference)
+        index, quality = self._trusted(scene, reference)
+        points = scene.points_world[index]
         pixels, _ = _project(points, cameras, reference)
         quality = torch.where(on_hull(pixels), quality + quality.amax(), quality)
         edge_px = config.facet_edge_px
@@ -137,12 +139,12 @@ class Triangulate(nn.Module):
             if config.fill:  # filled vertices count too: do not crowd where points are dense
                 chosen = spread(pixels, quality, 0.7 * edge_px)
         vertices = points[chosen]
-        is_point = torch.ones(len(vertices), dtype=torch.bool, device=vertices.device)
+        source = index[chosen]
         faces = self._facets(vertices, scene.views, cameras, reference)
         if config.fill:
             filled = self._filled(vertices, faces, points, cameras, reference, edge_px)
             vertices = torch.cat([vertices, filled])
-            is_point = torch.cat([is_point, is_point.new_zeros(len(filled))])
+            source = torch.cat([source, torch.full_like(source[:1], -1).expand(len(filled))])
             faces = self._facets(vertices, scene.views, cameras, reference)
         faces = largest_component(faces)
         if len(faces) == 0:
@@ -157,12 +159,12 @@ class Triangulate(nn.Module):
             vertex_normals(vertices, faces), faces, self.config.smoothing_rounds
         )
         mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=normals)
-        return CoarseMesh(mesh=mesh, reference=reference, is_point=is_point[used])
+        return with_cloud(scene, index, mesh, reference, source[used])
 
     def _trusted(
         self, scene: SparseScene, reference: int
-    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
-        """Give the points that pass every filter, and how good each is."""
+    ) -> tuple[Int[Tensor, " trusted"], Float[Tensor, " trusted"]]:
+        """List the points that pass every filter, and how good each is."""
         config, cameras, observed = self.config, scene.cameras, scene.observed
         length = observed.sum(dim=1)
         angle = triangulation_angles(scene.points_world, observed, cameras)
@@ -213,7 +215,7 @@ class Triangulate(nn.Module):
             )
         quality = length[index].to(angle) - scene.reprojection_errors_px[index]
         seen = observed[index, reference].to(quality)
-        return scene.points_world[index], quality + 3 * seen
+        return index, quality + 3 * seen
 
     def _filled(
         self,

@@ -1,6 +1,7 @@
 """Frozen data that travels between stages; no algorithms."""
 
 from pimper_torch.records.patches import (
+    AlignVerdict,
     Convergence,
     DepthPatches,
     Depths,
@@ -16,11 +17,12 @@ from pimper_torch.records.patches import (
 )
 from pimper_torch.records.reconstruction import Reconstruction, StageReport
 from pimper_torch.records.record import Record
-from pimper_torch.records.scene import CoarseMesh, Lens, Mesh, SparseScene
+from pimper_torch.records.scene import CoarseMesh, FacetPoints, Lens, Mesh, SparseScene
 from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
 from pimper_torch.records.views import Cameras, Views
 
 __all__ = [
+    "AlignVerdict",
     "Cameras",
     "Capture",
     "CoarseMesh",
@@ -29,6 +31,7 @@ __all__ = [
     "Depths",
     "DtuProtocol",
     "Estimate",
+    "FacetPoints",
     "Lens",
     "Mesh",
     "PatchSet",

@@ -186,6 +186,18 @@ class PhotometricPatches(Record):
     buckets: tuple[Photometry, ...]
 
 
+class AlignVerdict(IntEnum):
+    """Whether neighbours bear a patch's relief out."""
+
+    ALIGNED = 0
+    """Moved to where it agrees with a neighbour at least."""
+    ALONE = 1
+    """No neighbour's relief lies over its own: it stays on the mesh."""
+    DISPUTED = 2
+    """Every neighbour that it meets lies elsewhere, even after all was tried: it stays on
+    the mesh."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Depths(Record):
     """A bucket of patches with relief.
@@ -196,11 +208,20 @@ class Depths(Record):
             outside the enlarged triangle.
         transform: The alignment's ``(h_x, h_y, h_z, h_0)``: ``depth`` is
             ``h . (x, y, z, 1)`` of what integration gave; identity (0, 0, 1, 0) before.
+        verdict: An :class:`AlignVerdict` each; ``None`` before alignment.
     """
 
     depth: Float[Tensor, "patch height width"]
     valid: Bool[Tensor, "patch height width"]
     transform: Float[Tensor, "patch 4"]
+    verdict: Int[Tensor, " patch"] | None = None
+
+    @property
+    def aligned(self) -> Bool[Tensor, " patch"]:
+        """Whether a neighbour bears the relief out; false before alignment."""
+        if self.verdict is None:
+            return torch.zeros_like(self.transform[:, 0], dtype=torch.bool)
+        return self.verdict == int(AlignVerdict.ALIGNED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -88,6 +88,21 @@ class Mesh(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class FacetPoints(Record):
+    """Points of the sparse cloud that lie on facets without being their vertices.
+
+    Attributes:
+        points_world: Where they were triangulated.
+        covariance_world: Of each place, scene units squared.
+        facet: The facet each point lies on, as the reference view sees it.
+    """
+
+    points_world: Float[Tensor, "point 3"]
+    covariance_world: Float[Tensor, "point 3 3"]
+    facet: Int[Tensor, " point"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CoarseMesh(Record):
     """The few hundred facets that the pieces of the method stand on.
 
@@ -96,8 +111,13 @@ class CoarseMesh(Record):
         reference: The view that the facets were triangulated in; the frontal one.
         is_point: True for vertices that are points of the sparse cloud; the others were
             filled in between them.
+        covariance_world: Of each vertex that is a point, scene units squared; zero for the
+            others. ``None`` for a mesh that comes from elsewhere.
+        points: The cloud between the vertices; ``None`` for a mesh from elsewhere.
     """
 
     mesh: Mesh
     reference: int
     is_point: Bool[Tensor, " vertex"]
+    covariance_world: Float[Tensor, "vertex 3 3"] | None = None
+    points: FacetPoints | None = None

@@ -2,7 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.alignment.align import Align, AlignConfig, trust_by_distance
+from pimper_torch.alignment.align import Align, AlignConfig
+from pimper_torch.alignment.trust import trust_by_distance
 from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.records import Mesh

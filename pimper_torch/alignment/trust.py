@@ -1,0 +1,92 @@
+"""Which samples of an overlap can be believed, and which patches neighbours bear out."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.records import AlignVerdict
+
+# Reliefs this close, in edge lengths, agree; only beyond it can a sample be an outlier.
+SAME_PLACE = 5e-3
+
+# How sharply one side of an edge is preferred: that of bilateral normal integration.
+_SIDES_SHARPNESS = 2.0
+
+# A seam whose samples keep less of their weight than this on average bears nobody out: it is
+# what a sample at the outlier's distance keeps.
+_RELIABLE = 0.25
+
+# A seam that fewer rays than this share meet says nothing of its patches.
+_MET_ENOUGH = 0.25
+
+
+def common_distance(
+    distance: Float[Tensor, "*sample"], met: Bool[Tensor, "*sample"]
+) -> Float[Tensor, ""]:
+    """Give the distance that half of all samples stay below, at least ``SAME_PLACE``."""
+    return distance[met].median().clamp_min(SAME_PLACE)
+
+
+def trust_by_distance(
+    distance: Float[Tensor, "seam ray"], met: Bool[Tensor, "seam ray"], outlier: float
+) -> Float[Tensor, "seam ray"]:
+    """Weight samples down that are apart by far more than most.
+
+    Args:
+        distance: Between the two reliefs.
+        met: Where it means something.
+        outlier: A sample this many times the median apart keeps a quarter of its weight
+            (Geman and McClure's function).
+    """
+    return (1 + (distance / (outlier * common_distance(distance, met))).square()) ** -2
+
+
+def trust_by_sides(
+    distance: Float[Tensor, "seam row column"], met: Bool[Tensor, "seam row column"]
+) -> Float[Tensor, "seam row column"]:
+    r"""Believe, of two samples that mirror each other across the edge, the one that agrees.
+
+    A depth edge beside a seam spoils one of its sides. With r the distances of a sample and
+    of its mirror image, in medians of all, a sample keeps
+    :math:`2 / (1 + e^{2 (r^2 - r_{mirror}^2)})`, at most 1: all of it where it is the better
+    one or its mirror image was not met.
+
+    Source: Cao, Santo, Shi, Okura, Matsushita: Bilateral normal integration, ECCV 2022, for
+    the weights, there between the two sides of a pixel.
+    """
+    away = (distance / common_distance(distance, met)).square()
+    worse = torch.where(met.flip(1), away - away.flip(1), 0).clamp_min(0)
+    return 2 * torch.sigmoid(-_SIDES_SHARPNESS * worse)
+
+
+def overlapping_seams(met: Bool[Tensor, "seam ray"]) -> Bool[Tensor, " seam"]:
+    """Mark the seams whose two reliefs lie over each other for enough of their length."""
+    return met.sum(dim=1) >= _MET_ENOUGH * met.shape[1]
+
+
+def reliable_seams(
+    trust: Float[Tensor, "seam ray"], met: Bool[Tensor, "seam ray"]
+) -> Bool[Tensor, " seam"]:
+    """Mark the overlapping seams whose two reliefs lie in the same place."""
+    mean = (trust * met).sum(dim=1) / met.sum(dim=1).clamp_min(1)
+    return overlapping_seams(met) & (mean >= _RELIABLE)
+
+
+def judge_patches(
+    facets: Int[Tensor, "seam 2"],
+    overlapping: Bool[Tensor, " seam"],
+    reliable: Bool[Tensor, " seam"],
+    count: int,
+) -> Int[Tensor, " face"]:
+    """Give every patch its :class:`~pimper_torch.records.AlignVerdict`.
+
+    Args:
+        facets: The two patches of each seam.
+        overlapping: Whether their reliefs lie over each other.
+        reliable: Whether they also agree.
+        count: Patches.
+    """
+    verdict = torch.full((count,), int(AlignVerdict.ALONE), device=facets.device)
+    verdict[facets[overlapping].flatten()] = int(AlignVerdict.DISPUTED)
+    verdict[facets[overlapping & reliable].flatten()] = int(AlignVerdict.ALIGNED)
+    return verdict

@@ -1,0 +1,81 @@
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.coarse.cloud import facets_under, point_covariances
+from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.scenes.cameras import arc_cameras
+from pimper_torch.scenes.render import render_shape
+from pimper_torch.scenes.shapes import Sphere
+from pimper_torch.scenes.sparse import sparse_scene
+
+
+def noisy_cloud(noise_px, seed, span_deg=50.0):
+    cameras = arc_cameras(
+        6, width=160, height=120, focal_px=200.0, distance=4.0, sway_deg=0.0, span_deg=span_deg
+    )
+    lights = torch.tensor([[0.4, 0.0, 0.0, 0.4]], dtype=torch.float64).expand(6, 4)
+    scene = render_shape(Sphere(), cameras, lights, lambda points: torch.ones_like(points))
+    generator = torch.Generator().manual_seed(seed)
+    return sparse_scene(scene, 1500, generator, noise_px=noise_px, dtype=torch.float64)
+
+
+def test_covariances_are_as_large_as_the_errors_of_triangulated_points():
+    noise = 0.3
+    cloud = noisy_cloud(noise, 0)
+    everyone = torch.arange(len(cloud.points_world))
+    covariance = point_covariances(cloud, everyone)
+    # The points came from a sphere: the radial error is known without knowing the point.
+    radial = cloud.points_world / cloud.points_world.norm(dim=1, keepdim=True)
+    predicted = torch.einsum("pi,pij,pj->p", radial, covariance, radial)
+    error = cloud.points_world.norm(dim=1) - 1
+    ratio = float((error.square() / predicted).mean())
+    assert 0.6 < ratio < 1.6  # the triangulation is not weighted by depth, nor noise by track
+    # Those said to be uncertain are.
+    order = predicted.argsort()
+    half = len(order) // 2
+    spread = [float(error[part].square().mean()) for part in (order[:half], order[half:])]
+    assert spread[1] > 1.2 * spread[0]
+
+
+def test_narrow_angles_make_depth_uncertain():
+    wide, narrow = noisy_cloud(0.3, 1), noisy_cloud(0.3, 1, span_deg=10.0)
+
+    def along_rays(cloud):
+        covariance = point_covariances(cloud, torch.arange(len(cloud.points_world)))
+        axis = cloud.cameras.cam_from_world[3, 2, :3]
+        return float((axis @ covariance @ axis).median().sqrt())
+
+    assert along_rays(narrow) > 3 * along_rays(wide)
+
+
+def test_points_without_error_are_certain_and_all_covariances_are_symmetric():
+    cloud = noisy_cloud(0.0, 2)
+    covariance = point_covariances(cloud, torch.arange(20))
+    assert covariance.abs().max() < 1e-6  # rounding of the depth maps
+    noisy = point_covariances(noisy_cloud(0.3, 2), torch.arange(20))
+    assert_close(noisy, noisy.mT)
+    assert (torch.linalg.eigvalsh(noisy) > 0).all()
+
+
+def test_the_coarse_mesh_carries_what_is_known_of_its_points(dome_cloud):
+    coarse = Triangulate(TriangulateConfig(num_points=60))(dome_cloud)
+    assert coarse.covariance_world is not None
+    assert coarse.covariance_world.shape == (len(coarse.mesh.vertices_world), 3, 3)
+    assert (coarse.covariance_world[~coarse.is_point] == 0).all()
+    points = coarse.points
+    assert points is not None
+    assert len(points.facet) > 100
+    assert int(points.facet.max()) < len(coarse.mesh.faces)
+    # No vertex among them, and each lies on its facet: near its plane on so round a mesh.
+    gaps = torch.cdist(points.points_world, coarse.mesh.vertices_world[coarse.is_point])
+    assert gaps.min() > 0
+    corners = coarse.mesh.vertices_world[coarse.mesh.faces[points.facet]]
+    away = (points.points_world[:, None] - corners).norm(dim=-1).amax(dim=1)
+    longest = (corners - corners.roll(1, dims=1)).norm(dim=-1).amax(dim=1)
+    assert (away < 1.1 * longest).all()
+
+
+def test_facets_under_points_of_an_image():
+    corners = torch.tensor([[[0.0, 0], [2, 0], [0, 2]], [[2, 0], [2, 2], [0, 2]]])
+    pixels = torch.tensor([[0.5, 0.5], [1.7, 1.7], [3.0, 1.0], [0.1, 1.0]])
+    assert facets_under(pixels, corners).tolist() == [0, 1, -1, 0]
