@@ -190,7 +190,8 @@ def plane_pull(
 def face_slopes(lattice: Lattice, places: Float[Tensor, "vertex 3"]) -> Float[Tensor, "face 3 3"]:
     """Give the gradient of places on every flat face: how it stretches and tilts the face.
 
-    Directions out of the face's plane give zero, and so do faces without area. Differentiable in ``places``.
+    Directions out of the face's plane give zero, and so do faces without area. Differentiable
+    in ``places``.
     """
     mesh = _elements(lattice)
     area = mesh.area.clamp_min(torch.finfo(mesh.area.dtype).tiny)
