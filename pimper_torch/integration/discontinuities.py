@@ -41,9 +41,10 @@ _FIRST_SCALE, _NARROWER = 3.0, 3.0
 _TWIST = 1.0
 
 # Of the linear systems' solutions, in their energy; what remains is far below any scale.
-_TOLERANCE = 1e-8
+_TOLERANCE = 1e-6
 
-# A hierarchy that needed more cycles than this is made anew for the next weights.
+# Once the scale is at its last value weights move little, and a hierarchy is kept until it
+# needs more cycles than this.
 _MANY_CYCLES = 25
 
 # A deviation is this many times the median of absolute residuals.
@@ -74,7 +75,7 @@ class DiscontinuityConfig:
     kink: float = 2.0
     twist: float = 1.0
     tie: float = 1e-4
-    tolerance: float = 3e-4
+    tolerance: float = 5e-4
     max_iterations: int = 40
 
     def __post_init__(self) -> None:
@@ -135,15 +136,16 @@ def find_discontinuities(
             torch.where(asked[1], 1.0, config.tie) * inside[1],
         )
         system, solution = None, None
-        scale, cause = _FIRST_SCALE, StopCause.LIMIT
+        scale, narrowed, cause = _FIRST_SCALE, False, StopCause.LIMIT
         for taken in range(1, config.max_iterations + 1):
             weights = weight_right * share[0], weight_down * share[1]
-            if system is None or solution is None or solution.iterations > _MANY_CYCLES:
+            if system is None or solution is None:
                 system = RasterSystem(
                     *weights, anchor, method=method, tolerance=_TOLERANCE, what="the integration"
                 )
             else:
-                system = system.refreshed(*weights, anchor)
+                keep = narrowed and solution.iterations <= _MANY_CYCLES
+                system = system.refreshed(*weights, anchor, keep=keep)
             solution = _solved(system, steps, weights, anchor, heights, solution)
             apart = _residuals(steps, solution.values.reshape(steps.inside.shape))
             smallest = _last_scale(apart, asked, config)

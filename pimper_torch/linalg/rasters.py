@@ -185,6 +185,8 @@ class RasterSystem:
         weight_right: Float[Tensor, "height steps_right"],
         weight_down: Float[Tensor, "steps_down width"],
         anchor: Float[Tensor, "height width"] | None = None,
+        *,
+        keep: bool = False,
     ) -> "RasterSystem":
         """Prepare the same raster with other weights.
 
@@ -192,11 +194,18 @@ class RasterSystem:
         every weight stays within a factor two of the one they were made from: the usual
         case in late rounds of reweighting. Else this is as a new system, but for the search
         of free components, which is left out while the same weights are positive.
+
+        Args:
+            weight_right: As for a new system.
+            weight_down: Likewise.
+            anchor: Likewise.
+            keep: Keep the coarse levels whatever the weights. The answer is the same, but may
+                take many more cycles: for who watches them, round by round.
         """
         other = object.__new__(RasterSystem)
         other._wish, other._refuses = self._wish, self._refuses
         other._tolerance, other._what = self._tolerance, self._what
-        other._take(weight_right, weight_down, anchor, self)
+        other._take(weight_right, weight_down, anchor, self, keep)
         return other
 
     def _take(
@@ -205,6 +214,7 @@ class RasterSystem:
         weight_down: Float[Tensor, "steps_down width"],
         anchor: Float[Tensor, "height width"] | None,
         former: "RasterSystem | None",
+        keep: bool = False,
     ) -> None:
         if anchor is None:
             anchor = weight_right.new_zeros(weight_right.shape[0], weight_down.shape[1])
@@ -219,7 +229,7 @@ class RasterSystem:
             diagonal = torch.where(self._inside, tied, 1).reshape(-1)
             diagonal = self._components.held(diagonal).view(tied.shape)
             self._stencil = Stencil(right=right, down=down, diagonal=diagonal)
-            kept = former._solver.refreshed(self._stencil) if former else None
+            kept = former._solver.refreshed(self._stencil, keep) if former else None
             self._solver: RasterSolver = kept or self._prepared(held)
 
     def _refuse_unusable(self) -> None:

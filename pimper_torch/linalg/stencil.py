@@ -69,7 +69,7 @@ class RasterSolver(Protocol):
     ) -> Iterate:
         """Solve in float64 on the device of the stencil."""
 
-    def refreshed(self, stencil: Stencil) -> "RasterSolver | None":
+    def refreshed(self, stencil: Stencil, keep: bool) -> "RasterSolver | None":
         """Solve with another stencil on the same edges; None if nothing can be kept."""
 
 
@@ -100,7 +100,7 @@ class CholeskyRaster:
         found = self._factor.solve_values(rhs.reshape(-1))
         return Iterate(values=found, iterations=1, residual=0.0)
 
-    def refreshed(self, stencil: Stencil) -> RasterSolver | None:
+    def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
         """Keep nothing."""
         return None
 
@@ -129,7 +129,7 @@ class CosineRaster:
         found = solve_poisson(rhs, self._right, self._down, self._anchor)
         return Iterate(values=found.reshape(-1), iterations=1, residual=0.0)
 
-    def refreshed(self, stencil: Stencil) -> RasterSolver | None:
+    def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
         """Keep nothing."""
         return None
 
@@ -164,12 +164,12 @@ class MultigridRaster:
             None if start is None else start.reshape(-1),
         )
 
-    def refreshed(self, stencil: Stencil) -> RasterSolver | None:
-        """Keep the coarse levels if the weights are near those they were made from."""
+    def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
+        """Keep the coarse levels if told so, or the weights are near those they were made from."""
         pairs = (
             (getattr(stencil, name), getattr(self._origin, name)) for name in stencil.__slots__
         )
-        if not all(may_keep(new, old) for new, old in pairs):
+        if not (keep or all(may_keep(new, old) for new, old in pairs)):
             return None
         other = object.__new__(MultigridRaster)
         other._origin, other._stencil = self._origin, stencil
