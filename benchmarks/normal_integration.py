@@ -51,7 +51,7 @@ def with_depth(folder: Path) -> None:
     print("|---|" + "--:|" * (len(PUBLISHED) + 2))  # noqa: T201
     published = sum(PUBLISHED.values()) / len(PUBLISHED)
     row("published", list(PUBLISHED.values()), published, "")
-    maps = {name: cropped(read_normal_map(folder / name)) for name in PUBLISHED}
+    maps = {name: read_normal_map(folder / name) for name in PUBLISHED}
     for method in METHODS:
         began = time.perf_counter()
         found = [integrate(one, method) for one in maps.values()]
@@ -75,32 +75,17 @@ def row(name: str, errors: list[float], mean: float, seconds: str) -> None:
     print(f"| {name} | {cells} | {mean:.3f} | {seconds} |", flush=True)  # noqa: T201
 
 
-def cropped(one: NormalMap) -> NormalMap:
-    """Cut a map to its mask."""
-    rows, columns = one.mask.any(dim=1).nonzero()[:, 0], one.mask.any(dim=0).nonzero()[:, 0]
-    part = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-    K = one.intrinsics
-    if K is not None:
-        K = K.clone()
-        K[0, 2] -= int(columns[0])
-        K[1, 2] -= int(rows[0])
-    return one.replace(
-        normals=one.normals[part].double(),
-        mask=one.mask[part],
-        intrinsics=K,
-        depth=None if one.depth is None else one.depth[part].double(),
-    )
-
-
 def integrate(one: NormalMap, method: str) -> IntegratedMap:
     """Integrate as a user would."""
-    return integrate_normal_map(one.normals, one.mask, intrinsics=one.intrinsics, method=method)
+    return integrate_normal_map(
+        one.normals.double(), one.mask, intrinsics=one.intrinsics, method=method
+    )
 
 
 def depth_error(one: NormalMap, depth: Tensor) -> float:
     """Give the mean absolute error after the scale of the median ratio."""
     assert one.depth is not None
-    true, found = one.depth[one.mask], depth[one.mask]
+    true, found = one.depth.double()[one.mask], depth[one.mask]
     return float((found * (true / found).median() - true).abs().mean())
 
 
@@ -123,8 +108,8 @@ def at_the_truth(one: NormalMap) -> tuple[Steps, list[Tensor], list[Tensor]]:
     """Give the steps wanted, by how many pixels the true depth leaves them, and weights."""
     assert one.depth is not None
     assert one.intrinsics is not None
-    steps = perspective_steps(one.normals, one.mask, one.intrinsics)
-    unknown = torch.where(one.mask, one.depth, 1).log()
+    steps = perspective_steps(one.normals.double(), one.mask, one.intrinsics)
+    unknown = torch.where(one.mask, one.depth.double(), 1).log()
     inside = one.mask[:, 1:] & one.mask[:, :-1], one.mask[1:] & one.mask[:-1]
     apart = [
         torch.where(inside[0], unknown.diff(dim=1) / steps.unit_right - steps.right, 0),
@@ -143,7 +128,7 @@ def without_depth(folders: list[Path], figure: Path | None) -> None:
     print("|---|---|--:|--:|--:|--:|")  # noqa: T201
     panels = []
     for folder in folders:
-        one = cropped(read_normal_map(folder))
+        one = read_normal_map(folder)
         found = {}
         for method in ("weighted", "discontinuities"):
             began = time.perf_counter()
@@ -170,9 +155,9 @@ def turned_by(one: NormalMap, found: IntegratedMap) -> Tensor:
     depth, K = found.depth, one.intrinsics
     unknown = depth if K is None else torch.where(one.mask, depth, 1).log()
     if K is None:
-        steps = orthographic_steps(one.normals, one.mask)
+        steps = orthographic_steps(one.normals.double(), one.mask)
     else:
-        steps = perspective_steps(one.normals, one.mask, K)
+        steps = perspective_steps(one.normals.double(), one.mask, K)
     across = unknown.diff(dim=1) / steps.unit_right
     along = unknown.diff(dim=0) / steps.unit_down
     kept = [steps.known_right, steps.known_down]

@@ -68,6 +68,15 @@ def pixel_centers(
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
 
 
+def crop_intrinsics(
+    intrinsics: Float[Tensor, "*batch 3 3"], left: float, top: float
+) -> Float[Tensor, "*batch 3 3"]:
+    """Follow a cut of the image: pixels count from its corner, ``(left, top)`` of before."""
+    moved = torch.zeros_like(intrinsics)
+    moved[..., 0, 2], moved[..., 1, 2] = left, top
+    return intrinsics - moved
+
+
 def scale_intrinsics(
     intrinsics: Float[Tensor, "*batch 3 3"], factor_u: float, factor_v: float
 ) -> Float[Tensor, "*batch 3 3"]:

@@ -7,8 +7,10 @@ from typing import Literal
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from pimper_torch.errors import InputError
+from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.integration.discontinuities import (
     Continuity,
     DiscontinuityConfig,
@@ -70,9 +72,9 @@ def integrate_normal_map(
         known_weight: Of the known depths, next to that of one normal; 1 if not given.
         method: ``"discontinuities"`` lets depth jump; see
             :mod:`~pimper_torch.integration.discontinuities`. ``"weighted"`` is least squares,
-            under masks and weights. ``"cosine"`` and ``"frankot-chellappa"`` take the whole
-            rectangle, normals outside the mask filled in smoothly: published, quick, and for
-            rectangles without mask and weights.
+            under masks and weights. ``"cosine"`` and ``"frankot-chellappa"`` take the
+            rectangle round the mask, normals outside it filled in smoothly: published, quick,
+            and for rectangles without mask and weights.
         config: When a step is given up.
         solver: Of the linear systems: ``"cholesky"``, ``"multigrid"`` or ``"auto"``.
 
@@ -90,6 +92,21 @@ def integrate_normal_map(
     _refuse(normals, mask, weight, known_depth, known_weight, spacing)
     if mask is None:
         mask = torch.ones_like(normals[..., 0], dtype=torch.bool)
+    box = _box(mask)
+    if mask[box].shape != mask.shape:
+        part = integrate_normal_map(
+            normals[box],
+            mask[box],
+            intrinsics=None if intrinsics is None else _from_corner(intrinsics, box),
+            spacing=spacing,
+            weight=None if weight is None else weight[box],
+            known_depth=None if known_depth is None else known_depth[box],
+            known_weight=None if known_weight is None else known_weight[box],
+            method=method,
+            config=config,
+            solver=solver,
+        )
+        return _placed(part, box, *mask.shape)
     unit = _usable(normals, mask, weight)
     whole = method in ("cosine", "frankot-chellappa")
     inside = torch.ones_like(mask) if whole else mask
@@ -112,6 +129,33 @@ def integrate_normal_map(
         found = system.fit_steps(*steps.wanted, unknown)
     depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(depth=depth.to(normals), valid=steps.valid & mask, continuity=continuity)
+
+
+Box = tuple[slice, slice]
+
+
+def _box(mask: Bool[Tensor, "height width"]) -> Box:
+    """Give the rows and columns that have pixels: work and memory are spent on those only."""
+    rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def _from_corner(intrinsics: Float[Tensor, "3 3"], box: Box) -> Float[Tensor, "3 3"]:
+    return crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
+
+
+def _placed(part: IntegratedMap, box: Box, height: int, width: int) -> IntegratedMap:
+    """Put what was found in a box back where the box was."""
+    rows, columns = box
+    frame = (columns.start, width - columns.stop, rows.start, height - rows.stop)
+    continuity = part.continuity
+    if continuity is not None:
+        continuity = continuity.replace(
+            right=pad(continuity.right, frame), down=pad(continuity.down, frame)
+        )
+    return IntegratedMap(
+        depth=pad(part.depth, frame), valid=pad(part.valid, frame), continuity=continuity
+    )
 
 
 def _usable(

@@ -7,6 +7,7 @@ from torch.nn.functional import grid_sample
 from torch.testing import assert_close
 
 from pimper_torch.geometry.pixels import (
+    crop_intrinsics,
     grid_from_pixels,
     homography_in_indices,
     indices_from_pixels,
@@ -121,6 +122,15 @@ def test_resized_images_keep_corners_and_so_intrinsics_only_scale():
     # Area averaging puts the mean of two centres, 0.5 and 1.5, at 1 = 2 * 0.5.
     halved = torch.nn.functional.avg_pool2d(ramp_image(8, 6), 2)
     assert_close(halved, 2 * ramp_image(4, 3))
+
+
+def test_a_cut_moves_pixels_by_its_corner():
+    K = torch.tensor([[100.0, 0, 32], [0, 110, 24], [0, 0, 1]], dtype=torch.float64)
+    points = torch.tensor([[0.1, 0.2, 2.0], [-0.3, 0.1, 3.0]], dtype=torch.float64)
+    identity = torch.eye(4, dtype=torch.float64)
+    whole, _ = project(points, identity, K)
+    cut, _ = project(points, identity, crop_intrinsics(K, 5.0, 7.0))
+    assert_close(cut, whole - whole.new_tensor([5, 7]))
 
 
 def test_the_pinhole_is_colmaps():

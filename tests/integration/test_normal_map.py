@@ -124,6 +124,25 @@ def test_turning_the_raster_turns_the_answer(method):
     assert_close(again.depth, straight.depth.rot90(1, (0, 1)), rtol=0, atol=1e-7)
 
 
+@pytest.mark.parametrize("method", MASKED)
+def test_empty_margins_change_nothing(method):
+    normals, _, mask, K = ball(24)
+    wide = torch.zeros(40, 50, 3).double(), torch.zeros(40, 50, dtype=torch.bool)
+    wide[0][5:29, 20:44], wide[1][5:29, 20:44] = normals, mask
+    moved = K.clone()
+    moved[0, 2] += 20
+    moved[1, 2] += 5
+    plain = integrate_normal_map(normals, mask, intrinsics=K, method=method)
+    found = integrate_normal_map(*wide, intrinsics=moved, method=method)
+    assert_close(found.depth[5:29, 20:44], plain.depth)
+    assert (found.depth[~wide[1]] == 0).all()
+    assert (found.valid[5:29, 20:44] == plain.valid).all()
+    if found.continuity is not None:
+        assert found.continuity.right.shape == (40, 49)
+        assert_close(found.continuity.right[5:29, 20:43], plain.continuity.right)
+        assert_close(found.continuity.down[5:28, 20:44], plain.continuity.down)
+
+
 @pytest.mark.parametrize("method", ALL)
 def test_pixels_need_not_be_square(method):
     normals, z = bumps(0, spacing=(2 / 48, 2 / 30))
