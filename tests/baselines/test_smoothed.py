@@ -40,6 +40,8 @@ def test_a_closed_mesh_is_smoothed_too_and_becomes_rounder(photographed, sphere)
     ball = coarse.replace(
         mesh=coarse.mesh.replace(vertices_world=vertices.float(), faces=faces, normals_world=None),
         is_point=torch.ones(len(vertices), dtype=torch.bool),
+        covariance_world=None,
+        points=None,
     )
     found = few()(scene, ball).mesh
     corners = vertices[faces]
