@@ -4,15 +4,14 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.transform import pyrdown, remap
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.config import require
-from pimper_torch.geometry.frames import invert_rigid, transform
-from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.patches.pyramid import image_pyramid, pyramid_level, sample_pyramid
 from pimper_torch.progress import track
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
@@ -73,8 +72,8 @@ class Warp(nn.Module):
 
     def forward(self, views: Views, cameras: Cameras, patches: PatchSet) -> PatchViews:
         """Give J and D of every patch."""
-        pyramid = self._pyramid(views)
-        mesh = patches.coarse.mesh
+        pyramid = image_pyramid(views, self.config.saturation_level, self.config.pyramid_levels)
+        mesh = patches.surface or patches.coarse.mesh
         caster = RayCaster(mesh.vertices_world, mesh.faces)
         return PatchViews(
             patches=patches,
@@ -83,21 +82,6 @@ class Warp(nn.Module):
                 for bucket in track(patches.buckets)
             ),
         )
-
-    def _pyramid(self, views: Views) -> list[Float[Tensor, "view channels _ _"]]:
-        """Halve the images again and again; the last channel is 1 where a pixel is unusable."""
-        usable = views.inside
-        if views.masks is not None:
-            usable = usable & views.masks
-        finite = views.images.isfinite()
-        usable = usable & finite.all(dim=1)
-        usable = usable & (views.images.amax(dim=1) < self.config.saturation_level)
-        # NaN times a weight of 0 is NaN: zeros, which are marked, spread nothing.
-        images = torch.where(finite, views.images, 0)
-        levels = [torch.cat([images, (~usable)[:, None].to(images)], dim=1)]
-        while len(levels) < self.config.pyramid_levels and min(levels[-1].shape[-2:]) >= 8:
-            levels.append(pyrdown(levels[-1]))
-        return levels
 
     def _register(
         self,
@@ -110,7 +94,10 @@ class Warp(nn.Module):
         num, height, width = templates.depth.shape
         points = transform(world_from_patch, templates.points_patch.reshape(num, -1, 3))
         points_world = points.reshape(num, height, width, 3)
-        outward = -world_from_patch[:, :3, 2]
+        outward = -world_from_patch[:, None, None, :3, 2].expand_as(points_world)
+        if templates.normals_patch is not None:
+            carried = templates.normals_patch.detach().reshape(num, -1, 3)
+            outward = rotate(world_from_patch, carried).reshape(points_world.shape)
         seen = [
             self._seen_by(view, templates, points_world, outward, cameras, pyramid, caster)
             for view in range(cameras.num_views)
@@ -125,13 +112,13 @@ class Warp(nn.Module):
         view: int,
         templates: Templates,
         points_world: Float[Tensor, "patch height width 3"],
-        outward: Float[Tensor, "patch 3"],
+        outward: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
         pyramid: list[Float[Tensor, "view channels _ _"]],
         caster: RayCaster,
     ) -> tuple[Float[Tensor, "patch channel height width"], Bool[Tensor, "patch height width"]]:
         center = cameras.centers_world[view]
-        facing = (normalize(center - points_world, dim=-1) * outward[:, None, None]).sum(-1)
+        facing = (normalize(center - points_world, dim=-1) * outward).sum(-1)
         steepest = torch.deg2rad(facing.new_tensor(self.config.max_tilt_deg)).cos()
         pixels, depth = project(
             points_world.reshape(-1, 3), cameras.cam_from_world[view], cameras.intrinsics[view]
@@ -172,65 +159,8 @@ class Warp(nn.Module):
         return dense[:, 0] > 0
 
 
-def pyramid_level(
-    pixels: Float[Tensor, "patch height width 2"],
-) -> Float[Tensor, "patch height width"]:
-    """Choose the pyramid level at which neighbouring samples are a pixel apart.
-
-    The footprint is the square root of the area of a sample's parallelogram in the image:
-    a compromise for oblique facets between blur along one axis and aliasing along the other.
-    """
-    du = _difference(pixels, dim=2)
-    dv = _difference(pixels, dim=1)
-    area = (du[..., 0] * dv[..., 1] - du[..., 1] * dv[..., 0]).abs()
-    return 0.5 * area.clamp_min(1).log2()
-
-
-def sample_pyramid(
-    pyramid: list[Float[Tensor, "channels _ _"]],
-    pixels: Float[Tensor, "patch height width 2"],
-    level: Float[Tensor, "patch height width"],
-) -> Float[Tensor, "patch channels height width"]:
-    """Look an image up, blending the two pyramid levels next to each sample's own.
-
-    Every level covers the same ``[0, width] x [0, height]`` of the finest, so one
-    normalised grid serves all.
-    """
-    num, rows, columns = level.shape
-    grid = grid_from_pixels(pixels, width=pyramid[0].shape[-1], height=pyramid[0].shape[-2])
-    grid = grid.reshape(1, num * rows, columns, 2).clamp(-3, 3).to(pyramid[0])
-    level = level.clamp(0, len(pyramid) - 1).to(pyramid[0])
-    total = pyramid[0].new_zeros(num, pyramid[0].shape[0], rows, columns)
-    for index, image in enumerate(pyramid):
-        weight = (1 - (level - index).abs()).clamp_min(0)
-        if not (weight > 0).any():
-            continue
-        sampled = remap(
-            image[None],
-            grid[..., 0],
-            grid[..., 1],
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=False,
-            normalized_coordinates=True,
-        )
-        sampled = sampled.reshape(-1, num, rows, columns).transpose(0, 1)
-        total = total + weight[:, None] * sampled
-    return total
-
-
 def missing_share(seen: PatchViews) -> float:
     """Give the share of the enlarged triangles' samples, over all views, that is missing."""
     pairs = list(zip(seen.patches.buckets, seen.buckets, strict=True))
     samples = sum(int(t.inside.sum()) * r.valid.shape[1] for t, r in pairs)
     return 1 - sum(int(registered.valid.sum()) for _, registered in pairs) / samples
-
-
-def _difference(
-    values: Float[Tensor, "patch height width 2"], dim: int
-) -> Float[Tensor, "patch height width 2"]:
-    """Take forward differences, the last one repeated; zero along a single sample."""
-    steps = values.diff(dim=dim)
-    if steps.shape[dim] == 0:
-        return torch.zeros_like(values)
-    return torch.cat([steps, steps.narrow(dim, steps.shape[dim] - 1, 1)], dim=dim)

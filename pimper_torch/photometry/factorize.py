@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate
 from pimper_torch.geometry.surfaces import face_pairs
+from pimper_torch.patches.carry import carried_normals
 from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver, select
@@ -26,7 +27,7 @@ from pimper_torch.photometry.light_field import LightField, faces_lamp
 from pimper_torch.photometry.manifolds import Cone, Free, Manifold, SecondOrder
 from pimper_torch.photometry.mesh_light import light_of_mesh
 from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Loss, Squares
-from pimper_torch.photometry.rows import Rows, coarse_normals, on_raster, rows_of
+from pimper_torch.photometry.rows import Rows, on_raster, rows_of
 from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.photometry.verdicts import judge_data, warn_of_verdicts
@@ -206,7 +207,7 @@ class Factorize(nn.Module):
     def forward(self, seen: PatchViews) -> PhotometricPatches:
         """Factorize all patches."""
         config = self.config
-        coarse = [coarse_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
+        coarse = [carried_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
         field = light_of_mesh(seen, coarse, config.min_views, config.light)
         chunks = [
             [

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.photometry.light_field import LightField
 from pimper_torch.photometry.lights import fit_light_field
 from pimper_torch.records import PatchViews
@@ -24,11 +25,10 @@ def light_of_mesh(
 
     Args:
         seen: All views on all templates.
-        coarse: The mesh's smoothed normals on every template, bucket by bucket, patch frame.
+        coarse: Normals of what the templates carry, bucket by bucket, patch frame.
         min_views: Views a sample must be valid in.
         model: See :func:`~pimper_torch.photometry.lights.fit_light_field`.
     """
-    mesh = seen.patches.coarse.mesh
     chosen = [
         (templates.barycentric >= 0).all(dim=-1) & (registered.valid.sum(dim=1) >= min_views)
         for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True)
@@ -45,9 +45,8 @@ def light_of_mesh(
         visible.append(registered.valid[patch, :, row, column] & finite)
         to_world = templates.patch_from_world[patch, :3, :3].to(blend)
         normals.append((blend[patch, row, column, None] @ to_world)[:, 0])
-        corners = mesh.vertices_world[mesh.faces[templates.facet[patch]]].detach().to(blend)
-        inner = templates.barycentric[patch, row, column].to(blend)
-        points.append((inner[..., None] * corners).sum(dim=1))
+        places = templates.points_patch[patch, row, column, None].detach()
+        points.append(transform(invert_rigid(templates.patch_from_world[patch]), places)[:, 0])
     return fit_light_field(
         torch.cat(radiance),
         torch.cat(visible),

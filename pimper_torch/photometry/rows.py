@@ -5,14 +5,8 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import rotate
-from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.records import CoarseMesh, Record, Registered, Templates
-
-# Coarse normals are kept this far from the rim, so that all of them face the viewer.
-LEAST_FACING = 0.05
+from pimper_torch.records import Record, Registered, Templates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -24,35 +18,13 @@ class Rows(Record):
             outside the template.
         radiance: Linear; zero where missing.
         seen: ``D``; false where radiance is not finite.
-        normals: Of the coarse mesh, patch frame.
+        normals: Of what the template carries, patch frame.
     """
 
     place: Int[Tensor, "patch sample"]
     radiance: Float[Tensor, "patch view channel sample"]
     seen: Bool[Tensor, "patch view sample"]
     normals: Float[Tensor, "patch sample 3"]
-
-
-def coarse_normals(
-    coarse: CoarseMesh, templates: Templates
-) -> Float[Tensor, "patch height width 3"]:
-    """Blend the mesh's smoothed vertex normals over every template, patch frame.
-
-    Outside the facet barycentric coordinates are clamped to it, as the blend would
-    otherwise run away. All face the viewer.
-    """
-    mesh = coarse.mesh
-    per_vertex = mesh.normals_world
-    if per_vertex is None:
-        per_vertex = vertex_normals(mesh.vertices_world, mesh.faces)
-    corners = rotate(templates.patch_from_world, per_vertex[mesh.faces[templates.facet]])
-    inner = templates.barycentric.clamp_min(0)
-    inner = inner / inner.sum(dim=-1, keepdim=True)
-    blend = torch.einsum("phwc,pcx->phwx", inner, corners.to(inner))
-    unit = normalize(blend, dim=-1)
-    facing = unit[..., 2:].clamp_max(-LEAST_FACING)
-    aside = (1 - facing**2).clamp_min(0).sqrt() * normalize(unit[..., :2], dim=-1)
-    return torch.where(unit[..., 2:] > -LEAST_FACING, torch.cat([aside, facing], dim=-1), unit)
 
 
 def rows_of(

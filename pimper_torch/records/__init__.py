@@ -5,6 +5,7 @@ from pimper_torch.records.patches import (
     Convergence,
     DepthPatches,
     Depths,
+    Heights,
     PatchSet,
     PatchVerdict,
     PatchViews,
@@ -13,6 +14,7 @@ from pimper_torch.records.patches import (
     Registered,
     StopCause,
     Surface,
+    SweptPatches,
     Templates,
 )
 from pimper_torch.records.reconstruction import Reconstruction, StageReport
@@ -32,6 +34,7 @@ __all__ = [
     "DtuProtocol",
     "Estimate",
     "FacetPoints",
+    "Heights",
     "Lens",
     "Mesh",
     "PatchSet",
@@ -46,6 +49,7 @@ __all__ = [
     "StageReport",
     "StopCause",
     "Surface",
+    "SweptPatches",
     "Templates",
     "Truth",
     "Views",

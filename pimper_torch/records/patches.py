@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.records.record import Record
-from pimper_torch.records.scene import CoarseMesh
+from pimper_torch.records.scene import CoarseMesh, Mesh
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -30,7 +30,10 @@ class Templates(Record):
         depth: z of every sample, 0 while the template is flat.
         barycentric: Coordinates of every sample with respect to the facet itself; outside
             the facet one of them is negative.
-        inside: True in the enlarged triangle.
+        inside: True in the enlarged triangle; of a template that carries a surface, only where
+            it has some.
+        normals_patch: Of the surface that a template carries, unit, facing the viewer. ``None``
+            while the template is flat: the coarse mesh's smoothed normals stand in.
     """
 
     facet: Int[Tensor, " patch"]
@@ -40,6 +43,7 @@ class Templates(Record):
     depth: Float[Tensor, "patch height width"]
     barycentric: Float[Tensor, "patch height width 3"]
     inside: Bool[Tensor, "patch height width"]
+    normals_patch: Float[Tensor, "patch height width 3"] | None = None
 
     @property
     def points_patch(self) -> Float[Tensor, "patch height width 3"]:
@@ -59,10 +63,13 @@ class PatchSet(Record):
     Attributes:
         coarse: The facets.
         buckets: Their templates.
+        surface: What the templates carry, and what hides what; ``None`` for the facets
+            themselves.
     """
 
     coarse: CoarseMesh
     buckets: tuple[Templates, ...]
+    surface: Mesh | None = None
 
     @property
     def num_patches(self) -> int:
@@ -184,6 +191,37 @@ class PhotometricPatches(Record):
 
     patches: PatchSet
     buckets: tuple[Photometry, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Heights(Record):
+    """A bucket of patches swept for height under their light.
+
+    Attributes:
+        offset: How far outside the template the surface lies at every sample, along the
+            outward normal of what the template carries; scene units, 0 where nothing tells.
+        information: Inverse variance of the offset, one over scene units squared; 0 where
+            nothing tells. A sample's own share: neighbours that were averaged with it have
+            theirs.
+        misfit: Root mean square of what is left of the radiance there; 0 where not swept.
+    """
+
+    offset: Float[Tensor, "patch height width"]
+    information: Float[Tensor, "patch height width"]
+    misfit: Float[Tensor, "patch height width"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SweptPatches(Record):
+    """Heights of all patches, with the photometry they were swept under."""
+
+    photometric: PhotometricPatches
+    buckets: tuple[Heights, ...]
+
+    @property
+    def patches(self) -> PatchSet:
+        """The decomposition underneath."""
+        return self.photometric.patches
 
 
 class AlignVerdict(IntEnum):

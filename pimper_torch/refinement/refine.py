@@ -15,7 +15,7 @@ from pimper_torch.linalg.systems import prepare
 from pimper_torch.records import Convergence, DepthPatches, PatchSet, StopCause, Surface
 from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull, trend_deviation
 from pimper_torch.refinement.smoothness import reweighted
-from pimper_torch.refinement.union import Union, ray_directions, unite
+from pimper_torch.fusion.union import Union, ray_directions, unite
 
 # Robust smoothness has settled when vertices move by less than this share of their spacing.
 _SETTLED = 1e-3
@@ -77,7 +77,7 @@ class Refine(nn.Module):
     sides. See :mod:`~pimper_torch.refinement.energy` for the discretisation and for what
     ``hold_planes`` adds to the published energy, :mod:`~pimper_torch.refinement.smoothness`
     for robust smoothness, which takes a factorization for each of its solves, and
-    :mod:`~pimper_torch.refinement.union` for the union. Vertices that no patch supports are
+    :mod:`~pimper_torch.fusion.union` for the union. Vertices that no patch supports are
     filled by the smoothness term and have confidence 0.
 
     Differentiable in depth, photometric normals, albedo and confidence; the coarse mesh and

@@ -6,7 +6,7 @@ from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import boundary_vertices
 from pimper_torch.refinement.refine import Refine, RefineConfig, vertex_spacing
-from pimper_torch.refinement.union import ray_directions, unite
+from pimper_torch.fusion.union import ray_directions, unite
 
 SPACING = 0.02
 

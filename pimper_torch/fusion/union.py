@@ -20,7 +20,15 @@ from pimper_torch.geometry.lattice import Lattice
 from pimper_torch.geometry.reliefs import intersect_relief, sample_raster
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.progress import track
-from pimper_torch.records import CoarseMesh, DepthPatches, Depths, Photometry, Record, Templates
+from pimper_torch.records import (
+    CoarseMesh,
+    DepthPatches,
+    Depths,
+    Heights,
+    Photometry,
+    Record,
+    Templates,
+)
 
 # A ray turned more than this from the patch's own normal (cosine) says nothing of its height.
 _FACING = 0.2
@@ -49,6 +57,9 @@ class Union(Record):
         albedo: Linear; zero where no patch has one.
         seen: True where normal and albedo are photometric.
         confidence: In [0, 1]; 0 where not supported or not determined by the photographs.
+        offsets: How far outside the reliefs the sweep has the surface, along their normals;
+            0 where not swept.
+        information: Inverse variance of the offsets; 0 where not swept.
     """
 
     heights: Float[Tensor, " vertex"]
@@ -57,6 +68,8 @@ class Union(Record):
     albedo: Float[Tensor, "vertex channel"]
     seen: Bool[Tensor, " vertex"]
     confidence: Float[Tensor, " vertex"]
+    offsets: Float[Tensor, " vertex"]
+    information: Float[Tensor, " vertex"]
 
 
 def ray_directions(lattice: Lattice, coarse: CoarseMesh) -> Float[Tensor, "vertex 3"]:
@@ -73,6 +86,7 @@ def unite(
     lattice: Lattice,
     directions: Float[Tensor, "vertex 3"],
     outlier_samples: float,
+    swept: Sequence[Heights] | None = None,
 ) -> Union:
     r"""Blend the patches on the lattice.
 
@@ -81,7 +95,8 @@ def unite(
     facet's edge to 1 as far inside: the union is continuous across seams, and on the middle
     of a seam both patches count alike. Where three or more patches meet, one that lies
     ``d > outlier_samples`` samples from the weighted median has its weight divided by
-    ``1 + 10 (d / outlier_samples - 1)^2``: a wild patch is outvoted.
+    ``1 + 10 (d / outlier_samples - 1)^2``: a wild patch is outvoted. Swept offsets count by
+    their information, besides.
 
     Differentiable in depth, normals, albedo and confidence; which samples are blended is
     decided without gradient.
@@ -89,7 +104,10 @@ def unite(
     coarse = depths.patches.coarse
     held = torch.bincount(lattice.facet, minlength=len(coarse.mesh.faces)).tolist()
     vertices_of = torch.split(lattice.facet.argsort(stable=True), held)
-    buckets = zip(depths.patches.buckets, depths.buckets, depths.photometric.buckets, strict=True)
+    heights = swept if swept is not None else [None] * len(depths.buckets)
+    buckets = zip(
+        depths.patches.buckets, depths.buckets, depths.photometric.buckets, heights, strict=True
+    )
     estimates = [
         _estimates(coarse, *bucket, lattice, directions, vertices_of)
         for bucket in track(list(buckets))
@@ -101,13 +119,17 @@ def unite(
         scale=torch.cat([one.scale for one in estimates]),
         known=torch.cat([one.known for one in estimates]),
         values=torch.cat([one.values for one in estimates]),
+        swept=torch.cat([one.swept for one in estimates]),
     )
     return _blend(joined, len(lattice.points), outlier_samples)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Estimates:
-    """What single patches say of single vertices; ``values`` are normal, confidence, albedo."""
+    """What single patches say of single vertices.
+
+    ``values`` are normal, confidence, albedo; ``swept`` is information, and with it the offset.
+    """
 
     vertex: Int[Tensor, " estimate"]
     height: Float[Tensor, " estimate"]
@@ -115,6 +137,7 @@ class _Estimates:
     scale: Float[Tensor, " estimate"]
     known: Float[Tensor, " estimate"]
     values: Float[Tensor, "estimate value"]
+    swept: Float[Tensor, "estimate 2"]
 
 
 def _estimates(
@@ -122,6 +145,7 @@ def _estimates(
     templates: Templates,
     relief: Depths,
     photometry: Photometry,
+    swept: Heights | None,
     lattice: Lattice,
     directions: Float[Tensor, "vertex 3"],
     vertices_of: Sequence[Int[Tensor, "..."]],
@@ -147,6 +171,10 @@ def _estimates(
     place = (xy, templates.origin, templates.spacing)
     values = sample_raster(layers.movedim(-1, 1), *place, valid=photometry.valid)
     known = sample_raster(photometry.valid[:, None].to(relief.depth), *place)[:, 0]
+    of_sweep = values.new_zeros(values.shape[0], 2, values.shape[2])
+    if swept is not None:
+        told = torch.stack([swept.information, swept.information * swept.offset], dim=1)
+        of_sweep = sample_raster(told, *place)
     return _Estimates(
         vertex=vertex[found],
         height=((points - origins) * along).sum(dim=-1)[found],
@@ -154,6 +182,7 @@ def _estimates(
         scale=templates.spacing[:, None].expand_as(weight)[found],
         known=known[found],
         values=values.movedim(1, -1)[found],
+        swept=of_sweep.movedim(1, -1)[found],
     )
 
 
@@ -245,6 +274,9 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Union:
     per_seen = torch.where(seen, 1 / seen_total.clamp_min(_LEAST_WEIGHT), 0)
     values = _sum_at(vertex, seen_weight[:, None] * estimates.values, count)
     normals, confidence, albedo = values[:, :3], values[:, 3], values[:, 4:]
+    told = _sum_at(vertex, weight[:, None] * estimates.swept, count)
+    information = told[:, 0]
+    some = information > 0
     return Union(
         heights=_sum_at(vertex, weight * height, count) * per_support,
         supported=supported,
@@ -253,6 +285,8 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Union:
         seen=seen,
         # Divided by the whole weight: a patch that does not know speaks against certainty.
         confidence=(confidence * per_support).clamp(0, 1),
+        offsets=torch.where(some, told[:, 1] / torch.where(some, information, 1), 0),
+        information=information * per_support,
     )
 
 

@@ -1,0 +1,126 @@
+"""Templates that carry a surface: registration on what is known, not on the facet's plane."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.frames import invert_rigid, rotate, transform
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
+
+# Normals are kept this far from the rim, so that all of them face the viewer.
+LEAST_FACING = 0.05
+
+# A template finds its surface within this share of its own extent of the facet's plane.
+_REACH = 0.5
+
+
+def carry(patches: PatchSet, surface: Mesh) -> PatchSet:
+    """Let every template carry the surface: its depth, and its normals.
+
+    A sample's place is where the surface, facing as the facet does, meets the sample's line
+    along the facet's normal, nearest to the facet's plane. Samples without one, or whose place
+    is further off than half the template's extent, are no longer ``inside``.
+
+    Differentiable in the surface's vertices and normals; which face a line meets is constant.
+    """
+    normals = surface.normals_world
+    if normals is None:
+        normals = vertex_normals(surface.vertices_world, surface.faces)
+    caster = RayCaster(surface.vertices_world, surface.faces)
+    buckets = tuple(
+        _carrying(templates, surface, normals, caster) for templates in patches.buckets
+    )
+    return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
+
+
+def carried_normals(
+    coarse: CoarseMesh, templates: Templates
+) -> Float[Tensor, "patch height width 3"]:
+    """Give the normals of what a template carries, patch frame: a surface's, or the mesh's."""
+    if templates.normals_patch is None:
+        return coarse_normals(coarse, templates)
+    return facing_viewer(templates.normals_patch)
+
+
+def coarse_normals(
+    coarse: CoarseMesh, templates: Templates
+) -> Float[Tensor, "patch height width 3"]:
+    """Blend the mesh's smoothed vertex normals over every template, patch frame.
+
+    Outside the facet barycentric coordinates are clamped to it, as the blend would
+    otherwise run away. All face the viewer.
+    """
+    mesh = coarse.mesh
+    per_vertex = mesh.normals_world
+    if per_vertex is None:
+        per_vertex = vertex_normals(mesh.vertices_world, mesh.faces)
+    corners = rotate(templates.patch_from_world, per_vertex[mesh.faces[templates.facet]])
+    inner = templates.barycentric.clamp_min(0)
+    inner = inner / inner.sum(dim=-1, keepdim=True)
+    return facing_viewer(torch.einsum("phwc,pcx->phwx", inner, corners.to(inner)))
+
+
+def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Make unit, and bring what faces away to just before the rim."""
+    unit = normalize(normals, dim=-1)
+    facing = unit[..., 2:].clamp_max(-LEAST_FACING)
+    aside = (1 - facing**2).clamp_min(0).sqrt() * normalize(unit[..., :2], dim=-1)
+    return torch.where(unit[..., 2:] > -LEAST_FACING, torch.cat([aside, facing], dim=-1), unit)
+
+
+def _carrying(
+    templates: Templates,
+    surface: Mesh,
+    normals: Float[Tensor, "vertex 3"],
+    caster: RayCaster,
+) -> Templates:
+    num, height, width = templates.depth.shape
+    world_from_patch = invert_rigid(templates.patch_from_world)
+    flat = templates.replace(depth=torch.zeros_like(templates.depth)).points_patch
+    places = transform(world_from_patch, flat.reshape(num, -1, 3))
+    inward = world_from_patch[:, None, :3, 2].expand_as(places)
+    hits, met = _nearest(caster, places, inward, surface)
+    found = hits.interpolate(surface.vertices_world, surface.faces)
+    depth = transform(templates.patch_from_world, found)[..., 2]
+    turned = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
+    reach = _REACH * templates.spacing * max(height, width)
+    met = met & (depth.abs() <= reach[:, None])
+    raster = (num, height, width)
+    return templates.replace(
+        depth=torch.where(met, depth, 0).reshape(raster),
+        normals_patch=normalize(
+            torch.where(met[..., None], turned, turned.new_tensor([0, 0, -1])), dim=-1
+        ).reshape(*raster, 3),
+        inside=templates.inside & met.reshape(raster),
+    )
+
+
+def _nearest(
+    caster: RayCaster,
+    places: Float[Tensor, "patch sample 3"],
+    inward: Float[Tensor, "patch sample 3"],
+    surface: Mesh,
+) -> tuple[Hits, Bool[Tensor, "patch sample"]]:
+    """Cast to both sides, and take the nearer hit of a face that looks outward."""
+    outward = torch.linalg.cross(
+        *(surface.vertices_world.detach()[surface.faces].diff(dim=1).unbind(dim=1))
+    )
+    below, above = caster.cast(places, inward), caster.cast(places, -inward)
+
+    def looking_out(hits: Hits) -> Bool[Tensor, "patch sample"]:
+        facing = (outward[hits.face.clamp_min(0)] * inward).sum(dim=-1) < 0
+        return (hits.face >= 0) & facing
+
+    one, other = looking_out(below), looking_out(above)
+    first = one & (~other | (below.distance <= above.distance))
+    return (
+        Hits(
+            face=torch.where(first, below.face, above.face),
+            distance=torch.where(first, below.distance, above.distance),
+            barycentric=torch.where(first[..., None], below.barycentric, above.barycentric),
+        ),
+        one | other,
+    )
