@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.surfaces import face_edges, face_normals
 from pimper_torch.records import Record
 
 # An edge has at most so many times the pieces that it would have if its facet were equilateral,
@@ -82,7 +82,7 @@ def subdivide(
     >>> len(lattice.points), len(lattice.faces)
     (12, 14)
     """
-    edges, facet_edges = _edges(facets)
+    edges, facet_edges = face_edges(facets)
     pieces = _pieces(vertices.detach(), facets, edges, facet_edges, spacing.detach())
     # Slot 0 opposite to a longest edge: that edge carries the lattice's own cuts, so that
     # only two edges ever slide, both counted from slot 0.
@@ -151,13 +151,6 @@ def _assemble(
         faces=renumbered,
         face_facet=face_facet[whole],
     )
-
-
-def _edges(facets: Int[Tensor, "facet 3"]) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "facet 3"]]:
-    """Give the edges, and which of them lies opposite to each corner."""
-    ends = facets[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2).sort(dim=1).values
-    edges, index = torch.unique(ends, dim=0, return_inverse=True)
-    return edges, index.reshape(-1, 3)
 
 
 def _pieces(

@@ -61,6 +61,19 @@ def face_pairs(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "pair 2"], Int
     return torch.stack([order[first], order[first + 1]], dim=1) // 3, edges[order[first]]
 
 
+def face_edges(
+    faces: Int[Tensor, "face 3"],
+) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "face 3"]]:
+    """Give every edge once, its lower vertex first, and which lies opposite to each corner."""
+    ends = faces[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2).sort(dim=1).values
+    if len(ends) == 0:
+        return ends, faces
+    # One number an edge: rows take far longer to compare.
+    size = ends.max() + 1
+    key, index = torch.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)
+    return torch.stack([key // size, key % size], dim=1), index.reshape(-1, 3)
+
+
 def boundary_vertices(
     faces: Int[Tensor, "face 3"], num_vertices: int
 ) -> Bool[Tensor, " {num_vertices}"]:

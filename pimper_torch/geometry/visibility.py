@@ -93,6 +93,27 @@ class RayCaster:
         hits = self.cast(center, directions / length[..., None])
         return hits.distance < length - tolerance
 
+    def blocked(
+        self,
+        origins: Float[Tensor, "*#batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+        reach: Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Tell whether a ray meets any face at all; several times as fast as its first one.
+
+        Args:
+            origins: World.
+            directions: Of the rays.
+            reach: How far each goes, in lengths of its direction; may be infinite.
+        """
+        shape = directions.shape[:-1]
+        start, along = _as_rows(origins.expand_as(directions)), _as_rows(directions)
+        far = reach.detach().expand(shape).reshape(-1).to("cpu", torch.float32)
+        # embree's own word for infinity
+        far = far.clamp(0, 1e37).contiguous()
+        found = self._scene.run(start, along, dists=far.numpy(), query="OCCLUDED")
+        return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
+
 
 def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
     """Cast a ray through every pixel of a view.

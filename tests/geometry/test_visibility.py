@@ -102,3 +102,16 @@ def test_dtype_and_shape_follow_the_rays():
     assert hits.barycentric.shape == (2, 5, 3)
     one = caster.cast(torch.tensor([0.3, 0.1, 1.0]), directions[0, 0])
     assert one.face.shape == ()
+
+
+def test_a_ray_is_blocked_where_its_first_hit_is_within_reach(generator):
+    vertices, faces = icosphere(2)
+    caster = RayCaster(vertices, faces)
+    origins = 0.7 * torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    directions = torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    reach = 3 * torch.rand(500, generator=generator, dtype=torch.float64)
+    reach[::7] = torch.inf
+    first = caster.cast(origins, directions).distance
+    found = caster.blocked(origins, directions, reach)
+    assert 0.1 < found.float().mean() < 0.9
+    assert (found == (first < reach))[(first - reach).abs() > 1e-5].all()

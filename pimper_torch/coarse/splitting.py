@@ -1,0 +1,153 @@
+"""Red-green splitting: some edges of a triangle mesh are halved, and it stays conforming.
+
+A face with three halved edges becomes four of its own shape (red); with one or two it is cut
+through to the new vertices (green). What an edge's two faces do follows from the edge alone, so
+no face ever has a vertex of its neighbour on its edge.
+
+Source: of red and green, Bank, Sherman & Weiser, Scientific Computing, 1983; of halving longest
+edges so that angles stay away from 0, Rivara, Int. J. Numer. Meth. Eng. 20, 1984.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.records import Record
+
+# Barycentric coordinates of a face's corners, and of the middles of the opposite edges.
+_NODES = ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0))
+
+_RED = ((0, 5, 4), (5, 1, 3), (4, 3, 2), (3, 4, 5))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Split(Record):
+    """A mesh, some of whose edges have been halved.
+
+    Attributes:
+        faces: Old vertices keep their numbers; the new ones follow, one for each of ``halved``.
+        halved: The edges in the middle of which they lie.
+        parent: The face that each face is a part of, ascending.
+        corners: Barycentric coordinates of each face's corners in its parent, row by row.
+    """
+
+    faces: Int[Tensor, "child 3"]
+    halved: Int[Tensor, " new"]
+    parent: Int[Tensor, " child"]
+    corners: Float[Tensor, "child 3 3"]
+
+    def relocate(
+        self, parent: Int[Tensor, " point"], barycentric: Float[Tensor, "point 3"]
+    ) -> tuple[Int[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Give the part that each point of a face lies in, or nearest to, and where in it.
+
+        Args:
+            parent: The face before it was split.
+            barycentric: Coordinates in that; may be outside.
+        """
+        inverse = torch.linalg.inv(self.corners).to(barycentric)
+        first = torch.searchsorted(self.parent, parent)
+        last = torch.searchsorted(self.parent, parent, right=True) - 1
+        child, place = first, (barycentric[:, None] @ inverse[first])[:, 0]
+        for slot in range(1, len(_RED)):
+            (more,) = torch.nonzero(first + slot <= last, as_tuple=True)
+            other = first[more] + slot
+            there = (barycentric[more, None] @ inverse[other])[:, 0]
+            better = there.amin(dim=1) > place[more].amin(dim=1)
+            child = child.index_copy(0, more[better], other[better])
+            place = place.index_copy(0, more[better], there[better])
+        return child, place
+
+
+def mark_edges(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    wanted: Bool[Tensor, " face"],
+    forbidden: Bool[Tensor, " face"],
+) -> Bool[Tensor, " edge"]:
+    """Choose the edges to halve, in the order of :func:`face_edges`.
+
+    All edges of the wanted faces; and of every face that has one of these its longest too, so
+    that no angle shrinks below half of the smallest there was, however often this is done.
+
+    Args:
+        vertices: Of the mesh.
+        faces: Of the mesh.
+        wanted: To be split in four.
+        forbidden: Faces that keep all their edges, whatever it costs the angles of others.
+    """
+    edges, face_edge = face_edges(faces)
+    ends = vertices[edges]
+    length = (ends[:, 0] - ends[:, 1]).norm(dim=1)
+    longest = face_edge.gather(1, length[face_edge].argmax(dim=1, keepdim=True))[:, 0]
+    free = torch.ones_like(length, dtype=torch.bool)
+    free[face_edge[forbidden].flatten()] = False
+    marked = torch.zeros_like(free)
+    marked[face_edge[wanted].flatten()] = True
+    marked = marked & free
+    while True:
+        grown = marked.clone()
+        grown[longest[marked[face_edge].any(dim=1)]] = True
+        grown = grown & free
+        if bool((grown == marked).all()):
+            return marked
+        marked = grown
+
+
+def split_edges(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], marked: Bool[Tensor, " edge"]
+) -> Split:
+    """Halve the marked edges, in the order of :func:`face_edges`; faces keep their orientation."""
+    _, face_edge = face_edges(faces)
+    halved = marked.nonzero()[:, 0]
+    number = torch.full_like(marked, -1, dtype=torch.long)
+    number[halved] = len(vertices) + torch.arange(len(halved), device=faces.device)
+    names = torch.cat([faces, number[face_edge]], dim=1)
+    corners = vertices[faces]
+    nodes = torch.tensor(_NODES, dtype=vertices.dtype, device=vertices.device)
+    places = nodes @ corners
+    here = marked[face_edge]
+    children, parents, inside = [], [], []
+    for some, table in _cases(here, places):
+        if not len(some):
+            continue
+        local = torch.tensor(table, device=faces.device)
+        children.append(names[some][:, local].flatten(0, 1))
+        parents.append(some.repeat_interleave(len(table)))
+        inside.append(nodes[local].repeat(len(some), 1, 1))
+    parent = torch.cat(parents)
+    order = parent.argsort(stable=True)
+    return Split(
+        faces=torch.cat(children)[order],
+        halved=halved,
+        parent=parent[order],
+        corners=torch.cat(inside)[order],
+    )
+
+
+def _cases(
+    marked: Bool[Tensor, "face 3"], places: Float[Tensor, "face 6 3"]
+) -> list[tuple[Int[Tensor, " some"], tuple[tuple[int, int, int], ...]]]:
+    """List the faces that are cut alike, and how."""
+    count = marked.sum(dim=1)
+    cases: list[tuple[Int[Tensor, " some"], tuple[tuple[int, int, int], ...]]] = [
+        ((count == 0).nonzero()[:, 0], ((0, 1, 2),)),
+        ((count == 3).nonzero()[:, 0], _RED),
+    ]
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        middle = 3 + a
+        one = (count == 1) & marked[:, a]
+        cases.append((one.nonzero()[:, 0], ((a, b, middle), (a, middle, c))))
+        p, q = 3 + c, 3 + b  # the middles of ab and ac, where bc is whole
+        two = (count == 2) & ~marked[:, a]
+        # The shorter diagonal of the rest is the median to the longer edge: larger angles.
+        from_b = (places[:, b] - places[:, q]).norm(dim=1)
+        from_c = (places[:, c] - places[:, p]).norm(dim=1)
+        near = from_b <= from_c
+        cases.append(((two & near).nonzero()[:, 0], ((a, p, q), (p, b, q), (b, c, q))))
+        cases.append(((two & ~near).nonzero()[:, 0], ((a, p, q), (p, b, c), (p, c, q))))
+    return cases

@@ -1,0 +1,152 @@
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.photometry.light_field import LightField
+from pimper_torch.photometry.shadows import cast_shadows, cast_shadows_on_rasters
+from pimper_torch.records import Mesh
+from pimper_torch.scenes.meshes import icosphere, join, moved, table
+
+RADIUS, HEIGHT = 0.5, 1.2  # of the ball, above the plane z = 0
+
+
+@pytest.fixture(scope="module")
+def ball_over_plane():
+    vertices, faces = icosphere(5)
+    ball = moved(Mesh(vertices_world=vertices, faces=faces), scale=RADIUS, shift=(0.0, 0.0, HEIGHT))
+    both = join(ball, table(8.0))
+    return RayCaster(both.vertices_world, both.faces)
+
+
+def lamps(places, distant=False):
+    """Lamps at places, or in their directions."""
+    places = torch.tensor(places, dtype=torch.float64)
+    distance = places.norm(dim=1)
+    return LightField(
+        origin=torch.zeros(3).double(),
+        soft=torch.zeros(len(places), 4).double(),
+        lamp=2.0 * normalize(places, dim=1),
+        closeness=torch.zeros_like(distance) if distant else 1 / distance,
+    )
+
+
+@pytest.fixture
+def plane():
+    """A raster on the plane, samples 0.02 apart."""
+    side = torch.linspace(-2, 2, 201, dtype=torch.float64)
+    y, x = torch.meshgrid(side, side, indexing="ij")
+    points = torch.stack([x, y, torch.zeros_like(x)], dim=-1)
+    return points, torch.tensor([0.0, 0, 1]).double().expand_as(points)
+
+
+def ellipse(points, direction):
+    """Signed distance, roughly, to the rim of a ball's shadow under a distant lamp."""
+    direction = normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
+    middle = -HEIGHT * direction[:2] / direction[2]
+    along = normalize(direction[:2], dim=0)
+    offset = points[..., :2] - middle
+    u, v = offset @ along, offset @ torch.stack([-along[1], along[0]])
+    return ((u * direction[2]) ** 2 + v**2).sqrt() - RADIUS
+
+
+def test_a_distant_lamp_casts_the_ellipse_of_a_ball(ball_over_plane, plane):
+    points, normals = plane
+    direction = (0.5, 0.2, 0.9)
+    found = cast_shadows(lamps([direction], True), ball_over_plane, points, normals, 1e-4)
+    rim = ellipse(points, direction)
+    clear = rim.abs() > 0.003  # the icosphere lies 0.0005 inside the ball
+    assert clear.float().mean() > 0.98
+    assert (found.lit[..., 0] == (rim > 0))[clear].all()
+    assert 0.03 < (~found.lit).float().mean() < 0.2  # a shadow was there to be found
+
+
+def test_a_near_lamp_overhead_casts_a_wider_circle(ball_over_plane, plane):
+    points, normals = plane
+    lamp_height = 3.0
+    found = cast_shadows(lamps([(0, 0, lamp_height)]), ball_over_plane, points, normals, 1e-4)
+    opening = math.asin(RADIUS / (lamp_height - HEIGHT))
+    rim = points[..., :2].norm(dim=-1) - lamp_height * math.tan(opening)
+    clear = rim.abs() > 0.003
+    assert (found.lit[..., 0] == (rim > 0))[clear].all()
+
+
+def test_what_stands_behind_the_lamp_casts_no_shadow(ball_over_plane, plane):
+    points, normals = plane
+    found = cast_shadows(lamps([(0, 0, HEIGHT - 0.6)]), ball_over_plane, points, normals, 1e-4)
+    assert found.lit.all()
+
+
+def test_the_ball_s_own_shadow_ends_where_it_turns_from_the_lamp(ball_over_plane, generator):
+    normals = normalize(torch.randn(2000, 3, generator=generator, dtype=torch.float64), dim=1)
+    points = RADIUS * normals + torch.tensor([0, 0, HEIGHT]).double()
+    direction = normalize(torch.tensor([0.3, -0.4, 0.8]).double(), dim=0)
+    field = lamps([direction.tolist()], True)
+    # Points lie off the faces by up to 0.0005: without any lift some would shade themselves.
+    found = cast_shadows(field, ball_over_plane, points, normals, 1e-3, guard=1e-3)
+    facing = normals @ direction
+    clear = facing.abs() > 0.05
+    assert (found.lit[:, 0] == (facing > 0))[clear].all()
+    assert found.sure[clear].all()
+
+
+def test_edges_nearer_than_the_guard_make_unsure_and_no_others(ball_over_plane, plane):
+    points, normals = plane
+    lamp_height, guard = 3.0, 0.1
+    found = cast_shadows(
+        lamps([(0, 0, lamp_height)]), ball_over_plane, points, normals, 1e-4, guard=guard
+    )
+    rim = points[..., :2].norm(dim=-1) - lamp_height * math.tan(
+        math.asin(RADIUS / (lamp_height - HEIGHT))
+    )
+    sure = found.sure[..., 0]
+    near, far = rim.abs() < 0.95 * guard, rim.abs() > 1.2 * guard  # the edge is curved
+    assert near.any()
+    assert not sure[near].any()
+    assert sure[far].all()
+    plain = cast_shadows(lamps([(0, 0, lamp_height)]), ball_over_plane, points, normals, 1e-4)
+    assert plain.sure.all()
+    assert (plain.lit == found.lit).all()
+
+
+def test_a_view_without_a_lamp_is_lit_everywhere(ball_over_plane, plane):
+    points, normals = plane
+    dark = lamps([(0.5, 0.2, 0.9), (0, 0, 3)])
+    dark = dark.replace(lamp=dark.lamp * torch.tensor([[1.0], [0.0]]))
+    found = cast_shadows(dark, ball_over_plane, points, -normals, 1e-4)
+    assert not found.lit[..., 0].any()
+    assert found.lit[..., 1].all()
+
+
+@pytest.mark.parametrize("stride", [1, 3, 4])
+def test_sparse_rays_answer_for_their_neighbours_except_near_edges(ball_over_plane, plane, stride):
+    points, normals = plane
+    field = lamps([(1.0, 0.4, 2.5), (-0.5, 0.2, 4.0)])
+    raster = points[None, :, :150], normals[None, :, :150]  # no multiple of the stride
+    spacing = torch.tensor([0.02]).double()
+    dense = cast_shadows(field, ball_over_plane, *raster, 1e-4)
+    found = cast_shadows_on_rasters(
+        field, ball_over_plane, *raster, spacing, tolerance=1e-4, guard=0.02, stride=stride
+    )
+    assert found.lit.shape == dense.lit.shape
+    assert (found.lit == dense.lit)[found.sure].all()
+    assert found.sure.float().mean() > 0.85
+    if stride == 1:
+        assert (found.lit == dense.lit).all()
+
+
+def test_rays_are_cast_only_where_asked(ball_over_plane, plane):
+    points, normals = plane
+    field = lamps([(0, 0, 3.0)])
+    asked = torch.zeros(1, *points.shape[:2], dtype=torch.bool)
+    asked[0, 90:110] = True
+    spacing = torch.tensor([0.02]).double()
+    settings = {"tolerance": 1e-4, "stride": 4}
+    raster = points[None], normals[None], spacing
+    found = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings, asked=asked)
+    whole = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings)
+    assert (found.lit == whole.lit)[asked].all()
+    assert not found.lit[asked].all()
+    assert found.lit[0, :80].all()
