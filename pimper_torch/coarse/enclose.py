@@ -1,0 +1,284 @@
+"""Coarse mesh all round: facets on everything that a few views see, without a reference view."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from pimper_torch.coarse.brought import checked
+from pimper_torch.coarse.cloud import point_covariances
+from pimper_torch.coarse.densify import DensifyConfig, DepthMaps, depth_maps
+from pimper_torch.coarse.oriented import (
+    OrientedPoints,
+    joined_points,
+    oriented_points,
+    sparse_oriented,
+    thinned,
+)
+from pimper_torch.coarse.select import frontal_view, named_view, triangulation_angles
+from pimper_torch.coarse.triangulate import smooth_over_mesh
+from pimper_torch.coarse.trim import evidence, large_pieces, near_points, without_small_holes
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
+from pimper_torch.sfm.colmap import poisson_surface, simplified
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncloseConfig:
+    """How the cloud becomes dense, the surface, and what of it stays.
+
+    Lengths in pixels are those of the finest depth maps, at the cloud's median depth.
+
+    Attributes:
+        reference: Name or stem of the frontal photograph; empty chooses it.
+        num_facets: About so many are left after simplification.
+        min_track_length: Views that must have seen a point of the sparse cloud.
+        max_reprojection_px: Mean reprojection error it may have.
+        min_angle_deg: Widest angle between rays it must have.
+        densify: The search for depth maps.
+        cell_px: The points' grid, and the finest cell of the surface.
+        max_depth: Of the surface's octree, whatever the cell.
+        point_weight: Of points against smoothness, in the surface.
+        reach_px: A face nearer to a point of the cloud than this is borne out by it.
+        least_views: That have to see a face which is not.
+        hole_px: Side of a square as large as the largest hole that is closed.
+        min_share: Of the area borne out, that a piece apart has to have.
+        boundary_weight: Of rims against the surface, in simplification.
+        max_distance_px: From its facet that a point of the sparse cloud may have.
+        smoothing_rounds: Of the vertex normals, over the mesh.
+        threads: Of the surface's reconstruction; -1 for all cores.
+    """
+
+    reference: str = ""
+    num_facets: int = 3000
+    min_track_length: int = 3
+    max_reprojection_px: float = 1.5
+    min_angle_deg: float = 4.0
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    cell_px: float = 1.0
+    max_depth: int = 10
+    point_weight: float = 2.0
+    reach_px: float = 4.0
+    least_views: int = 2
+    hole_px: float = 24.0
+    min_share: float = 0.01
+    boundary_weight: float = 10.0
+    max_distance_px: float = 4.0
+    smoothing_rounds: int = 1
+    threads: int = -1
+
+    def __post_init__(self) -> None:
+        require(self.num_facets >= 4, "num_facets", self.num_facets, "4 or more")
+        require(self.min_track_length >= 2, "min_track_length", self.min_track_length, "2 or more")
+        require(self.cell_px > 0, "cell_px", self.cell_px, "above 0")
+        require(2 <= self.max_depth <= 12, "max_depth", self.max_depth, "2 to 12")
+        require(self.point_weight >= 0, "point_weight", self.point_weight, "0 or more")
+        require(self.reach_px > 0, "reach_px", self.reach_px, "above 0")
+        require(self.least_views >= 1, "least_views", self.least_views, "1 or more")
+        require(self.hole_px >= 0, "hole_px", self.hole_px, "0 or more")
+        require(0 <= self.min_share < 1, "min_share", self.min_share, "in [0, 1)")
+        require(self.max_distance_px > 0, "max_distance_px", self.max_distance_px, "above 0")
+
+
+class Enclose(nn.Module):
+    """Enclose the object in facets; the result is a constant to autograd."""
+
+    def __init__(self, config: EncloseConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or EncloseConfig()
+
+    @torch.no_grad()
+    def forward(self, scene: SparseScene, mesh: Mesh | None = None) -> CoarseMesh:
+        """Make the coarse mesh of depth maps, or of a mesh that is given.
+
+        Args:
+            scene: Photographs, cameras and cloud.
+            mesh: A surface in the scene's frame, used instead of the photographs' own.
+
+        Raises:
+            InputError: No registered photograph has the reference's name, or the mesh that
+                is given cannot be used.
+            ReconstructionError: Too few points can be trusted or matched, or no face is
+                borne out.
+        """
+        config = self.config
+        if config.reference:
+            reference = named_view(scene.views, config.reference)
+        else:
+            reference = frontal_view(scene)
+        trusted = self._trusted(scene)
+        if mesh is None:
+            vertices, faces, pixel = self.surface(scene, trusted)
+        else:
+            vertices, faces = checked(mesh, scene.cameras)
+            pixel = _pixel_size(scene, trusted) if len(trusted) else float("inf")
+        if len(faces) > config.num_facets:
+            vertices, faces = _few(vertices, faces, config)
+        normals = smooth_over_mesh(vertex_normals(vertices, faces), faces, config.smoothing_rounds)
+        return CoarseMesh(
+            mesh=Mesh(vertices_world=vertices, faces=faces, normals_world=normals),
+            reference=reference,
+            is_point=torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device),
+            covariance_world=torch.zeros_like(vertices)[:, :, None].expand(-1, 3, 3),
+            points=self._on_facets(scene, trusted, vertices, faces, pixel),
+        )
+
+    def surface(
+        self, scene: SparseScene, trusted: Int[Tensor, " trusted"]
+    ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"], float]:
+        """Give the surface before simplification, and the size of a pixel there."""
+        config = self.config
+        if len(trusted) < 4:
+            raise ReconstructionError(
+                f"coarse mesh: {len(trusted)} of {len(scene.points_world)} sparse points can be "
+                "trusted, and at least 4 are needed. Take more photographs, or relax the filters "
+                "of `enclose`."
+            )
+        maps = depth_maps(scene, trusted, config.densify)
+        pixel = _pixel_size(scene, trusted) * maps[-1].factor
+        dense = thinned(oriented_points(maps), config.cell_px * pixel)
+        cloud = joined_points(dense, sparse_oriented(scene, trusted, dense, 3 * pixel))
+        if len(cloud.points_world) < 16:
+            raise ReconstructionError(
+                f"coarse mesh: {len(cloud.points_world)} points were matched between the "
+                "photographs, and a surface needs some hundreds. Take photographs that overlap "
+                "more, or bring a mesh of your own."
+            )
+        vertices, faces = self._closed(cloud, pixel)
+        kept = self._borne_out(vertices, faces, cloud, maps[-1], pixel)
+        if not bool(kept.any()):
+            raise ReconstructionError(
+                f"coarse mesh: none of {len(faces)} faces is borne out by the photographs. "
+                "Lower `enclose.least_views`, raise `enclose.reach_px`, or bring a mesh."
+            )
+        return *_used(vertices, faces[kept]), pixel
+
+    def _trusted(self, scene: SparseScene) -> Int[Tensor, " trusted"]:
+        config, observed = self.config, scene.observed
+        angle = triangulation_angles(scene.points_world, observed, scene.cameras)
+        trusted = (
+            (observed.sum(dim=1) >= config.min_track_length)
+            & (scene.reprojection_errors_px <= config.max_reprojection_px)
+            & (angle >= torch.deg2rad(angle.new_tensor(config.min_angle_deg)))
+        )
+        return trusted.nonzero()[:, 0]
+
+    def _closed(
+        self, cloud: OrientedPoints, pixel: float
+    ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+        points = cloud.points_world
+        extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
+        cells = extent / (self.config.cell_px * pixel)
+        depth = min(self.config.max_depth, max(4, int(torch.tensor(cells).log2().ceil())))
+        # COLMAP works in single precision: a cloud far from the origin is brought there.
+        middle = points.median(dim=0).values
+        vertices, faces = poisson_surface(
+            points - middle,
+            cloud.normals_world,
+            depth=depth,
+            point_weight=self.config.point_weight,
+            threads=self.config.threads,
+        )
+        return vertices.to(points) + middle, faces.to(points.device)
+
+    def _borne_out(
+        self,
+        vertices: Float[Tensor, "vertex 3"],
+        faces: Int[Tensor, "face 3"],
+        cloud: OrientedPoints,
+        maps: DepthMaps,
+        pixel: float,
+    ) -> Bool[Tensor, " face"]:
+        config = self.config
+        said = evidence(vertices, faces, maps)
+        middle = vertices[faces].mean(dim=1)
+        supported = near_points(middle, cloud.points_world, config.reach_px * pixel)
+        kept = (said.seen >= config.least_views) & supported
+        kept |= (said.lit >= config.least_views) & (said.denied < config.least_views)
+        kept = without_small_holes(vertices, faces, kept, (config.hole_px * pixel) ** 2)
+        chosen = kept.nonzero()[:, 0]
+        pieces = large_pieces(vertices, faces[chosen], supported[chosen], config.min_share)
+        kept[chosen[~pieces]] = False
+        return kept
+
+    def _on_facets(
+        self,
+        scene: SparseScene,
+        trusted: Int[Tensor, " trusted"],
+        vertices: Float[Tensor, "vertex 3"],
+        faces: Int[Tensor, "face 3"],
+        pixel: float,
+    ) -> FacetPoints:
+        facet, distance = nearest_facets(scene.points_world[trusted], vertices, faces)
+        near = distance <= self.config.max_distance_px * pixel
+        chosen = trusted[near]
+        return FacetPoints(
+            points_world=scene.points_world[chosen],
+            covariance_world=point_covariances(scene, chosen),
+            facet=facet[near],
+        )
+
+
+def nearest_facets(
+    points: Float[Tensor, "point 3"],
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    divisions: int = 12,
+) -> tuple[Int[Tensor, " point"], Float[Tensor, " point"]]:
+    """Find the facet nearest to each point, and how far its plane is.
+
+    Facets are compared by a lattice of samples, so that of two about as near either may be
+    found where a point lies close to their common edge.
+    """
+    steps = [
+        (a, b, divisions - a - b) for a in range(divisions + 1) for b in range(divisions + 1 - a)
+    ]
+    weights = vertices.new_tensor(steps) * (1 - 1 / divisions) / divisions + 1 / (3 * divisions)
+    samples = torch.einsum("sc,fcx->fsx", weights, vertices[faces])
+    tree = cKDTree(samples.reshape(-1, 3).detach().cpu().numpy())
+    _, index = tree.query(points.detach().cpu().numpy())
+    facet = torch.as_tensor(index, device=points.device).long() // len(steps)
+    corner = vertices[faces[facet]]
+    normal = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = torch.nn.functional.normalize(normal, dim=-1)
+    nearest = samples.reshape(-1, 3)[torch.as_tensor(index, device=points.device)]
+    offset = points - nearest
+    off_plane = (offset * normal).sum(dim=-1)
+    # Beside the facet, the sample's distance counts as far as the lattice does not explain it.
+    beside = (offset - off_plane[:, None] * normal).norm(dim=-1)
+    spacing = (corner - corner.roll(1, dims=1)).norm(dim=-1).amax(dim=1) / divisions
+    return facet, torch.hypot(off_plane, (beside - spacing).clamp_min(0))
+
+
+def _few(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], config: EncloseConfig
+) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
+    middle = vertices.median(dim=0).values
+    fewer, left = simplified(
+        vertices - middle,
+        faces,
+        num_faces=config.num_facets,
+        boundary_weight=config.boundary_weight,
+        threads=config.threads,
+    )
+    return _used(fewer.to(vertices) + middle, left.to(faces.device))
+
+
+def _used(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> tuple[Float[Tensor, "used 3"], Int[Tensor, "face 3"]]:
+    used, faces = torch.unique(faces, return_inverse=True)
+    return vertices[used], faces
+
+
+def _pixel_size(scene: SparseScene, trusted: Int[Tensor, " trusted"]) -> float:
+    """Give the size of a photograph's pixel at the trusted observations; the median's."""
+    chosen = torch.isin(scene.observation_point, trusted)
+    view, point = scene.observation_view[chosen], scene.observation_point[chosen]
+    frames = scene.cameras.cam_from_world[view]
+    depth = (frames[:, 2, :3] * scene.points_world[point]).sum(dim=-1) + frames[:, 2, 3]
+    return float((depth / scene.cameras.intrinsics[view, 0, 0]).median())

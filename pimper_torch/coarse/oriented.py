@@ -1,0 +1,267 @@
+"""Depth maps of many views as one cloud of points with normals and noise."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize, pad
+
+from pimper_torch.coarse.densify import DepthMaps
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.records import Record, SparseScene
+
+# Radius of the windows that planes are fitted in, pixels.
+_RADIUS = 2
+
+# Steps of inverse depth from the middle of a window at which a pixel's weight has fallen to
+# 0.6: more is another surface, or one so steep that views hardly show it.
+_REACH_STEPS = 3.0
+
+# Share of a window that has to lie on the plane: where it is less, the pixel is beside the
+# contour of what is in front, which windows that match make too large.
+_LEAST_SHARE = 0.5
+
+# Points round a sparse one that tell its normal; the standard deviation across their plane
+# over the smaller one along it that is still a plane; the cosine to the mean ray at least.
+_NEIGHBOURS, _FLAT, _FACING = 12, 0.3, 0.2
+
+# Steps in front of what another view sees, beyond which a point is denied by it.
+_DENIED_STEPS = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class OrientedPoints(Record):
+    """Points of surfaces.
+
+    Attributes:
+        points_world: Where.
+        normals_world: Unit, towards the cameras.
+        noise: Standard deviation along the normal, scene units.
+    """
+
+    points_world: Float[Tensor, "point 3"]
+    normals_world: Float[Tensor, "point 3"]
+    noise: Float[Tensor, " point"]
+
+    def take(self, index: Tensor) -> "OrientedPoints":
+        """Keep some points."""
+        return OrientedPoints(
+            points_world=self.points_world[index],
+            normals_world=self.normals_world[index],
+            noise=self.noise[index],
+        )
+
+
+def joined_points(*clouds: OrientedPoints) -> OrientedPoints:
+    """Put clouds in one."""
+    return OrientedPoints(
+        points_world=torch.cat([one.points_world for one in clouds]),
+        normals_world=torch.cat([one.normals_world for one in clouds]),
+        noise=torch.cat([one.noise for one in clouds]),
+    )
+
+
+def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
+    """Give every valid pixel's point, on the plane that its neighbours lie on.
+
+    A point that more views look through than agree with it is dropped. Coarse pixels give
+    points where finer ones have none near: their windows reach across weaker texture.
+
+    Args:
+        maps: Of all resolutions, the coarsest first.
+    """
+    clouds = []
+    for rank, one in enumerate(maps):
+        finer = maps[rank + 1] if rank + 1 < len(maps) else None
+        for view in range(one.valid.shape[0]):
+            wanted = one.valid[view]
+            if finer is not None:
+                wanted = wanted & ~_covered(finer.valid[view], wanted)
+            clouds.append(_of_view(one, view, wanted))
+    return joined_points(*clouds)
+
+
+def _covered(
+    finer: Bool[Tensor, "fine_height fine_width"], like: Bool[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Mark coarse pixels on or beside which a finer one is valid."""
+    share = adaptive_avg_pool2d(finer[None, None].float(), like.shape)
+    return max_pool2d(share, 3, 1, 1)[0, 0] > 0
+
+
+def _of_view(maps: DepthMaps, view: int, wanted: Bool[Tensor, "height width"]) -> OrientedPoints:
+    intrinsics = maps.level.cameras.intrinsics[view]
+    frame = maps.level.cameras.cam_from_world[view]
+    inverse_depth, slope, spread, fine = fitted_planes(
+        maps.inverse_depth[view], maps.valid[view], float(maps.step[view])
+    )
+    fine &= wanted
+    height, width = fine.shape
+    pixels = pixel_centers(width, height, like=intrinsics)[fine]
+    q, slope, spread = inverse_depth[fine], slope[fine], spread[fine]
+    rays = rays_through(pixels, frame, intrinsics)
+    points = maps.level.cameras.centers_world[view] + rays / q[:, None]
+    rest = q - (slope * pixels).sum(dim=-1)
+    plane = torch.cat([slope, rest[:, None]], dim=-1)  # q = plane . (u, v, 1)
+    normals = -normalize(plane @ intrinsics @ frame[:3, :3], dim=-1)
+    # Along the ray dz = dq / q^2; along the normal as much less as the ray is oblique.
+    oblique = -(normalize(rays, dim=-1) * normals).sum(dim=-1)
+    noise = spread / q.square() * rays.norm(dim=-1) * oblique
+    cloud = OrientedPoints(points_world=points, normals_world=normals, noise=noise)
+    borne_out = _denied(maps, view, points) <= maps.agreed[view][fine]
+    return cloud.take(borne_out & (oblique > 0))
+
+
+def fitted_planes(
+    inverse_depth: Float[Tensor, "height width"], valid: Bool[Tensor, "height width"], step: float
+) -> tuple[
+    Float[Tensor, "height width"],
+    Float[Tensor, "height width 2"],
+    Float[Tensor, "height width"],
+    Bool[Tensor, "height width"],
+]:
+    """Fit a plane to the inverse depths round every pixel; a plane's are affine in the pixel.
+
+    Args:
+        inverse_depth: Of the view.
+        valid: Which of them count.
+        step: Change of inverse depth that matters.
+
+    Returns:
+        The planes' inverse depths and slopes a pixel, the standard deviation of that inverse
+        depth, and where there were enough neighbours on the plane.
+    """
+    steps = torch.arange(-_RADIUS, _RADIUS + 1).to(inverse_depth)
+    v, u = (one.reshape(-1) for one in torch.meshgrid(steps, steps, indexing="ij"))
+    basis = torch.stack([torch.ones_like(u), u, v], dim=-1)
+    around = torch.stack(_neighbours(inverse_depth), dim=-1) - inverse_depth[..., None]
+    counted = torch.stack(_neighbours(valid.to(inverse_depth)), dim=-1)
+    chosen = valid.nonzero(as_tuple=True)
+    around, counted = around[chosen] / max(step, 1e-30), counted[chosen]
+    weight = counted * torch.exp(-(around / _REACH_STEPS).square() / 2)
+    fit = torch.zeros_like(around[:, :3])
+    for _ in range(3):  # again with what lies off the plane left out
+        normal = torch.einsum("pk,ki,kj->pij", weight, basis, basis)
+        normal = normal + 1e-3 * torch.eye(3).to(normal)
+        fit = torch.linalg.solve(normal, torch.einsum("pk,ki,pk->pi", weight, basis, around))
+        residual = around - fit @ basis.T
+        weight = counted * torch.exp(-residual.square() / 2)
+    share = weight.sum(dim=-1) / len(basis)
+    variance = (weight * residual.square()).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1e-6)
+    fine = (share >= _LEAST_SHARE) & (fit[:, 0].abs() < 1)
+    # Neighbouring windows overlap, so that their errors are alike: no gain from averaging.
+    results = [torch.zeros_like(inverse_depth) for _ in range(4)]
+    for target, values in zip(
+        results, (fit[:, 0], fit[:, 1], fit[:, 2], variance.sqrt().clamp_min(0.05)), strict=True
+    ):
+        target[chosen] = step * values
+    kept = torch.zeros_like(valid)
+    kept[chosen] = fine
+    return inverse_depth + results[0], torch.stack(results[1:3], dim=-1), results[3], kept
+
+
+def _neighbours(values: Float[Tensor, "height width"]) -> list[Float[Tensor, "height width"]]:
+    height, width = values.shape
+    wide = pad(values[None, None], (_RADIUS,) * 4, mode="constant")[0, 0]
+    side = range(2 * _RADIUS + 1)
+    return [wide[row : row + height, column : column + width] for row in side for column in side]
+
+
+def _denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
+    """Count the views that see something behind the points."""
+    cameras, count = maps.level.cameras, torch.zeros(len(points), dtype=torch.long)
+    count = count.to(points.device)
+    height, width = maps.valid.shape[-2:]
+    for other in range(cameras.num_views):
+        if other == view:
+            continue
+        pixels, depth = project(points, cameras.cam_from_world[other], cameras.intrinsics[other])
+        column, row = pixels.nan_to_num(-1).floor().long().unbind(dim=-1)
+        inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
+        behind = maps.inverse_depth[other, row, column] + _DENIED_STEPS * maps.step[other]
+        count += inside & maps.valid[other, row, column] & (1 / depth > behind)
+    return count
+
+
+def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
+    """Average points that share a cell of a grid and face the same way.
+
+    Args:
+        cloud: Any.
+        cell: Side of the grid's cells, scene units.
+    """
+    points = cloud.points_world
+    if len(points) == 0:
+        return cloud
+    place = ((points - points.amin(dim=0)) / cell).floor().long()
+    side = place.amax(dim=0) + 1
+    facing = cloud.normals_world.abs().argmax(dim=-1)
+    towards = cloud.normals_world.gather(1, facing[:, None])[:, 0] > 0
+    key = (place[:, 0] * side[1] + place[:, 1]) * side[2] + place[:, 2]
+    key = key * 6 + 2 * facing + towards
+    _, index, counts = torch.unique(key, return_inverse=True, return_counts=True)
+    weight = 1 / cloud.noise.double().clamp_min(1e-12).square()
+
+    def averaged(values: Float[Tensor, "point channel"]) -> Float[Tensor, "cell channel"]:
+        total = torch.zeros(len(counts), values.shape[1], dtype=torch.double, device=values.device)
+        return total.index_add(0, index, weight[:, None] * values.double())
+
+    total = averaged(torch.ones_like(points[:, :1]))
+    return OrientedPoints(
+        points_world=(averaged(points) / total).to(points),
+        normals_world=normalize(averaged(cloud.normals_world), dim=-1).to(points),
+        # Errors of windows that overlap, in one view, do not average out: each cell counts
+        # for one measurement of the weight its points have on average.
+        noise=(counts / total[:, 0]).sqrt().to(points),
+    )
+
+
+def sparse_oriented(
+    scene: SparseScene,
+    index: Int[Tensor, " chosen"],
+    dense: OrientedPoints,
+    reach: float,
+) -> OrientedPoints:
+    """Give points of the sparse cloud normals, where there are no dense ones.
+
+    A normal is that of the plane through the nearest points, sparse and dense; a point whose
+    neighbours lie on none is left out.
+
+    Args:
+        scene: Cameras, cloud and tracks.
+        index: Trusted points.
+        dense: Points with normals.
+        reach: A dense point nearer than this makes a sparse one needless.
+    """
+    points = scene.points_world[index]
+    around = torch.cat([points, dense.points_world.to(points)]).detach().cpu().numpy()
+    distance, nearest = cKDTree(around).query(
+        points.detach().cpu().numpy(), k=min(_NEIGHBOURS, len(around))
+    )
+    by_dense = torch.from_numpy((nearest >= len(points)) & (distance < reach)).any(dim=1)
+    steps = torch.from_numpy(around[nearest] - points.detach().cpu().numpy()[:, None]).double()
+    steps = steps - steps.mean(dim=1, keepdim=True)
+    width, axes = torch.linalg.eigh(steps.mT @ steps / steps.shape[1])
+    normals = axes[:, :, 0].to(points)
+    flat = (width[:, 0] < _FLAT**2 * width[:, 1]).to(points.device)
+    towards = torch.zeros_like(scene.points_world).index_add(
+        0,
+        scene.observation_point,
+        normalize(
+            scene.cameras.centers_world[scene.observation_view]
+            - scene.points_world[scene.observation_point],
+            dim=-1,
+        ),
+    )[index]
+    facing = (normals * normalize(towards, dim=-1)).sum(dim=-1)
+    cloud = OrientedPoints(
+        points_world=points,
+        normals_world=normals * facing.sign()[:, None],
+        noise=width[:, 0].sqrt().to(points),
+    )
+    return cloud.take(flat & ~by_dense.to(points.device) & (facing.abs() > _FACING))

@@ -1,0 +1,135 @@
+"""Which faces of a closed surface the photographs bear out."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.coarse.densify import DepthMaps
+from pimper_torch.geometry.components import graph_components
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.records import Cameras, Record
+
+# Cosine between a face's normal and the ray to a camera, above which the view shows it.
+_FACING = 0.1
+
+# Steps of inverse depth in front of what a view sees, beyond which it denies a face.
+_DENIED_STEPS = 4.0
+
+# Tone (root of radiance over the bright level) above which a pixel shows something: a
+# twentieth of the bright level's radiance, the pedestal left out.
+_LIT_TONE = 0.06**0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Evidence(Record):
+    """What the photographs say about faces.
+
+    Attributes:
+        seen: In how many views a face is unhidden, within the picture, not turned away.
+        lit: In how many of them its pixel shows more than darkness.
+        denied: How many views see something behind it.
+    """
+
+    seen: Int[Tensor, " face"]
+    lit: Int[Tensor, " face"]
+    denied: Int[Tensor, " face"]
+
+
+def evidence(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], maps: DepthMaps
+) -> Evidence:
+    """Ask every view about the middle of every face."""
+    level, cameras = maps.level, maps.level.cameras
+    middle = vertices[faces].mean(dim=1)
+    normals = normalize(face_normals(vertices, faces), dim=-1)
+    side = (vertices[faces] - vertices[faces].roll(1, dims=1)).norm(dim=-1).amax(dim=1)
+    caster = RayCaster(vertices, faces)
+    seen, lit, denied = (torch.zeros_like(faces[:, 0]) for _ in range(3))
+    for view in range(cameras.num_views):
+        asked, column, row, depth = _shown(middle, cameras, view)
+        center = cameras.centers_world[view]
+        towards = normalize(center - middle[asked], dim=-1)
+        facing = (towards * normals[asked]).sum(dim=-1) > _FACING
+        asked, column, row, depth = asked[facing], column[facing], row[facing], depth[facing]
+        column = column.clamp_max(level.tone.shape[-1] - 1)
+        row = row.clamp_max(level.tone.shape[-2] - 1)
+        behind = maps.inverse_depth[view, row, column] + _DENIED_STEPS * maps.step[view]
+        denied[asked] += maps.valid[view, row, column] & (1 / depth > behind)
+        open_ = ~caster.occluded(middle[asked], center, 0.5 * side[asked])
+        open_ &= level.usable[view, row, column]
+        seen[asked] += open_
+        lit[asked] += open_ & (level.tone[view, row, column] > _LIT_TONE)
+    return Evidence(seen=seen, lit=lit, denied=denied)
+
+
+def _shown(
+    points: Float[Tensor, "point 3"], cameras: Cameras, view: int
+) -> tuple[Int[Tensor, " shown"], Int[Tensor, " shown"], Int[Tensor, " shown"], Tensor]:
+    """List the points inside a view's picture: which, column, row, depth."""
+    pixels, depth = project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
+    within = ((pixels >= 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
+    column, row = pixels[within].floor().long().unbind(dim=-1)
+    return within.nonzero()[:, 0], column, row, depth[within]
+
+
+def near_points(
+    places: Float[Tensor, "place 3"], points: Float[Tensor, "point 3"], reach: float
+) -> Bool[Tensor, " place"]:
+    """Mark places with a point within reach."""
+    if len(points) == 0:
+        return torch.zeros(len(places), dtype=torch.bool, device=places.device)
+    tree = cKDTree(points.detach().cpu().numpy())
+    distance, _ = tree.query(places.detach().cpu().numpy(), distance_upper_bound=reach)
+    return torch.from_numpy(distance <= reach).to(places.device)
+
+
+def without_small_holes(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    kept: Bool[Tensor, " face"],
+    largest: float,
+) -> Bool[Tensor, " face"]:
+    """Take back dropped faces that hang together over less than an area, in scene units."""
+    pairs, _ = face_pairs(faces)
+    dropped = pairs[~kept[pairs].any(dim=1)]
+    return kept | (~kept & (_piece_areas(vertices, faces, dropped) < largest))
+
+
+def large_pieces(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    counted: Bool[Tensor, " face"],
+    share: float,
+) -> Bool[Tensor, " face"]:
+    """Mark faces of pieces that hold a share of all the area that counts."""
+    pairs, _ = face_pairs(faces)
+    areas = _piece_areas(vertices, faces, pairs, counted)
+    whole = (_areas(vertices, faces) * counted).sum()
+    return areas >= share * whole
+
+
+def _piece_areas(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    links: Int[Tensor, "link 2"],
+    counted: Bool[Tensor, " face"] | None = None,
+) -> Float[Tensor, " face"]:
+    """Give the area of the piece that each face belongs to."""
+    label = graph_components(links, len(faces))
+    area = _areas(vertices, faces)
+    if counted is not None:
+        area = area * counted
+    total = torch.zeros_like(area).index_add(0, label, area)
+    return total[label]
+
+
+def _areas(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, " face"]:
+    return face_normals(vertices, faces).norm(dim=-1) / 2
