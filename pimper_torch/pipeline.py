@@ -8,17 +8,49 @@ from torch import nn
 
 from pimper_torch.alignment.align import Align, AlignConfig
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
-from pimper_torch.config import build, find_config, overlay, read_mapping
+from pimper_torch.coarse.adapt import Adapt, AdaptConfig
+from pimper_torch.coarse.enclose import Enclose, EncloseConfig
+from pimper_torch.config import build, find_config, overlay, read_mapping, require
+from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.radiometry import Encoding
-from pimper_torch.records import Reconstruction, Views
+from pimper_torch.records import (
+    CoarseMesh,
+    DepthPatches,
+    Mesh,
+    Reconstruction,
+    SparseScene,
+    Surface,
+    SweptPatches,
+    Views,
+)
 from pimper_torch.refinement.refine import Refine, RefineConfig
 from pimper_torch.reporting import Observer, Silent, recorded
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.sweep.sweep import Sweep, SweepConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoundsConfig:
+    """How often the middle of the chain runs, and on what.
+
+    Attributes:
+        scales: Of the photographs, one a round, coarse to fine; 1 is their own size. Without
+            any, the published chain runs once: facets one by one, then joined.
+        all_round: Whether the coarse mesh is made of what all views see, in place of the
+            cloud's triangulation in one reference view.
+    """
+
+    scales: tuple[float, ...] = (0.25, 0.5)
+    all_round: bool = True
+
+    def __post_init__(self) -> None:
+        positive = all(scale > 0 for scale in self.scales)
+        require(positive, "rounds.scales", self.scales, "above 0 each")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,14 +61,19 @@ class PimperConfig:
     """
 
     photographs: Encoding = field(default_factory=Encoding)
+    rounds: RoundsConfig = field(default_factory=RoundsConfig)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
     triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
+    enclose: EncloseConfig = field(default_factory=EncloseConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
     factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
     integrate: IntegrateConfig = field(default_factory=IntegrateConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
+    sweep: SweepConfig = field(default_factory=SweepConfig)
+    fuse: FuseConfig = field(default_factory=FuseConfig)
+    adapt: AdaptConfig = field(default_factory=AdaptConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
 
 
@@ -50,7 +87,7 @@ class Pimper(nn.Module):
     gradients run from the photographs' radiance in ``warp`` to the vertices of the mesh.
 
     Source: Sabzevari, Del Bue, Murino: PiMPeR, piecewise dense 3D reconstruction from
-    multi-view and multi-illumination images, 2015.
+    multi-view and multi-illumination images, 2015. The rounds are ours.
     """
 
     def __init__(
@@ -61,15 +98,21 @@ class Pimper(nn.Module):
         self.observer = observer or Silent()
         self.reconstruct: nn.Module = Reconstruct(config.reconstruct)
         self.triangulate: nn.Module = Triangulate(config.triangulate)
+        self.enclose: nn.Module = Enclose(config.enclose)
         self.decompose: nn.Module = Decompose(config.decompose)
         self.warp: nn.Module = Warp(config.warp)
         self.factorize: nn.Module = Factorize(config.factorize)
         self.integrate: nn.Module = Integrate(config.integrate)
         self.align: nn.Module = Align(config.align)
         self.refine: nn.Module = Refine(config.refine)
+        self.sweep: nn.Module = Sweep(config.sweep)
+        self.fuse: nn.Module = Fuse(config.fuse)
+        self.adapt: nn.Module = Adapt(config.adapt)
         self.extract: nn.Module = Extract(config.extract)
 
-    def forward(self, views: Views, sparse_model: Path | None = None) -> Reconstruction:
+    def forward(
+        self, views: Views, sparse_model: Path | None = None, mesh: Mesh | None = None
+    ) -> Reconstruction:
         """Reconstruct the surface that the photographs show.
 
         Args:
@@ -77,21 +120,50 @@ class Pimper(nn.Module):
                 is to run on.
             sparse_model: Folder of a COLMAP model of these photographs, used instead of
                 running structure from motion.
+            mesh: A rough surface in that model's frame, used instead of the photographs' own.
 
         Raises:
             PimperError: What was found at which stage, what was needed, what to do.
         """
         with recorded(self, self.observer) as report:
             scene = self.reconstruct(views, sparse_model)
-            coarse = self.triangulate(scene)
-            patches = self.decompose(coarse, scene.cameras)
-            seen = self.warp(scene.views, scene.cameras, patches)
-            depths = self.integrate(self.factorize(seen))
-            aligned = self.align(depths)
-            mesh = self.extract(self.refine(aligned))
+            chain = self._in_rounds if self.config.rounds.scales else self._published
+            coarse, patches, surface = chain(scene, mesh)
+            found = self.extract(surface)
         return Reconstruction(
-            mesh=mesh, scene=scene, coarse=coarse, patches=aligned, report=tuple(report)
+            mesh=found, scene=scene, coarse=coarse, patches=patches, report=tuple(report)
         )
+
+    def _published(
+        self, scene: SparseScene, mesh: Mesh | None
+    ) -> tuple[CoarseMesh, DepthPatches, Surface]:
+        """Every facet by itself, then all joined."""
+        coarse = self._coarse(scene, mesh)
+        patches = self.decompose(coarse, scene.cameras)
+        seen = self.warp(scene.views, scene.cameras, patches)
+        depths = self.integrate(self.factorize(seen))
+        aligned = self.align(depths)
+        return coarse, aligned, self.refine(aligned)
+
+    def _in_rounds(
+        self, scene: SparseScene, mesh: Mesh | None
+    ) -> tuple[CoarseMesh, SweptPatches, Surface]:
+        """All facets together, coarse to fine: every round registers on the one before."""
+        views, cameras = scene.views, scene.cameras
+        coarse, surface = self._coarse(scene, mesh), None
+        for scale in self.config.rounds.scales:
+            if surface is not None:
+                coarse = self.adapt(swept, surface)
+            patches = self.decompose(coarse, cameras, surface, scale)
+            seen = self.warp(views, cameras, patches)
+            swept = self.sweep(views, cameras, seen, self.factorize(seen))
+            surface = self.fuse(swept)
+        return coarse, swept, surface
+
+    def _coarse(self, scene: SparseScene, mesh: Mesh | None) -> CoarseMesh:
+        all_round = mesh is not None or self.config.rounds.all_round
+        found: CoarseMesh = self.enclose(scene, mesh) if all_round else self.triangulate(scene)
+        return found
 
 
 def load_config(

@@ -17,7 +17,7 @@ from pimper_torch.geometry.surfaces import (
     face_normals,
     face_pairs,
 )
-from pimper_torch.records import CoarseMesh, Mesh, Surface
+from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
 
 # A lattice vertex lies on an edge when its coordinate opposite to it is below this: lattices
 # have far fewer than a million pieces.
@@ -47,10 +47,10 @@ class AdaptConfig:
             than this share of the mesh's area together.
     """
 
-    max_departure: float = 4.0
+    max_departure: float = 2.0
     max_spread_deg: float = 12.0
     max_residual: float = 3.0
-    min_samples: float = 24.0
+    min_samples: float = 12.0
     max_facets: int = 5000
     max_hole: float = 0.02
 
@@ -72,14 +72,20 @@ class Adapt(nn.Module):
 
     def forward(
         self,
-        coarse: CoarseMesh,
+        swept: SweptPatches,
         surface: Surface,
-        spacing: float,
-        residual: Float[Tensor, " facet"] | None = None,
-        seen: Bool[Tensor, " facet"] | None = None,
     ) -> CoarseMesh:
-        """Give the adapted mesh."""
-        return adapt(coarse, surface, spacing, self.config, residual=residual, seen=seen)
+        """Adapt the mesh that the patches stand on to the surface that was found.
+
+        Lengths count in samples of these patches; the residual is their photometry's.
+        """
+        patches = swept.patches
+        residual = torch.full((patches.num_patches,), torch.nan)
+        for templates, found in zip(patches.buckets, swept.photometric.buckets, strict=True):
+            known = torch.where(found.determined, found.convergence.residual, torch.nan)
+            residual = residual.to(known).index_copy(0, templates.facet, known)
+        spacing = float(patches.buckets[0].spacing[0])
+        return adapt(patches.coarse, surface, spacing, self.config, residual=residual)
 
 
 @torch.no_grad()

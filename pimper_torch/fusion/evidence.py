@@ -2,20 +2,21 @@ r"""What is known of the surface, as linear equations in the heights of the latt
 
 A vertex lies at ``x_v = q_v + h_v d_v``: its place on the flat facet, and the height along its
 direction. Every kind of evidence is a set of equations :math:`\sum_k c_k h_{u_k} = t`, each with
-the standard deviation that its source claims.
+the variance that its source claims.
 """
 
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import FacetPoints, Record
 
-# A ray that leaves the surface at a flatter angle than this (cosine) tells no height.
+# A direction that leaves the surface at a flatter angle than this (cosine) tells no height.
 _LEAST_FACING = 0.2
 
 
@@ -27,9 +28,9 @@ class Evidence(Record):
         unknowns: Vertices that each equation ties together.
         coefficients: Of their heights.
         targets: What these should add up to.
-        information: Inverse variance of the target, as its source claims.
-        correlated: So many neighbouring equations err alike: what they say together is
-            counted once in ``information``, but each errs as little as all of them.
+        information: Inverse variance of the target, as its source claims, or what is left of it
+            where neighbours err alike: together they must not count for more than they know.
+        correlated: How many times less than the variance so enlarged each target errs by.
         judged: Whether residuals may tell what the variances are to be multiplied by.
     """
 
@@ -37,7 +38,7 @@ class Evidence(Record):
     coefficients: Float[Tensor, "equation term"]
     targets: Float[Tensor, " equation"]
     information: Float[Tensor, " equation"]
-    correlated: Float[Tensor, " equation"] | float = 1.0
+    correlated: Float[Tensor, " equation"]
     judged: bool = True
 
     def residual(self, heights: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
@@ -48,8 +49,9 @@ class Evidence(Record):
 def edges_of(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
     """List the edges of a mesh once each."""
     ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
-    key = torch.unique(ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1])
-    return torch.stack([key // (int(faces.max()) + 1), key % (int(faces.max()) + 1)], dim=1)
+    count = int(faces.max()) + 1
+    key = torch.unique(ends[:, 0] * count + ends[:, 1])  # sorting rows takes twenty times as long
+    return torch.stack([key // count, key % count], dim=1)
 
 
 def slopes(
@@ -62,8 +64,8 @@ def slopes(
 ) -> Evidence:
     r"""Say that edges are at right angles to the normals at their ends.
 
-    :math:`(n_a + n_b) \cdot (x_b - x_a) = 0`: exact on a parabola. An angle's error moves one
-    end by the edge's length times it.
+    :math:`(n_a + n_b) \cdot (x_b - x_a) = 0`, which is exact on a parabola. An error of the
+    angle moves one end by the edge's length times it.
 
     Args:
         edges: Those whose ends have normals.
@@ -71,25 +73,48 @@ def slopes(
         directions: ``d``, unit.
         normals: Unit, outward.
         variance: Of the normals, squared radians.
-        shared: What is added to it so that neighbours that err alike count as what they say
-            together; each errs by less.
+        shared: Of what neighbours err by alike, times their number: added to the variance, it
+            makes all of them together count for what they know.
     """
     one, other = edges.unbind(dim=1)
     middle = normalize(normals[one] + normals[other], dim=-1)
     step = flat[other] - flat[one]
-    length = step.norm(dim=-1)
     own = (variance[one] + variance[other]) / 2
     added = torch.zeros_like(own) if shared is None else (shared[one] + shared[other]) / 2
-    spread = (own + added) * length.square()
-    coefficients = torch.stack(
+    leaning = torch.stack(
         [-(middle * directions[one]).sum(dim=-1), (middle * directions[other]).sum(dim=-1)], dim=1
     )
     return Evidence(
         unknowns=edges,
-        coefficients=coefficients,
+        coefficients=leaning,
         targets=-(middle * step).sum(dim=-1),
-        information=1 / spread,
+        information=1 / ((own + added) * step.square().sum(dim=-1)),
         correlated=(own + added) / own,
+    )
+
+
+def kept_slopes(
+    edges: Int[Tensor, "edge 2"],
+    flat: Float[Tensor, "vertex 3"],
+    directions: Float[Tensor, "vertex 3"],
+    shape: Float[Tensor, "vertex 3"],
+    carried: Float[Tensor, " vertex"],
+    variance: float,
+) -> Evidence:
+    """Say that edges lie as they do on the surface that there is, where light tells nothing.
+
+    Args:
+        edges: Those without normals at both ends.
+        flat: ``q``.
+        directions: ``d``, unit.
+        shape: Normals of the surface.
+        carried: Its heights.
+        variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
+    """
+    found = slopes(edges, flat, directions, shape, torch.full_like(carried, variance))
+    return found.replace(
+        targets=(found.coefficients * carried[edges]).sum(dim=1),
+        judged=False,
     )
 
 
@@ -105,9 +130,9 @@ def swept_heights(
     Args:
         carried: Heights of the surface that was swept.
         offsets: Along its normals.
-        information: Of the offsets; vertices without any say nothing.
+        information: Of the offsets, each vertex's own share; one without says nothing.
         facing: Cosine between normals and directions.
-        correlated: See :class:`Evidence`.
+        correlated: Vertices in a window, which have a common offset.
     """
     known = ((information > 0) & (facing > _LEAST_FACING)).nonzero()[:, 0]
     steep = facing[known]
@@ -116,7 +141,7 @@ def swept_heights(
         coefficients=torch.ones_like(steep)[:, None],
         targets=carried[known] + offsets[known] / steep,
         information=information[known] * steep.square(),
-        correlated=correlated,
+        correlated=torch.full_like(steep, correlated),
     )
 
 
@@ -130,66 +155,46 @@ def cloud_points(
 ) -> Evidence:
     """Say that points of the cloud lie on the surface.
 
-    Each is carried to the face that it lies above or below, along that face's direction.
+    Each is tied to the face that it lies above or below along the nearest vertex's direction.
 
     Args:
         points: With covariances.
-        surface: Where the vertices lie now.
+        surface: Where the vertices lie now; constant.
         faces: Of the lattice.
         carried: Heights of the vertices now.
-        directions: ``d``.
+        directions: ``d``, unit.
         reach: Points further off are not of this surface.
     """
-    caster = RayCaster(surface, faces)
-    places = points.points_world
-    corner = directions[faces]
-    # The direction of a face near the point's own facet: start from the nearest along any.
-    best = None
-    for sign in (1.0, -1.0):
-        along = sign * normalize(_direction_at(points, directions, faces, surface), dim=-1)
-        hits = caster.cast(places, along)
-        distance = torch.where(hits.face >= 0, hits.distance, torch.inf)
-        if best is None:
-            best = (hits.face, hits.barycentric, distance, sign * torch.ones_like(distance), along)
-        else:
-            nearer = distance < best[2]
-            best = (
-                torch.where(nearer, hits.face, best[0]),
-                torch.where(nearer[:, None], hits.barycentric, best[1]),
-                torch.where(nearer, distance, best[2]),
-                torch.where(nearer, torch.full_like(distance, sign), best[3]),
-                torch.where(nearer[:, None], along, best[4]),
-            )
-    assert best is not None
-    face, barycentric, distance, sign, along = best
-    met = (face >= 0) & (distance <= reach)
-    face, barycentric = face[met], barycentric[met]
-    line = along[met] * sign[met][:, None]
-    here = (barycentric[..., None] * corner[face]).sum(dim=1)
-    # The surface must move by what separates the point from it, against the way it was cast.
-    lift = -sign[met] * distance[met] / (here * line).sum(dim=-1).clamp_min(_LEAST_FACING)
+    tree = cKDTree(surface.detach().cpu().numpy())
+    _, nearest = tree.query(points.points_world.detach().cpu().numpy())
+    line = directions[torch.as_tensor(nearest, device=faces.device)]
+    hits, lift = _above_or_below(RayCaster(surface, faces), points.points_world.to(line), line)
+    met = (hits.face >= 0) & (lift.abs() <= reach)
+    corners, share, line = faces[hits.face[met]], hits.barycentric[met].to(carried), line[met]
+    along = (share[..., None] * directions[corners]).sum(dim=1)
+    facing = (along * line).sum(dim=-1).clamp_min(_LEAST_FACING)
     covariance = points.covariance_world[met].to(line)
     variance = torch.einsum("pi,pij,pj->p", line, covariance, line)
-    unknowns = faces[face]
     return Evidence(
-        unknowns=unknowns,
-        coefficients=barycentric,
-        targets=(barycentric * carried[unknowns]).sum(dim=1) + lift,
-        information=1 / variance.clamp_min(1e-30),
+        unknowns=corners,
+        coefficients=share,
+        targets=(share * carried[corners]).sum(dim=1) + lift[met] / facing,
+        information=1 / variance.clamp_min(torch.finfo(variance.dtype).tiny**0.5),
+        correlated=torch.ones_like(variance),
     )
 
 
-def _direction_at(
-    points: FacetPoints,
-    directions: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    surface: Float[Tensor, "vertex 3"],
-) -> Float[Tensor, "point 3"]:
-    """Give the direction at the vertex nearest to each point."""
-    from scipy.spatial import cKDTree
-
-    used = torch.unique(faces)
-    _, nearest = cKDTree(surface[used].detach().cpu().numpy()).query(
-        points.points_world.detach().cpu().numpy()
+def _above_or_below(
+    caster: RayCaster, places: Float[Tensor, "point 3"], line: Float[Tensor, "point 3"]
+) -> tuple[Hits, Float[Tensor, " point"]]:
+    """Find the nearer of the faces on both sides, and how far above it each place is."""
+    ahead, behind = caster.cast(places, line), caster.cast(places, -line)
+    first = ahead.distance <= behind.distance
+    return (
+        Hits(
+            face=torch.where(first, ahead.face, behind.face),
+            distance=torch.where(first, ahead.distance, behind.distance),
+            barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
+        ),
+        torch.where(first, -ahead.distance, behind.distance),
     )
-    return directions[used[torch.as_tensor(nearest, device=faces.device)]]

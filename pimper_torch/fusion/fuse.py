@@ -9,15 +9,17 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
-from pimper_torch.fusion.estimate import fuse_evidence
 from pimper_torch.fusion.drift import drift
+from pimper_torch.fusion.estimate import Fused, fuse_evidence
 from pimper_torch.fusion.evidence import (
+    Evidence,
     cloud_points,
     edges_of,
+    kept_slopes,
     slopes,
     swept_heights,
 )
-from pimper_torch.fusion.union import Union, ray_directions, unite
+from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
@@ -25,112 +27,215 @@ from pimper_torch.records import (
     Convergence,
     DepthPatches,
     Depths,
-    FacetPoints,
-    PatchSet,
+    Record,
     StopCause,
     Surface,
     SweptPatches,
 )
 
+# Information that every vertex holds to where it is by, in units of one over its spacing
+# squared: as if it were known to 100 spacings. It decides where nothing else does.
+_HOLD = 1e-4
+
+# Points of the cloud further off the surface than this, in its spacings, are not of it.
+_REACH = 20.0
+
+# The squared length of a two-dimensional Gaussian vector has this median, in variances.
+_MEDIAN_OF_TILT = 2 * math.log(2)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FuseConfig:
-    """How the lattice is laid, and how its evidence is weighed."""
+    """Which evidence takes part, and how the noise of each is found.
+
+    Attributes:
+        samples_per_vertex: Template samples between neighbouring vertices of the surface.
+            Time and memory fall with its square.
+        slopes: Whether normals take part.
+        heights: Whether swept heights do.
+        points: Whether the cloud's points do.
+        drift_rounds: How often the tilt that all normals of a facet share is estimated, and
+            taken out of them; 0 trusts them at all wavelengths.
+        noise_rounds: Solves in which the noise of each kind of evidence is estimated and
+            outliers lose weight, for each estimate of the tilt and after them.
+        outlier_samples: How far, in samples, a patch may lie from the others before they
+            outvote it, where three or more meet.
+    """
 
     samples_per_vertex: float = 1.0
-    window_samples: float = 1.5
-    rounds: int = 3
-    bias_rounds: int = 2
-    outlier_samples: float = 4.0
-    heights: bool = True
     slopes: bool = True
+    heights: bool = True
     points: bool = True
+    drift_rounds: int = 2
+    noise_rounds: int = 3
+    outlier_samples: float = 4.0
+
+    def __post_init__(self) -> None:
+        for name in ("samples_per_vertex", "outlier_samples"):
+            require(getattr(self, name) > 0, f"fuse.{name}", getattr(self, name), "above 0")
+        require(self.drift_rounds >= 0, "fuse.drift_rounds", self.drift_rounds, "0 or more")
+        require(self.noise_rounds >= 1, "fuse.noise_rounds", self.noise_rounds, "1 or more")
+        some = self.slopes or self.heights or self.points
+        require(some, "fuse.slopes", self.slopes, "true unless heights or points are")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Task(Record):
+    """The lattice, and what the patches together say at its vertices.
+
+    Attributes:
+        lattice: The facets, subdivided.
+        facets: The coarse mesh's faces.
+        directions: Along which heights count.
+        union: What the patches say.
+        places: Of the vertices on what the templates carry.
+        shape: The normals of that.
+        edges: Of the lattice.
+        spacing: Of its vertices, scene units.
+        correlated: Vertices in a window of the sweep.
+    """
+
+    lattice: Lattice
+    facets: Int[Tensor, "facet 3"]
+    directions: Float[Tensor, "vertex 3"]
+    union: Union
+    places: Float[Tensor, "vertex 3"]
+    shape: Float[Tensor, "vertex 3"]
+    edges: Int[Tensor, "edge 2"]
+    spacing: float
+    correlated: float
 
 
 class Fuse(nn.Module):
-    """Fuse."""
+    """Solve for the surface that all evidence suits best, over the whole connected lattice.
+
+    Unknown is the height of every lattice vertex along the coarse mesh's smoothed normal.
+    Evidence is linear in it: edges are at right angles to photometric normals, the sweep knows
+    heights, the cloud's points lie on the surface, and where no light tells anything the
+    surface keeps the slopes it has. Each kind comes with the variances that its source claims;
+    what these must be multiplied by is estimated from the residuals
+    (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet err alike, as they were found
+    under one light: the tilt they share is estimated from the positions and taken out
+    (:mod:`~pimper_torch.fusion.drift`).
+
+    The surface's normals are its own. Differentiable in what the templates carry, normals,
+    albedo and swept offsets, through the last solve; its weights, the tilts, and the confidence
+    are constants.
+    """
 
     def __init__(self, config: FuseConfig | None = None) -> None:
         super().__init__()
         self.config = config or FuseConfig()
 
     def forward(self, swept: SweptPatches) -> Surface:
+        """Fuse what is known of all patches.
+
+        The convergence's residual is the root mean square distance that the surface moved, in
+        scene units; its iterations are the solves.
+        """
         config, patches = self.config, swept.patches
-        mesh = patches.coarse.mesh
+        facets = patches.coarse.mesh.faces
         spacing = vertex_spacing(patches, config.samples_per_vertex)
-        lattice = subdivide(mesh.vertices_world.detach(), mesh.faces, spacing)
+        lattice = subdivide(patches.coarse.mesh.vertices_world.detach(), facets, spacing)
         directions = ray_directions(lattice, patches.coarse).detach()
-        union = unite(carried_reliefs(swept), lattice, directions, config.outlier_samples, swept.buckets)
-        carried = union.heights
-        places = lattice.points + carried[:, None] * directions
-        own = vertex_normals(places.detach(), lattice.faces)
-        edges = edges_of(lattice.faces)
-        half = math.radians(HALF_CONFIDENCE_DEG)
-        variance = half**2 * (1 / union.confidence.clamp(1e-4, 1 - 1e-4) - 1)
-        known = union.seen & (union.confidence > 0)
-        normals = union.normals_world
-        both = known[edges].all(dim=1)
-        # Where light says nothing the surface keeps its slopes, as well as these are known.
-        angle = (normals[known] * own[known]).sum(dim=-1).clamp(-1, 1).acos()
-        doubt = (1.4826 * angle.median()).square() if len(angle) else own.new_tensor(half**2)
-        facing = (own * directions).sum(dim=-1)
-        ends = edges[~both] if config.slopes else edges
-        kept = slopes(ends, lattice.points, directions, own, doubt.expand(len(own)))
-        kept = kept.replace(targets=(kept.coefficients * carried[ends]).sum(dim=1), judged=False)
-        kinds = [kept]
-        if config.heights:
-            correlated = 4 * math.pi * (config.window_samples / config.samples_per_vertex) ** 2
-            kinds.append(
-                swept_heights(carried, union.offsets, union.information, facing, correlated)
-            )
-        cloud = patches.coarse.points
-        if config.points and cloud is not None and len(cloud.points_world):
-            reach = 20 * float(spacing.median())
-            kinds.append(
-                cloud_points(cloud, places.detach(), lattice.faces, carried, directions, reach)
-            )
-        weakest = 1e-4 / (spacing.median().double() ** 2)
-        prior = weakest.expand(len(carried))
-        generator = torch.Generator().manual_seed(0)
-        self.kinds = kinds
-        shape = own
-        self.log = []
-        factors = None
-        fused = None
-        if config.slopes:
-            for again in range(config.bias_rounds):
-                field = drift(lattice, mesh.faces, normals, shape, known)
-                length = field.tilt.norm(dim=-1)[field.known]
-                bias = (length.square().median() / 1.386) if len(length) else variance.new_tensor(0.0)
-                self.log.append(math.degrees(float(bias) ** 0.5))
-                shared = bias * field.count[lattice.facet]
-                found = slopes(edges[both], lattice.points, directions, normals, variance, shared)
-                fused = fuse_evidence([*kinds, found], carried, prior, config.rounds, generator)
-                self.log.append([round(f, 3) for f in fused.factors])
-                vertices = lattice.points + fused.heights.to(carried)[:, None] * directions
-                shape = vertex_normals(vertices, lattice.faces)
-            field = drift(lattice, mesh.faces, normals, shape, known)
-            normals = normalize(normals + field.at(lattice, mesh.faces), dim=-1)
-            found = slopes(edges[both], lattice.points, directions, normals, variance)
-            kinds.append(found)
-        fused = fuse_evidence(kinds, carried, prior, config.rounds, generator)
-        self.factors = fused.factors
-        heights = fused.heights.to(carried)
+        union = unite(
+            carried_reliefs(swept), lattice, directions, config.outlier_samples, swept.buckets
+        )
+        places = (lattice.points + union.heights[:, None] * directions).detach()
+        task = _Task(
+            lattice=lattice,
+            facets=facets,
+            directions=directions,
+            union=union,
+            places=places,
+            shape=vertex_normals(places, lattice.faces),
+            edges=edges_of(lattice.faces),
+            spacing=float(spacing.median()),
+            correlated=swept.averaged / config.samples_per_vertex**2,
+        )
+        fused, solves = self._solved(task, self._positions(task, swept))
+        heights = fused.heights.to(union.heights)
         vertices = lattice.points + heights[:, None] * directions
-        shape = vertex_normals(vertices, lattice.faces)
+        moved = (heights - union.heights).detach()
         return Surface(
             vertices_world=vertices,
             faces=lattice.faces,
             facet=lattice.facet,
             barycentric=lattice.barycentric,
-            normals_world=shape,
+            normals_world=vertex_normals(vertices, lattice.faces),
             albedo=union.albedo,
             confidence=union.confidence,
             convergence=Convergence(
-                iterations=torch.full((1,), config.rounds),
-                residual=(heights - carried).detach().square().mean().sqrt()[None],
-                cause=torch.full((1,), int(StopCause.CONVERGED)),
+                iterations=torch.full((1,), solves, device=moved.device),
+                residual=moved.square().mean().sqrt()[None],
+                cause=torch.full((1,), int(StopCause.CONVERGED), device=moved.device),
             ),
         )
+
+    def _positions(self, task: _Task, swept: SweptPatches) -> list[Evidence]:
+        """List what is known of places: heights and points."""
+        found = []
+        union, lattice = task.union, task.lattice
+        if self.config.heights:
+            facing = (task.shape * task.directions).sum(dim=-1).detach()
+            found.append(
+                swept_heights(
+                    union.heights, union.offsets, union.information, facing, task.correlated
+                )
+            )
+        cloud = swept.patches.coarse.points
+        if self.config.points and cloud is not None:
+            found.append(
+                cloud_points(
+                    cloud,
+                    task.places,
+                    lattice.faces,
+                    union.heights,
+                    task.directions,
+                    _REACH * task.spacing,
+                )
+            )
+        return found
+
+    def _solved(self, task: _Task, positions: list[Evidence]) -> tuple[Fused, int]:
+        config, union = self.config, task.union
+        variance = _variance(union.confidence)
+        known = union.seen & (union.confidence > 0)
+        if not config.slopes:
+            known = torch.zeros_like(known)
+        both = known[task.edges].all(dim=1)
+        straight = task.edges[both]
+        flat, along = task.lattice.points, task.directions
+        kept = kept_slopes(
+            task.edges[~both], flat, along, task.shape, union.heights, self._doubt(task, known)
+        )
+        hold = torch.full_like(union.heights, _HOLD / task.spacing**2)
+
+        def solve(found: Evidence) -> Fused:
+            kinds = [kept, *positions, found]
+            return fuse_evidence(kinds, union.heights, hold, config.noise_rounds)
+
+        shape, normals, solves = task.shape, union.normals_world, config.noise_rounds
+        for _ in range(config.drift_rounds if positions and bool(both.any()) else 0):
+            with torch.no_grad():
+                apart = drift(task.lattice, task.facets, normals, shape, known)
+                typical = apart.tilt.norm(dim=-1)[apart.known].square().median()
+                shared = typical / _MEDIAN_OF_TILT * apart.count[task.lattice.facet]
+                fused = solve(slopes(straight, flat, along, normals, variance, shared))
+                heights = fused.heights.to(flat)
+                shape = vertex_normals(flat + heights[:, None] * along, task.lattice.faces)
+                solves += config.noise_rounds
+        if solves > config.noise_rounds:
+            apart = drift(task.lattice, task.facets, normals, shape, known)
+            normals = normalize(normals + apart.at(task.lattice, task.facets), dim=-1)
+        return solve(slopes(straight, flat, along, normals, variance)), solves
+
+    def _doubt(self, task: _Task, known: Bool[Tensor, " vertex"]) -> float:
+        """Estimate the variance of the slopes that the surface has already, from the others."""
+        if not bool(known.any()):
+            return math.radians(HALF_CONFIDENCE_DEG) ** 2
+        apart = (task.union.normals_world - task.shape)[known].detach().norm(dim=-1)
+        return max(float(apart.square().median()) / _MEDIAN_OF_TILT, 1e-6)
 
 
 def carried_reliefs(swept: SweptPatches) -> DepthPatches:
@@ -148,8 +253,7 @@ def carried_reliefs(swept: SweptPatches) -> DepthPatches:
     )
 
 
-def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
-    """Give each facet's wanted distance between neighbouring vertices, scene units."""
-    facet = torch.cat([bucket.facet for bucket in patches.buckets])
-    spacing = torch.cat([bucket.spacing for bucket in patches.buckets])
-    return torch.empty_like(spacing).index_put((facet,), spacing * samples_per_vertex)
+def _variance(confidence: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
+    """Undo confidence: the squared standard error of normals, in radians."""
+    half = math.radians(HALF_CONFIDENCE_DEG)
+    return half**2 * (1 / confidence.detach().clamp(1e-4, 1 - 1e-4) - 1)

@@ -25,6 +25,7 @@ from pimper_torch.records import (
     DepthPatches,
     Depths,
     Heights,
+    PatchSet,
     Photometry,
     Record,
     Templates,
@@ -79,6 +80,13 @@ def ray_directions(lattice: Lattice, coarse: CoarseMesh) -> Float[Tensor, "verte
     if normals is None:
         normals = vertex_normals(mesh.vertices_world, mesh.faces)
     return normalize(lattice.interpolate(normals, mesh.faces), dim=-1)
+
+
+def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
+    """Give each facet's wanted distance between neighbouring vertices, scene units."""
+    facet = torch.cat([bucket.facet for bucket in patches.buckets])
+    spacing = torch.cat([bucket.spacing for bucket in patches.buckets])
+    return torch.empty_like(spacing).index_put((facet,), spacing * samples_per_vertex)
 
 
 def unite(

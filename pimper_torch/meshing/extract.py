@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
@@ -26,25 +27,27 @@ class ExtractConfig:
             longer ones are spikes or cliffs. Infinite keeps all.
         drop_overturned: Leave out faces turned more than 90 degrees from the mean of
             their facet.
-        largest_only: Keep only the largest connected piece, by area.
+        min_piece: Share of the largest connected piece's area that another one needs to be
+            kept; 1 keeps the largest only.
     """
 
     min_confidence: float = 0.0
     max_hole: float = 0.2
     max_stretch: float = 10.0
     drop_overturned: bool = True
-    largest_only: bool = True
+    min_piece: float = 1.0
 
     def __post_init__(self) -> None:
         require(0 <= self.min_confidence < 1, "min_confidence", self.min_confidence, "in [0, 1)")
         require(self.max_hole >= 0, "max_hole", self.max_hole, "0 or more")
         require(self.max_stretch > 1, "max_stretch", self.max_stretch, "above 1")
+        require(0 <= self.min_piece <= 1, "min_piece", self.min_piece, "in [0, 1]")
 
 
 class Extract(nn.Module):
     """Keep what the photographs support, as one connected manifold mesh.
 
-    Faces without support and spikes go; of what remains, the largest piece stays, and where
+    Faces without support and spikes go; of what remains, the large pieces stay, and where
     two fans of faces touched in one vertex only, each gets its own copy. Orientation is the
     coarse mesh's: counter-clockwise from outside.
 
@@ -83,8 +86,7 @@ class Extract(nn.Module):
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the share "
                 "of missing data that the report gives."
             )
-        if self.config.largest_only:
-            faces = faces[largest_piece(vertices, faces)]
+        faces = faces[large_pieces(vertices, faces, self.config.min_piece)]
         source, faces = vertex_fans(faces)
         return Mesh(
             vertices_world=surface.vertices_world[source],
@@ -147,11 +149,17 @@ def overturned(
     return (normals * total[owner]).sum(dim=-1) < 0
 
 
-def largest_piece(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+def large_pieces(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], share: float
 ) -> Bool[Tensor, " face"]:
-    """Mark the faces of the piece with the largest area; pieces hang together by edges."""
+    """Mark the faces of pieces with at least a share of the largest one's area.
+
+    Pieces hang together by edges. With share 1 one piece is marked, the first of the largest.
+    """
     label = face_components(faces)
     area = face_normals(vertices, faces).norm(dim=-1).double()
     areas = area.new_zeros(int(label.max()) + 1).index_add(0, label, area)
-    return label == areas.argmax()
+    large = areas >= share * areas.amax()
+    if share == 1:
+        large = torch.arange(len(areas), device=areas.device) == areas.argmax()
+    return large[label]

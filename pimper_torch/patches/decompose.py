@@ -13,7 +13,8 @@ from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
-from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Templates
+from pimper_torch.patches.carry import carry
+from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,11 +45,23 @@ class Decompose(nn.Module):
         super().__init__()
         self.config = config or DecomposeConfig()
 
-    def forward(self, coarse: CoarseMesh, cameras: Cameras) -> PatchSet:
+    def forward(
+        self,
+        coarse: CoarseMesh,
+        cameras: Cameras,
+        surface: Surface | None = None,
+        scale: float = 1.0,
+    ) -> PatchSet:
         """Decompose a coarse mesh.
 
         The samples of all templates are equally far apart: one over ``samples_per_pixel``
-        pixels of the reference view at the median depth of the mesh.
+        times ``scale`` pixels of the reference view at the median depth of the mesh.
+
+        Args:
+            coarse: The facets.
+            cameras: Of all views.
+            surface: What the templates are to carry; without, they are flat.
+            scale: Of the photographs, 1 for their own size.
 
         Raises:
             ReconstructionError: A mesh without facets.
@@ -61,7 +74,8 @@ class Decompose(nn.Module):
             )
         patch_from_world = facet_frames(vertices, faces, cameras.cam_from_world[coarse.reference])
         corners = transform(patch_from_world, vertices[faces])[..., :2]
-        spacing = sample_spacing(vertices, cameras, coarse.reference, self.config.samples_per_pixel)
+        density = self.config.samples_per_pixel * scale
+        spacing = sample_spacing(vertices, cameras, coarse.reference, density)
         enlarged = enlarge(corners, self.config.overlap_samples * spacing)
         # A sliver's enlarged corner runs far away; no patch needs more than twice the overlap.
         reach = 2 * self.config.overlap_samples * spacing
@@ -72,7 +86,8 @@ class Decompose(nn.Module):
             _templates(facets, raster, patch_from_world, corners, enlarged, low, spacing)
             for facets, raster in group_by_size(sides, self.config.bucket_samples)
         )
-        return PatchSet(coarse=coarse, buckets=buckets)
+        patches = PatchSet(coarse=coarse, buckets=buckets)
+        return patches if surface is None else carry(patches, surface.mesh)
 
 
 def facet_frames(

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from kornia.geometry.transform import pyrdown, remap
 from torch import Tensor
+from torch.nn.functional import conv2d, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.records import Views
@@ -17,18 +18,37 @@ def image_pyramid(
     Unusable is what lies outside the undistorted frame or the mask, is not finite, or is
     saturated in any channel.
     """
-    usable = views.inside
-    if views.masks is not None:
-        usable = usable & views.masks
-    finite = views.images.isfinite()
-    usable = usable & finite.all(dim=1)
-    usable = usable & (views.images.amax(dim=1) < saturation_level)
-    # NaN times a weight of 0 is NaN: zeros, which are marked, spread nothing.
-    images = torch.where(finite, views.images, 0)
-    pyramid = [torch.cat([images, (~usable)[:, None].to(images)], dim=1)]
-    while len(pyramid) < levels and min(pyramid[-1].shape[-2:]) >= 8:
-        pyramid.append(pyrdown(pyramid[-1]))
-    return pyramid
+    by_view = []
+    inside = views.inside
+    for view in range(views.num_views):  # one by one: halving all at once takes several copies
+        image, usable = views.images[view], inside[view]
+        if views.masks is not None:
+            usable = usable & views.masks[view]
+        finite = image.isfinite()
+        usable = usable & finite.all(dim=0) & (image.amax(dim=0) < saturation_level)
+        # NaN times a weight of 0 is NaN: zeros, which are marked, spread nothing.
+        image = torch.where(finite, image, 0)
+        pyramid = [torch.cat([image, (~usable)[None].to(image)])[None]]
+        while len(pyramid) < levels and min(pyramid[-1].shape[-2:]) >= 8:
+            pyramid.append(halve(pyramid[-1]))
+        by_view.append(pyramid)
+    return [torch.cat(level) for level in zip(*by_view, strict=True)]
+
+
+def halve(images: Float[Tensor, "view channels _ _"]) -> Float[Tensor, "view channels _ _"]:
+    """Blur and halve images as kornia's ``pyrdown`` does, in a sixth of the time.
+
+    Burt's binomial of five, then the mean of two: together six taps along rows and along
+    columns, at every other place. Sides that are odd go by ``pyrdown`` itself.
+    """
+    height, width = images.shape[-2:]
+    if height % 2 or width % 2:
+        return pyrdown(images)
+    taps = images.new_tensor([1, 5, 10, 10, 5, 1]) / 32
+    planes = pad(images.reshape(-1, 1, height, width), (2, 2, 2, 2), mode="reflect")
+    planes = conv2d(planes, taps.reshape(1, 1, 1, 6), stride=(1, 2))
+    planes = conv2d(planes, taps.reshape(1, 1, 6, 1), stride=(2, 1))
+    return planes.reshape(*images.shape[:-2], height // 2, width // 2)
 
 
 def pyramid_level(
@@ -50,32 +70,52 @@ def sample_pyramid(
     pixels: Float[Tensor, "patch height width 2"],
     level: Float[Tensor, "patch height width"],
 ) -> Float[Tensor, "patch channels height width"]:
+    """Look an image up on rasters; see :func:`look_up`."""
+    raster = level.shape
+    found = look_up(pyramid, pixels.reshape(-1, 2), level.reshape(-1))
+    return found.reshape(*raster, -1).movedim(-1, 1)
+
+
+def look_up(
+    pyramid: list[Float[Tensor, "channels _ _"]],
+    pixels: Float[Tensor, "sample 2"],
+    level: Float[Tensor, " sample"],
+) -> Float[Tensor, "sample channels"]:
     """Look an image up, blending the two pyramid levels next to each sample's own.
 
     Every level covers the same ``[0, width] x [0, height]`` of the finest, so one
-    normalised grid serves all.
+    normalised grid serves all. Differentiable in images and pixels.
     """
-    num, rows, columns = level.shape
-    grid = grid_from_pixels(pixels, width=pyramid[0].shape[-1], height=pyramid[0].shape[-2])
-    grid = grid.reshape(1, num * rows, columns, 2).clamp(-3, 3).to(pyramid[0])
-    level = level.clamp(0, len(pyramid) - 1).to(pyramid[0])
-    total = pyramid[0].new_zeros(num, pyramid[0].shape[0], rows, columns)
+    finest = pyramid[0]
+    grid = grid_from_pixels(pixels, width=finest.shape[-1], height=finest.shape[-2])
+    grid = grid.clamp(-3, 3).to(finest)
+    level = level.clamp(0, len(pyramid) - 1).to(finest)
+    total = finest.new_zeros(len(grid), len(finest))
     for index, image in enumerate(pyramid):
         weight = (1 - (level - index).abs()).clamp_min(0)
-        if not (weight > 0).any():
-            continue
-        sampled = remap(
-            image[None],
-            grid[..., 0],
-            grid[..., 1],
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=False,
-            normalized_coordinates=True,
-        )
-        sampled = sampled.reshape(-1, num, rows, columns).transpose(0, 1)
-        total = total + weight[:, None] * sampled
+        (some,) = torch.nonzero(weight > 0, as_tuple=True)
+        if len(some) > 0:
+            blended = weight[some, None] * _bilinear(image, grid[some])
+            total = total.index_add(0, some, blended)
     return total
+
+
+def _bilinear(
+    image: Float[Tensor, "channels _ _"], grid: Float[Tensor, "sample 2"]
+) -> Float[Tensor, "sample channels"]:
+    """Look up in as many batches as there are threads: each is one thread's on the CPU."""
+    threads = torch.get_num_threads()
+    filled = pad(grid, (0, 0, 0, -len(grid) % threads)).reshape(threads, -1, 1, 2)
+    found = remap(
+        image.expand(threads, -1, -1, -1),
+        filled[..., 0],
+        filled[..., 1],
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+        normalized_coordinates=True,
+    )
+    return found[..., 0].transpose(1, 2).reshape(-1, len(image))[: len(grid)]
 
 
 def _difference(

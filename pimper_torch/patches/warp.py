@@ -11,7 +11,7 @@ from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.patches.pyramid import image_pyramid, pyramid_level, sample_pyramid
+from pimper_torch.patches.pyramid import image_pyramid, look_up, pyramid_level
 from pimper_torch.progress import track
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
@@ -129,14 +129,16 @@ class Warp(nn.Module):
             channels = pyramid[0].shape[1] - 1
             return pyramid[0].new_zeros(len(facing), channels, *facing.shape[1:]), wanted
         level = pyramid_level(pixels)
-        sampled = sample_pyramid([images[view] for images in pyramid], pixels, level)
-        radiance, unusable = sampled[:, :-1], sampled[:, -1]
         # A sample whose footprint touches the border, or is unusable by a tenth, is missing.
         margin = 0.5 * 2 ** level.detach()[..., None]
         size = cameras.sizes_px[view].to(pixels)
         within = ((pixels >= margin) & (pixels <= size - margin)).all(dim=-1)
-        valid = wanted & within & (unusable < 0.1)
-        valid = valid & (radiance.mean(dim=1) > self.config.dark_level)
+        wanted = wanted & within
+        found = look_up([images[view] for images in pyramid], pixels[wanted], level[wanted])
+        usable = (found[:, -1] < 0.1) & (found[:, :-1].mean(dim=1) > self.config.dark_level)
+        radiance = found.new_zeros(*wanted.shape, found.shape[1] - 1)
+        radiance = radiance.index_put((wanted,), found[:, :-1]).movedim(-1, 1)
+        valid = torch.zeros_like(wanted).index_put((wanted,), usable)
         valid = valid & ~self._hidden(templates, points_world, center, caster, valid)
         return radiance * valid[:, None], valid
 

@@ -11,8 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from pimper_torch.config import require
-from pimper_torch.geometry.frames import invert_rigid, rotate
+from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_pairs
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.patches.carry import carried_normals
 from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
@@ -28,6 +29,7 @@ from pimper_torch.photometry.manifolds import Cone, Free, Manifold, SecondOrder
 from pimper_torch.photometry.mesh_light import light_of_mesh
 from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Loss, Squares
 from pimper_torch.photometry.rows import Rows, on_raster, rows_of
+from pimper_torch.photometry.shadows import cast_shadows_on_rasters
 from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.photometry.verdicts import judge_data, warn_of_verdicts
@@ -72,6 +74,9 @@ LOSSES: dict[str, Callable[[float], Loss]] = {
     "geman-mcclure": GemanMcClure,
 }
 
+# A surface is right to so many samples, where it casts shadows.
+SHADOW_SAMPLES = 2.0
+
 # The spread of a patch's residuals is read off about this many samples.
 SPREAD_SAMPLES = 512
 
@@ -105,6 +110,8 @@ class FactorizeConfig:
         geometry_weight: How strongly normals hold to the coarse ones, in units of one view.
         loss: How highlights and shadows lose weight: ``"cauchy"``; ``"geman-mcclure"``, more
             sharply; ``"squares"``, not at all.
+        shadows: Whether samples that the lamp cannot reach past the surface are missing. Needs
+            a surface that is nearly right.
         loss_scale: Of the loss, in standard deviations of the patch's residuals; Cauchy's
             weight there is a half.
         min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
@@ -125,7 +132,8 @@ class FactorizeConfig:
     light_coupling: float = 0.0
     geometry_weight: float = 0.1
     loss: Literal["squares", "cauchy", "geman-mcclure"] = "cauchy"
-    loss_scale: float = 2.0
+    loss_scale: float = 1.0
+    shadows: bool = True
     min_views: int = 4
     min_light_variation: float = 0.02
     max_iterations: int = 60
@@ -209,6 +217,7 @@ class Factorize(nn.Module):
         config = self.config
         coarse = [carried_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
         field = light_of_mesh(seen, coarse, config.min_views, config.light)
+        lit = self._lit(seen, coarse, field)
         chunks = [
             [
                 _Chunk(
@@ -218,9 +227,7 @@ class Factorize(nn.Module):
                 )
                 for some in _parts(templates, len(field.soft))
             ]
-            for templates, registered, normals in zip(
-                seen.patches.buckets, seen.buckets, coarse, strict=True
-            )
+            for templates, registered, normals in zip(seen.patches.buckets, lit, coarse, strict=True)
         ]
         everything = [chunk for bucket in chunks for chunk in bucket]
         coupled = self._coupled(seen, everything, field) if config.light_coupling > 0 else None
@@ -233,6 +240,35 @@ class Factorize(nn.Module):
         buckets = [_joined([next(rest) for _ in bucket]) for bucket in chunks]
         warn_of_verdicts(buckets, config.min_views, config.min_light_variation)
         return PhotometricPatches(patches=seen.patches, buckets=_in_gauge(buckets))
+
+    def _lit(
+        self, seen: PatchViews, normals: list[Float[Tensor, "_ _ _ 3"]], field: LightField
+    ) -> list[Registered]:
+        """Leave out what lies in a cast shadow, or may."""
+        if not self.config.shadows or not bool(field.lamp.any()):
+            return list(seen.buckets)
+        mesh = seen.patches.surface or seen.patches.coarse.mesh
+        caster = RayCaster(mesh.vertices_world, mesh.faces)
+        found = []
+        for templates, registered, own in zip(
+            seen.patches.buckets, seen.buckets, normals, strict=True
+        ):
+            world_from_patch = invert_rigid(templates.patch_from_world)
+            raster = templates.points_patch.shape
+            places = transform(world_from_patch, templates.points_patch.flatten(1, 2))
+            shadows = cast_shadows_on_rasters(
+                field,
+                caster,
+                places.reshape(raster),
+                rotate(world_from_patch, own.flatten(1, 2)).reshape(raster),
+                templates.spacing,
+                tolerance=SHADOW_SAMPLES * templates.spacing,
+                guard=SHADOW_SAMPLES * float(templates.spacing[0]),
+                asked=templates.inside,
+            )
+            reached = (shadows.lit & shadows.sure).movedim(-1, 1)
+            found.append(registered.replace(valid=registered.valid & reached))
+        return found
 
     def _pose(self, chunk: _Chunk, field: LightField) -> _Posed:
         config = self.config

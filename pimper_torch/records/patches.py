@@ -213,10 +213,17 @@ class Heights(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SweptPatches(Record):
-    """Heights of all patches, with the photometry they were swept under."""
+    """Heights of all patches, with the photometry they were swept under.
+
+    Attributes:
+        photometric: Normals, albedo and light.
+        buckets: The heights.
+        averaged: Samples in the window that costs were averaged over.
+    """
 
     photometric: PhotometricPatches
     buckets: tuple[Heights, ...]
+    averaged: float
 
     @property
     def patches(self) -> PatchSet:
@@ -306,3 +313,14 @@ class Surface(Record):
     albedo: Float[Tensor, "vertex channel"]
     confidence: Float[Tensor, " vertex"]
     convergence: Convergence
+
+    @property
+    def mesh(self) -> Mesh:
+        """The whole of it, as triangles."""
+        return Mesh(
+            vertices_world=self.vertices_world,
+            faces=self.faces,
+            normals_world=self.normals_world,
+            albedo=self.albedo,
+            confidence=self.confidence,
+        )

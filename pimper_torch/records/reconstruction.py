@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from pimper_torch.records.patches import DepthPatches
+from pimper_torch.records.patches import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
 from pimper_torch.records.views import Cameras
@@ -33,14 +33,14 @@ class Reconstruction(Record):
         mesh: One connected surface with vertex normals, albedo and confidence.
         scene: Cameras, undistorted photographs and the sparse cloud, in the mesh's frame.
         coarse: The facets.
-        patches: Relief, normals, albedo, confidence and lights of every patch.
+        patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
         report: One entry a stage, in the order they ran.
     """
 
     mesh: Mesh
     scene: SparseScene
     coarse: CoarseMesh
-    patches: DepthPatches
+    patches: DepthPatches | SweptPatches
     report: tuple[StageReport, ...]
 
     @property

@@ -12,10 +12,10 @@ from pimper_torch.config import require
 from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.linalg.systems import prepare
-from pimper_torch.records import Convergence, DepthPatches, PatchSet, StopCause, Surface
+from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull, trend_deviation
 from pimper_torch.refinement.smoothness import reweighted
-from pimper_torch.fusion.union import Union, ray_directions, unite
+from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 
 # Robust smoothness has settled when vertices move by less than this share of their spacing.
 _SETTLED = 1e-3
@@ -179,13 +179,6 @@ def smooth_seams(
         tolerance=_SETTLED * spacing.double().median(),
         limit=_MOST_SOLVES,
     )
-
-
-def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
-    """Give each facet's wanted distance between neighbouring vertices, scene units."""
-    facet = torch.cat([bucket.facet for bucket in patches.buckets])
-    spacing = torch.cat([bucket.spacing for bucket in patches.buckets])
-    return torch.empty_like(spacing).index_put((facet,), spacing * samples_per_vertex)
 
 
 def _normals(

@@ -1,24 +1,42 @@
 """Which views judge a sample."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
 def best_views(
-    score: Float[Tensor, "patch view height width"],
-    usable: Bool[Tensor, "patch view height width"],
-    count: int,
-) -> Bool[Tensor, "patch view height width"]:
-    """Keep, at every sample, the usable views of the best scores, ``count`` of them at most.
+    score: Float[Tensor, "sample view"], usable: Bool[Tensor, "sample view"], count: int
+) -> tuple[Int[Tensor, "sample chosen"], Bool[Tensor, "sample chosen"]]:
+    """Choose, for every sample, the usable views of the best scores, ``count`` of them at most.
 
-    >>> score = torch.tensor([0.5, 0.9, 0.7]).reshape(1, 3, 1, 1)
-    >>> best_views(score, torch.ones(1, 3, 1, 1, dtype=torch.bool), 2).flatten()
-    tensor([False,  True,  True])
+    Returns:
+        The views, and which of them are meant: a sample with fewer usable ones has fewer.
+
+    >>> score = torch.tensor([[0.5, 0.9, 0.7]])
+    >>> best_views(score, torch.tensor([[True, True, False]]), 2)
+    (tensor([[1, 0]]), tensor([[True, True]]))
     """
-    if score.shape[1] <= count:
-        return usable
     rated = torch.where(usable, score, -torch.inf)
-    chosen = rated.topk(count, dim=1).indices
-    kept = torch.zeros_like(usable).scatter(1, chosen, value=True)
-    return kept & usable
+    best = rated.topk(min(count, score.shape[1]), dim=1)
+    return best.indices, best.values > -torch.inf
+
+
+def view_scores(
+    facing: Float[Tensor, "sample view"],
+    footprint: Float[Tensor, "sample view"],
+    shading: Float[Tensor, "sample view"],
+) -> Float[Tensor, "sample view"]:
+    """Rate views by angle, resolution and light.
+
+    Args:
+        facing: Cosine between the normal and the way to the camera.
+        footprint: Pixels that a sample spans, if it faced the camera; more than one is no
+            better than one.
+        shading: What the light makes of albedo 1 there.
+
+    A view that sees the surface straight on and finely, in the light of a good view, has 1.
+    """
+    typical = shading.clamp_min(0).mean(dim=1, keepdim=True)
+    lit = shading / torch.where(typical > 0, typical, 1)
+    return facing * footprint.clamp_max(1) * lit.clamp(0, 1)

@@ -1,10 +1,9 @@
-"""The stage that finds heights: every place is looked up again, higher and lower, under its light."""
+"""The stage that finds heights: samples are looked up again, higher and lower, in their light."""
 
-import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -12,7 +11,7 @@ from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.patches.carry import carried_normals
-from pimper_torch.patches.pyramid import image_pyramid, pyramid_level, sample_pyramid
+from pimper_torch.patches.pyramid import image_pyramid, look_up
 from pimper_torch.progress import track
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
@@ -21,6 +20,7 @@ from pimper_torch.records import (
     PatchViews,
     PhotometricPatches,
     Photometry,
+    Record,
     Registered,
     SweptPatches,
     Templates,
@@ -28,12 +28,14 @@ from pimper_torch.records import (
 )
 from pimper_torch.sweep.consistency import inconsistency
 from pimper_torch.sweep.minimum import parabola_minimum, posterior_variance
-from pimper_torch.sweep.selection import best_views
-from pimper_torch.sweep.windows import level_weight, window_mean
-
+from pimper_torch.sweep.selection import best_views, view_scores
+from pimper_torch.sweep.windows import level_weight, window_mean, window_size
 
 # So many samples err alike, as they were looked up between the same pixels, blurred.
 CORRELATED_SAMPLES = 4.0
+
+# Residuals of a patch that suits its light perfectly still have this spread, of saturation.
+LEAST_SPREAD = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,32 +46,72 @@ class SweepConfig:
         steps: Tried on each side of the template.
         step_samples: Between them, in samples of the template.
         window_samples: Standard deviation of the window that costs are averaged over.
-        num_views: At most so many views judge a sample.
-        loss_scale: Of the robust cost, in standard deviations of the patch's residuals.
+        num_views: At most so many views judge a sample: the best by angle, resolution and
+            light of those that have it.
         min_views: A sample that fewer views may judge is left where it is.
-        steepest: Slope of the template, off its facet, at which a window ends.
+        loss_scale: Of the robust cost, in standard deviations of the patch's residuals.
+        max_slope: Of the template, off its facet: steeper is a cliff, where windows end.
+        pyramid_levels: How often an image may be halved.
+        saturation_level: Radiance at or above which a pixel is unusable.
     """
 
     steps: int = 4
     step_samples: float = 0.7
     window_samples: float = 1.5
     num_views: int = 16
-    loss_scale: float = 2.0
     min_views: int = 3
-    steepest: float = 4.0
+    loss_scale: float = 2.0
+    max_slope: float = 4.0
     pyramid_levels: int = 4
     saturation_level: float = SATURATED
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, "sweep.steps", self.steps, "1 or more")
-        require(self.num_views >= 2, "sweep.num_views", self.num_views, "2 or more")
         require(self.min_views >= 2, "sweep.min_views", self.min_views, "2 or more")
-        for name in ("step_samples", "window_samples", "loss_scale", "steepest"):
+        least = self.min_views
+        require(self.num_views >= least, "sweep.num_views", self.num_views, "min_views or more")
+        for name in ("step_samples", "window_samples", "loss_scale", "max_slope"):
             require(getattr(self, name) > 0, f"sweep.{name}", getattr(self, name), "above 0")
+        require(self.pyramid_levels >= 1, "sweep.pyramid_levels", self.pyramid_levels, "1 or more")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Swept(Record):
+    """The samples of a bucket that are swept, in a row.
+
+    Attributes:
+        place: In the flattened rasters.
+        patch: Of each.
+        points_world: On the template.
+        outward: Along which it is swept; unit, world.
+        chosen: Views that judge it.
+        seen: Which of these are meant.
+        shading: Of albedo 1 in these.
+    """
+
+    place: Int[Tensor, " sample"]
+    patch: Int[Tensor, " sample"]
+    points_world: Float[Tensor, "sample 3"]
+    outward: Float[Tensor, "sample 3"]
+    chosen: Int[Tensor, "sample chosen"]
+    seen: Bool[Tensor, "sample chosen"]
+    shading: Float[Tensor, "sample chosen"]
 
 
 class Sweep(nn.Module):
-    """Sweep every template along its normals, and keep the height that views agree on."""
+    r"""Move every sample along the normal of what its template carries to where views agree.
+
+    For each of a few heights all views are looked up again, and the light that was fitted, the
+    photometric normal and the best albedo predict them; robust residuals are averaged over a
+    small window, which stops at cliffs and at the template's border, and the least cost is
+    found to a fraction of a step. This is multi-view stereo that does not mind the light
+    changing. How sure a height is follows from the costs of all heights: with little texture,
+    or several that suit, it is not, and says so by its information.
+
+    A height at the end of the range is none. Differentiable in the photographs, in what the
+    templates carry, normals and lights, through the parabola at the least cost; which views
+    and which height are chosen, and the information, are constants.
+    """
 
     def __init__(self, config: SweepConfig | None = None) -> None:
         super().__init__()
@@ -81,111 +123,146 @@ class Sweep(nn.Module):
         """Sweep all patches."""
         config = self.config
         pyramid = image_pyramid(views, config.saturation_level, config.pyramid_levels)
-        gray = [
-            torch.cat([level[:, :-1].mean(dim=1, keepdim=True), level[:, -1:]], dim=1)
-            for level in pyramid
-        ]
-        coarse = photometric.patches.coarse
-        triples = list(
-            zip(photometric.patches.buckets, seen.buckets, photometric.buckets, strict=True)
+        gray = [level[:, :-1].mean(dim=1, keepdim=True) for level in pyramid]
+        buckets = zip(photometric.patches.buckets, seen.buckets, photometric.buckets, strict=True)
+        return SweptPatches(
+            photometric=photometric,
+            buckets=tuple(
+                self._sweep(photometric, *bucket, cameras, gray) for bucket in track(list(buckets))
+            ),
+            averaged=window_size(config.window_samples),
         )
-        buckets = [
-            self._sweep(*triple, carried_normals(coarse, triple[0]), cameras, gray)
-            for triple in track(triples)
-        ]
-        return SweptPatches(photometric=photometric, buckets=tuple(buckets))
 
     def _sweep(
+        self,
+        photometric: PhotometricPatches,
+        templates: Templates,
+        registered: Registered,
+        photometry: Photometry,
+        cameras: Cameras,
+        gray: list[Float[Tensor, "view 1 _ _"]],
+    ) -> Heights:
+        config = self.config
+        carried = carried_normals(photometric.patches.coarse, templates)
+        rows = self._rows(templates, registered, photometry, carried, cameras)
+        nothing = torch.zeros_like(templates.depth)
+        if len(rows.place) == 0:
+            return Heights(offset=nothing, information=nothing, misfit=nothing)
+        step = config.step_samples * templates.spacing
+        ladder = torch.arange(-config.steps, config.steps + 1, device=step.device).to(step)
+        moves = step[rows.patch, None] * ladder
+        scale = config.loss_scale * photometry.convergence.residual.clamp_min(LEAST_SPREAD)
+        radiance = self._look_up(rows, templates, moves, cameras, gray)
+        cost = inconsistency(radiance, rows.shading, rows.seen, scale[rows.patch])
+        # Near zero Cauchy's loss is the square over twice its scale's: now over the variance.
+        cost = cost * config.loss_scale**2
+        costs = _spread_out(cost, rows.place, templates)
+        swept = nothing.flatten().index_fill(0, rows.place, 1.0).reshape(nothing.shape)
+        window = level_weight(templates.depth.detach(), swept, templates.spacing, config.max_slope)
+        averaged = window_size(config.window_samples)
+        costs = window_mean(costs, window, config.window_samples) * (averaged / CORRELATED_SAMPLES)
+        place, curvature, found = parabola_minimum(costs)
+        with torch.no_grad():
+            variance = posterior_variance(costs, curvature)
+            unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
+            share = (1 / variance - 1 / unknown).clamp_min(0) / averaged
+            least = costs.amin(dim=1) * (CORRELATED_SAMPLES / averaged)
+        found = found & (window > 0) & (share > 0)
+        return Heights(
+            offset=torch.where(found, (place - config.steps) * step[:, None, None], 0),
+            information=torch.where(found, share / step[:, None, None].square(), 0),
+            misfit=torch.where(found, least, 0),
+        )
+
+    def _rows(
         self,
         templates: Templates,
         registered: Registered,
         photometry: Photometry,
         carried: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
-        pyramid: list[Float[Tensor, "view 2 _ _"]],
-    ) -> Heights:
-        config = self.config
-        num, height, width = templates.depth.shape
+    ) -> _Swept:
+        """List the samples that enough views judge, with these."""
+        config, views = self.config, cameras.num_views
+        asked = photometry.valid & templates.inside
+        asked = asked & (registered.valid.sum(dim=1) >= config.min_views)
+        (place,) = torch.nonzero(asked.flatten(), as_tuple=True)
+        patch = place // asked[0].numel()
         world_from_patch = invert_rigid(templates.patch_from_world)
-        flat = templates.points_patch.reshape(num, -1, 3)
-        places = transform(world_from_patch, flat)
-        outward = rotate(world_from_patch, carried.detach().reshape(num, -1, 3))
-        basis = torch.cat([torch.ones_like(carried[..., :1]), photometry.normals_patch], dim=-1)
-        shading = torch.einsum("pga,phwa->pghw", photometry.lights_patch, basis)
-        facing = self._facing(places, outward, cameras).reshape(num, -1, height, width)
-        usable = registered.valid & (shading > 0) & photometry.valid[:, None]
-        usable = best_views(facing, usable, config.num_views)
-        count = usable.sum(dim=1)
-        usable = usable & (count >= config.min_views)[:, None]
-
-        step = config.step_samples * templates.spacing
-        ladder = torch.arange(-config.steps, config.steps + 1).to(step)
-        moves = step[:, None] * ladder
-        spread = photometry.convergence.residual.clamp_min(1e-4)
-        looked = []
-        for view in range(cameras.num_views):
-            if not bool(usable[:, view].any()):
-                looked.append(shading.new_zeros(num, len(ladder), height, width))
-                continue
-            looked.append(
-                self._look_up(view, places, outward, moves, (height, width), cameras, pyramid)
-            )
-        radiance = torch.stack(looked, dim=1)
-        cost = inconsistency(radiance, shading, usable, config.loss_scale * spread)
-        # In units of the variance: Cauchy's cost near zero is r^2 / (2 c^2).
-        cost = cost * config.loss_scale**2
-        window = level_weight(
-            templates.depth.detach(), templates.inside & usable.any(dim=1), templates.spacing,
-            config.steepest,
-        )
-        averaged = 4 * math.pi * config.window_samples**2
-        cost = window_mean(cost, window, config.window_samples) * (averaged / CORRELATED_SAMPLES)
-        place, curvature, found = parabola_minimum(cost)
+        points = transform(world_from_patch, templates.points_patch.flatten(1, 2))
+        outward = rotate(world_from_patch, carried.flatten(1, 2))
+        points, outward = points.reshape(-1, 3)[place], outward.reshape(-1, 3)[place]
+        normals = photometry.normals_patch.reshape(-1, 3)[place]
+        basis = torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
+        shading = torch.einsum("sga,sa->sg", photometry.lights_patch[patch, :, :4], basis)
+        valid = registered.valid.movedim(1, -1).reshape(-1, views)[place]
         with torch.no_grad():
-            variance = posterior_variance(cost, curvature)
-            uniform = ((2 * config.steps + 1) ** 2 - 1) / 12
-            told = (1 / variance - 1 / uniform).clamp_min(0) / averaged
-        found = found & (window > 0) & (told > 0)
-        offset = (place - config.steps) * step[:, None, None]
-        information = told / step[:, None, None].square()
-        least = cost.detach().amin(dim=1)
-        return Heights(
-            offset=torch.where(found, offset, 0),
-            information=torch.where(found, information, 0),
-            misfit=torch.where(found, least, 0),
+            away = cameras.centers_world - points[:, None]
+            facing = (normalize(away, dim=-1) * outward[:, None]).sum(dim=-1)
+            footprint = self._footprint(points, templates.spacing[patch], cameras)
+            score = view_scores(facing, footprint, shading)
+            usable = valid & (facing > 0) & (shading > 0)
+            chosen, seen = best_views(score, usable, config.num_views)
+            enough = seen.sum(dim=1) >= config.min_views
+        return _Swept(
+            place=place[enough],
+            patch=patch[enough],
+            points_world=points[enough],
+            outward=outward[enough].detach(),
+            chosen=chosen[enough],
+            seen=seen[enough],
+            shading=shading.gather(1, chosen)[enough],
         )
 
-    def _facing(
+    def _footprint(
         self,
-        places: Float[Tensor, "patch sample 3"],
-        outward: Float[Tensor, "patch sample 3"],
+        points: Float[Tensor, "sample 3"],
+        spacing: Float[Tensor, " sample"],
         cameras: Cameras,
-    ) -> Float[Tensor, "patch view sample"]:
-        return torch.stack(
-            [
-                (normalize(center - places, dim=-1) * outward).sum(dim=-1)
-                for center in cameras.centers_world
-            ],
-            dim=1,
-        )
+    ) -> Float[Tensor, "sample view"]:
+        """Give the pixels that a sample would span in each view if it faced it."""
+        focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
+        axes = cameras.cam_from_world[:, 2]
+        depth = points @ axes[:, :3].mT + axes[:, 3]
+        return spacing[:, None] * focal / depth.clamp_min(torch.finfo(depth.dtype).eps)
 
     def _look_up(
         self,
-        view: int,
-        places: Float[Tensor, "patch sample 3"],
-        outward: Float[Tensor, "patch sample 3"],
-        moves: Float[Tensor, "patch hypothesis"],
-        raster: tuple[int, int],
+        rows: _Swept,
+        templates: Templates,
+        moves: Float[Tensor, "sample hypothesis"],
         cameras: Cameras,
-        pyramid: list[Float[Tensor, "view 2 _ _"]],
-    ) -> Float[Tensor, "patch hypothesis height width"]:
-        height, width = raster
-        num, tried = moves.shape
-        camera = cameras.cam_from_world[view], cameras.intrinsics[view]
-        moved = places[:, None] + moves[:, :, None, None] * outward[:, None]
-        pixels, _ = project(moved.reshape(-1, 3), *camera)
-        pixels = pixels.reshape(num, tried * height, width, 2)
-        level = pyramid_level(pixels.reshape(num * tried, height, width, 2)[: 0 + num * tried])
-        level = level.detach().reshape(num, tried * height, width)
-        sampled = sample_pyramid([images[view, :1] for images in pyramid], pixels, level)
-        return sampled[:, 0].reshape(num, tried, height, width)
+        gray: list[Float[Tensor, "view 1 _ _"]],
+    ) -> Float[Tensor, "sample chosen hypothesis"]:
+        """Look every sample up at all heights in the views that judge it."""
+        found = moves.new_zeros(*rows.chosen.shape, moves.shape[1]).flatten(0, 1)
+        width = rows.chosen.shape[1]
+        for view in range(cameras.num_views):
+            (slot,) = torch.nonzero(((rows.chosen == view) & rows.seen).flatten(), as_tuple=True)
+            if len(slot) == 0:
+                continue
+            sample = slot // width
+            outward, start = rows.outward[sample], rows.points_world[sample]
+            moved = start[:, None] + moves[sample, :, None] * outward[:, None]
+            camera = cameras.cam_from_world[view], cameras.intrinsics[view]
+            pixels, _ = project(moved.reshape(-1, 3), *camera)
+            with torch.no_grad():
+                spacing = templates.spacing[rows.patch[sample]]
+                one = cameras.take([view])
+                across = self._footprint(start, spacing, one)[:, 0]
+                away = normalize(one.centers_world - start, dim=-1)
+                squeezed = (away * outward).sum(dim=-1).clamp_min(0.05)
+                level = (across * squeezed.sqrt()).clamp_min(1).log2()
+                level = level[:, None].expand(-1, moves.shape[1]).flatten()
+            radiance = look_up([image[view] for image in gray], pixels, level)
+            found = found.index_copy(0, slot, radiance.reshape(len(slot), -1))
+        return found.reshape(*rows.chosen.shape, -1)
+
+
+def _spread_out(
+    cost: Float[Tensor, "sample hypothesis"], place: Int[Tensor, " sample"], templates: Templates
+) -> Float[Tensor, "patch hypothesis height width"]:
+    """Put rows back on their rasters, zero elsewhere."""
+    raster = templates.depth.shape
+    flat = cost.new_zeros(templates.depth.numel(), cost.shape[1]).index_copy(0, place, cost)
+    return flat.reshape(*raster, -1).movedim(-1, 1)

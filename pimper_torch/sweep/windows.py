@@ -1,9 +1,11 @@
 """Averages over small windows that stop at the edges of a patch."""
 
+import math
+
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, pad
 
 
 def window_mean(
@@ -35,21 +37,34 @@ def window_mean(
     return torch.where(some, summed[:, :-1] / torch.where(some, total, 1), 0)
 
 
+def window_size(radius: float) -> float:
+    """Give how many samples the window averages: as many as one of equal weights with its noise.
+
+    >>> round(window_size(2.0))
+    50
+    """
+    return 4 * math.pi * radius**2
+
+
 def level_weight(
     depth: Float[Tensor, "patch height width"],
-    inside: Bool[Tensor, "patch height width"],
+    swept: Float[Tensor, "patch height width"],
     spacing: Float[Tensor, " patch"],
-    steepest: float,
+    max_slope: float,
 ) -> Float[Tensor, "patch height width"]:
-    """Give 1 inside, falling to 0 where the template's depth runs up a cliff.
+    """Give the weight of every sample in windows: none on a cliff.
 
     A window would otherwise mix the two sides of a depth edge.
+
+    Args:
+        depth: What the template carries.
+        swept: 1 where a sample has costs, else 0.
+        spacing: Of the samples, in units of the depth.
+        max_slope: Between a sample and each of its four neighbours; more is a cliff.
     """
-    weight = inside.to(depth)
-    for axis in (1, 2):
-        slope = depth.diff(dim=axis).abs() / spacing[:, None, None]
-        gentle = (slope < steepest).to(depth)
-        size = depth.shape[axis]
-        weight.narrow(axis, 0, size - 1).mul_(gentle)
-        weight.narrow(axis, 1, size - 1).mul_(gentle)
-    return weight
+    per_sample = 1 / spacing[:, None, None]
+    across = depth.diff(dim=2).abs() * per_sample < max_slope
+    down = depth.diff(dim=1).abs() * per_sample < max_slope
+    level = pad(across, (1, 0), value=True) & pad(across, (0, 1), value=True)
+    level = level & pad(down, (0, 0, 1, 0), value=True) & pad(down, (0, 0, 0, 1), value=True)
+    return swept * level

@@ -84,7 +84,7 @@ def test_islands_go_and_the_largest_piece_stays():
     mesh = Extract(ExtractConfig(max_hole=0.1))(surface)
     assert columns(mesh).min() == 10
     assert len(as_trimesh(mesh).split(only_watertight=False)) == 1
-    both = Extract(ExtractConfig(max_hole=0.1, largest_only=False))(surface)
+    both = Extract(ExtractConfig(max_hole=0.1, min_piece=0.0))(surface)
     assert columns(both).min() == 0
     assert len(as_trimesh(both).split(only_watertight=False)) == 2
 
@@ -93,7 +93,7 @@ def test_pieces_that_touch_in_a_vertex_are_parted():
     surface = sheet()
     x, y = columns(surface), surface.vertices_world[:, 1]
     hourglass = ((x <= 10) & (y >= 10)) | ((x >= 10) & (y <= 10))
-    mesh = Extract(ExtractConfig(max_hole=0.1, largest_only=False))(
+    mesh = Extract(ExtractConfig(max_hole=0.1, min_piece=0.0))(
         surface.replace(confidence=hourglass.double())
     )
     # Diagonals run the other way, so that no face bridges the two squares.

@@ -5,13 +5,8 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.patches.decompose import Decompose
-from pimper_torch.patches.warp import (
-    Warp,
-    WarpConfig,
-    missing_share,
-    pyramid_level,
-    sample_pyramid,
-)
+from pimper_torch.patches.pyramid import pyramid_level, sample_pyramid
+from pimper_torch.patches.warp import Warp, WarpConfig, missing_share
 from pimper_torch.records import CoarseMesh, Mesh
 
 

@@ -1,0 +1,49 @@
+import pytest
+import torch
+from kornia.geometry.transform import pyrdown
+from torch.testing import assert_close
+
+from pimper_torch.patches.pyramid import halve, look_up, sample_pyramid
+
+
+@pytest.mark.parametrize("size", [(12, 20), (8, 8), (13, 20), (9, 7)])
+def test_halving_is_the_gaussian_pyramids(generator, size):
+    images = torch.rand(2, 3, *size, generator=generator, dtype=torch.float64)
+    assert_close(halve(images), pyrdown(images))
+
+
+def test_a_level_between_two_is_their_blend(generator):
+    fine = torch.rand(1, 8, 8, generator=generator, dtype=torch.float64)
+    rough = torch.rand(1, 4, 4, generator=generator, dtype=torch.float64)
+    pixels = 8 * torch.rand(50, 2, generator=generator, dtype=torch.float64)
+
+    def at(level: float) -> torch.Tensor:
+        return look_up([fine, rough], pixels, torch.full((50,), level, dtype=torch.float64))
+
+    assert_close(at(0.25), 0.75 * at(0.0) + 0.25 * at(1.0))
+    assert_close(at(7.0), at(1.0))  # no level beyond the last
+    assert not torch.allclose(at(0.0), at(1.0))
+
+
+def test_samples_of_several_levels_do_not_mix(generator):
+    pyramid = [torch.zeros(1, 8, 8), torch.ones(1, 4, 4), 2 * torch.ones(1, 2, 2)]
+    level = 2 * torch.rand(2, 5, 7, generator=generator)
+    pixels = 8 * torch.rand(2, 5, 7, 2, generator=generator)
+    assert_close(sample_pyramid(pyramid, pixels, level)[:, 0], level)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_any_number_of_samples_is_looked_up(count):
+    ramp = torch.arange(6.0, dtype=torch.float64).expand(1, 4, 6) + 0.5
+    pixels = torch.stack([torch.linspace(1, 5, count), torch.full((count,), 2.0)], dim=1).double()
+    assert_close(look_up([ramp], pixels, torch.zeros(count).double())[:, 0], pixels[:, 0])
+
+
+def test_looking_up_can_be_differentiated(generator):
+    image = torch.rand(2, 6, 6, generator=generator, dtype=torch.float64, requires_grad=True)
+    rough = torch.rand(2, 3, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    pixels = torch.tensor([[2.2, 3.1], [4.3, 1.7]], dtype=torch.float64, requires_grad=True)
+    level = torch.tensor([0.3, 0.8], dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda *given: look_up([given[0], given[1]], given[2], level), (image, rough, pixels)
+    )
