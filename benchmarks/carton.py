@@ -39,8 +39,9 @@ IN_MASKS = 0.9
 # Neighbours that a plane is fitted to round a point, and the least cosine it must face a view by.
 NEIGHBOURS, LEAST_FACING = 16, 0.25
 
-# Angles further from right than this belong to the gable.
-RIGHT = 10.0
+# Angles further from right than this belong to the gable; and only sides with this share of the
+# area that is flat are walls, whose angles are averaged.
+RIGHT, WALL = 10.0, 0.12
 
 
 class Arrays(pickle.Unpickler):
@@ -129,12 +130,13 @@ def report(mesh: Mesh, band: float) -> None:
     for each in dihedrals(mesh, sides):
         miss = each.angle_deg - 90
         right = abs(miss) <= RIGHT
-        off += [abs(miss)] if right else []
+        walls = min(sides[each.one].area, sides[each.other].area) >= WALL * total
+        off += [abs(miss)] if right and walls else []
         shown = f"{miss:+.2f}" if right else "(no right angle)"
         print(f"| {each.one}, {each.other} | {each.angle_deg:.2f} | {shown} |")  # noqa: T201
     if sides:
         edge = sum(side.rms / side.edge * side.area for side in sides) / total
-        angles = f", right angles off by {np.mean(off):.2f}° in the mean" if off else ""
+        angles = f", angles of walls off by {np.mean(off):.2f}° in the mean" if off else ""
         print(f"\nFlat to {100 * edge:.3f} % of the edge (RMS, by area){angles}.")  # noqa: T201
 
 

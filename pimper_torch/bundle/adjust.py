@@ -47,7 +47,7 @@ class AdjustConfig:
         blur_levels: Levels of the image pyramid to begin above the samples' own: each doubles
             how far off cameras may start.
         iterations: On each level, at most.
-        min_gain: Share by which the held-out residual must fall.
+        min_gain: Share by which the held-out residual must fall, in all and in each view.
         max_residual: Median residual over median radiance of held-out samples above which the
             photometry explains the photographs too badly to move cameras by it.
         max_motion_px: A camera that would move samples further, in the mean, keeps its place.
@@ -125,8 +125,8 @@ class Adjust(nn.Module):
     eliminated. The surface, its normals and the lights are held.
 
     What is kept is decided on facets that were not fitted: the residual must fall there, in
-    all, and a view in which it does not keeps its camera. A view that goes its own way so no
-    longer shares the focal length of its lens.
+    all views together, and a view in which it does not keeps its camera. A view that goes its own
+    way so no longer shares the focal length of its lens.
 
     The surface does not move, so cameras can only move with respect to it. Of the motions that
     all share (a similarity) those which the photographs do not tell are taken out; on a sphere,
@@ -241,15 +241,18 @@ class _Trial:
         scale = first.scale()
         first = residuals(before, judges, self.pyramid, there, scale)
         last = residuals(after, judges, self.pyramid, there, scale)
+        # All views together first: views picked for their residual fall in any case.
+        reason = self._objection(first, last, scale)
         chosen = motion <= config.max_motion_px
         for _ in range(len(chosen)):
             mixed = residuals(_mixed(before, after, chosen), judges, self.pyramid, there, scale)
-            worse = chosen & (mixed.costs(scale) >= first.costs(scale))
+            share = _shares(mixed, scale) / _shares(first, scale)
+            worse = chosen & ~(share < 1 - config.min_gain)
             if not bool(worse.any()):
                 break
             chosen = chosen & ~worse
-        mixed = residuals(_mixed(before, after, chosen), judges, self.pyramid, there, scale)
-        reason = self._objection(chosen, first, mixed, scale)
+        if not reason and not bool(chosen.any()):
+            reason = "no view's residual falls on the facets held out"
         if reason:
             chosen = torch.zeros_like(chosen)
         fit_first = residuals(before, fitted, self.pyramid, levels)
@@ -300,16 +303,8 @@ class _Trial:
             held=held,
         )
 
-    def _objection(
-        self,
-        chosen: Bool[Tensor, " view"],
-        first: Residuals,
-        last: Residuals,
-        scale: Float[Tensor, " view"],
-    ) -> str:
+    def _objection(self, first: Residuals, last: Residuals, scale: Float[Tensor, " view"]) -> str:
         """Say what speaks against the adjustment, if anything does."""
-        if not bool(chosen.any()):
-            return "no view's residual falls on the facets held out"
         left = float(last.value.abs()[last.usable].median() / last.radiance[last.usable].median())
         if not left <= self.config.max_residual:
             return (

@@ -27,6 +27,10 @@ _REFITS = 8
 # Normals are averaged over about this share of the diagonal, for noise tilts small faces by far.
 _SMOOTHING = 0.01
 
+# Vertices that must lie away from a side's border for that to be left out: a side of a few
+# large facets is nothing but border.
+_FEWEST_INSIDE = 12
+
 # At so many rounds over the mesh, at most.
 _MOST_ROUNDS = 60
 
@@ -235,7 +239,7 @@ def _measured(
     rim = margin * math.sqrt(sides[0] * sides[1])
     outside = (flat @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
     inner = torch.from_numpy(outside < -rim)
-    if int(inner.sum()) >= 3:
+    if int(inner.sum()) >= _FEWEST_INSIDE:
         normal, middle = _plane(points[inner], weight[inner], like)
         points, weight = points[inner], weight[inner]
     distance = ((points - middle) @ normal).abs()
