@@ -28,6 +28,7 @@ ROOMS = [
     "coarse",
     "patches",
     "photometry",
+    "bundle",
     "sweep",
     "integration",
     "alignment",

@@ -1,0 +1,1 @@
+"""Cameras, adjusted afterwards to what the photographs show on the surface."""
