@@ -8,6 +8,7 @@ from torch import nn
 
 from pimper_torch.alignment.align import Align, AlignConfig
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.bundle.adjust import Adjust, AdjustConfig
 from pimper_torch.coarse.adapt import Adapt, AdaptConfig
 from pimper_torch.coarse.enclose import Enclose, EncloseConfig
 from pimper_torch.config import build, find_config, overlay, read_mapping, require
@@ -19,6 +20,7 @@ from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import (
+    Cameras,
     CoarseMesh,
     DepthPatches,
     Mesh,
@@ -43,10 +45,13 @@ class RoundsConfig:
             any, the published chain runs once: facets one by one, then joined.
         all_round: Whether the coarse mesh is made of what all views see, in place of the
             cloud's triangulation in one reference view.
+        bundle: Whether the cameras are adjusted, once, to albedo and light of the last round
+            but one; kept only if facets held out of it agree better.
     """
 
     scales: tuple[float, ...] = (0.25, 0.5)
     all_round: bool = True
+    bundle: bool = False
 
     def __post_init__(self) -> None:
         positive = all(scale > 0 for scale in self.scales)
@@ -74,6 +79,7 @@ class PimperConfig:
     sweep: SweepConfig = field(default_factory=SweepConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
+    adjust: AdjustConfig = field(default_factory=AdjustConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
 
 
@@ -108,6 +114,7 @@ class Pimper(nn.Module):
         self.sweep: nn.Module = Sweep(config.sweep)
         self.fuse: nn.Module = Fuse(config.fuse)
         self.adapt: nn.Module = Adapt(config.adapt)
+        self.adjust: nn.Module = Adjust(config.adjust)
         self.extract: nn.Module = Extract(config.extract)
 
     def forward(
@@ -128,37 +135,44 @@ class Pimper(nn.Module):
         with recorded(self, self.observer) as report:
             scene = self.reconstruct(views, sparse_model)
             chain = self._in_rounds if self.config.rounds.scales else self._published
-            coarse, patches, surface = chain(scene, mesh)
+            cameras, patches, surface = chain(scene, mesh)
             found = self.extract(surface)
         return Reconstruction(
-            mesh=found, scene=scene, coarse=coarse, patches=patches, report=tuple(report)
+            mesh=found,
+            scene=scene.replace(cameras=cameras),
+            coarse=patches.patches.coarse,
+            patches=patches,
+            report=tuple(report),
         )
 
     def _published(
         self, scene: SparseScene, mesh: Mesh | None
-    ) -> tuple[CoarseMesh, DepthPatches, Surface]:
+    ) -> tuple[Cameras, DepthPatches, Surface]:
         """Every facet by itself, then all joined."""
         coarse = self._coarse(scene, mesh)
         patches = self.decompose(coarse, scene.cameras)
         seen = self.warp(scene.views, scene.cameras, patches)
         depths = self.integrate(self.factorize(seen))
         aligned = self.align(depths)
-        return coarse, aligned, self.refine(aligned)
+        return scene.cameras, aligned, self.refine(aligned)
 
     def _in_rounds(
         self, scene: SparseScene, mesh: Mesh | None
-    ) -> tuple[CoarseMesh, SweptPatches, Surface]:
+    ) -> tuple[Cameras, SweptPatches, Surface]:
         """All facets together, coarse to fine: every round registers on the one before."""
-        views, cameras = scene.views, scene.cameras
+        views, cameras, settings = scene.views, scene.cameras, self.config.rounds
         coarse, surface = self._coarse(scene, mesh), None
-        for scale in self.config.rounds.scales:
+        for number, scale in enumerate(settings.scales, start=1):
             if surface is not None:
                 coarse = self.adapt(swept, surface)
             patches = self.decompose(coarse, cameras, surface, scale)
             seen = self.warp(views, cameras, patches)
-            swept = self.sweep(views, cameras, seen, self.factorize(seen))
+            photometric = self.factorize(seen)
+            if settings.bundle and number == max(1, len(settings.scales) - 1):
+                cameras = self.adjust(views, cameras, seen, photometric, scene.lenses).cameras
+            swept = self.sweep(views, cameras, seen, photometric)
             surface = self.fuse(swept)
-        return coarse, swept, surface
+        return cameras, swept, surface
 
     def _coarse(self, scene: SparseScene, mesh: Mesh | None) -> CoarseMesh:
         all_round = mesh is not None or self.config.rounds.all_round

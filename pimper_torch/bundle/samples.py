@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.geometry.projection import project
-from pimper_torch.patches.warp import sample_pyramid
+from pimper_torch.patches.pyramid import sample_pyramid
 from pimper_torch.photometry.manifolds import Cone, Manifold, SecondOrder
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
