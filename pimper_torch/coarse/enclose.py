@@ -1,5 +1,6 @@
 """Coarse mesh all round: facets on everything that a few views see, without a reference view."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -19,7 +20,13 @@ from pimper_torch.coarse.oriented import (
 )
 from pimper_torch.coarse.select import frontal_view, named_view, triangulation_angles
 from pimper_torch.coarse.triangulate import smooth_over_mesh
-from pimper_torch.coarse.trim import evidence, large_pieces, near_points, without_small_holes
+from pimper_torch.coarse.trim import (
+    evidence,
+    hanging_together,
+    large_pieces,
+    point_distances,
+    without_small_holes,
+)
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import vertex_normals
@@ -40,11 +47,13 @@ class EncloseConfig:
         max_reprojection_px: Mean reprojection error it may have.
         min_angle_deg: Widest angle between rays it must have.
         densify: The search for depth maps.
-        cell_px: The points' grid, and the finest cell of the surface.
+        cell_px: The points' finest grid; the surface's own has cells twice as wide.
         max_depth: Of the surface's octree, whatever the cell.
         point_weight: Of points against smoothness, in the surface.
         reach_px: A face nearer to a point of the cloud than this is borne out by it.
         least_views: That have to see a face which is not.
+        gap_px: Distance from all points of the cloud, above which seen faces without any go,
+            and all that hang together with them.
         hole_px: Side of a square as large as the largest hole that is closed.
         min_share: Of the area borne out, that a piece apart has to have.
         boundary_weight: Of rims against the surface, in simplification.
@@ -61,9 +70,10 @@ class EncloseConfig:
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     cell_px: float = 1.0
     max_depth: int = 10
-    point_weight: float = 2.0
+    point_weight: float = 1.0
     reach_px: float = 4.0
     least_views: int = 2
+    gap_px: float = 40.0
     hole_px: float = 24.0
     min_share: float = 0.01
     boundary_weight: float = 10.0
@@ -172,8 +182,8 @@ class Enclose(nn.Module):
     ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
         points = cloud.points_world
         extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
-        cells = extent / (self.config.cell_px * pixel)
-        depth = min(self.config.max_depth, max(4, int(torch.tensor(cells).log2().ceil())))
+        cells = extent / (2 * self.config.cell_px * pixel)
+        depth = min(self.config.max_depth, max(4, round(math.log2(cells))))
         # COLMAP works in single precision: a cloud far from the origin is brought there.
         middle = points.median(dim=0).values
         vertices, faces = poisson_surface(
@@ -196,9 +206,13 @@ class Enclose(nn.Module):
         config = self.config
         said = evidence(vertices, faces, maps)
         middle = vertices[faces].mean(dim=1)
-        supported = near_points(middle, cloud.points_world, config.reach_px * pixel)
+        distance = point_distances(middle, cloud.points_world)
+        supported = distance <= config.reach_px * pixel
         kept = (said.seen >= config.least_views) & supported
-        kept |= (said.lit >= config.least_views) & (said.denied < config.least_views)
+        between = (said.lit >= config.least_views) & (said.denied < config.least_views)
+        between &= ~supported
+        gaps = hanging_together(faces, between, distance > config.gap_px * pixel)
+        kept |= between & ~gaps
         kept = without_small_holes(vertices, faces, kept, (config.hole_px * pixel) ** 2)
         chosen = kept.nonzero()[:, 0]
         pieces = large_pieces(vertices, faces[chosen], supported[chosen], config.min_share)
