@@ -97,7 +97,8 @@ def _covered(
     finer: Bool[Tensor, "fine_height fine_width"], like: Bool[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:
     """Mark coarse pixels on or beside which a finer one is valid."""
-    share = adaptive_avg_pool2d(finer[None, None].float(), like.shape)
+    height, width = like.shape
+    share = adaptive_avg_pool2d(finer[None, None].float(), (height, width))
     return max_pool2d(share, 3, 1, 1)[0, 0] > 0
 
 
