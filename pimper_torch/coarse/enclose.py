@@ -17,6 +17,7 @@ from pimper_torch.coarse.oriented import (
     oriented_points,
     sparse_oriented,
     thinned,
+    with_common_normals,
 )
 from pimper_torch.coarse.select import frontal_view, named_view, triangulation_angles
 from pimper_torch.coarse.triangulate import smooth_over_mesh
@@ -150,7 +151,7 @@ class Enclose(nn.Module):
             )
         maps = depth_maps(scene, trusted, config.densify)
         pixel = _pixel_size(scene, trusted) * maps[-1].factor
-        dense = thinned(oriented_points(maps), config.cell_px * pixel)
+        dense = with_common_normals(thinned(oriented_points(maps), config.cell_px * pixel))
         cloud = joined_points(dense, sparse_oriented(scene, trusted, dense, 3 * pixel))
         if len(cloud.points_world) < 16:
             raise ReconstructionError(

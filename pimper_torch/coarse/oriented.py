@@ -36,6 +36,9 @@ _MOST_DOUBLINGS = 3
 # without texture, and a coarser window knows better.
 _MOST_NOISE_STEPS = 1.0
 
+# Points whose places make a normal, and how many normals are made at once; bounds memory.
+_COMMON, _AT_ONCE = 24, 50_000
+
 # Steps in front of what another view sees, beyond which a point is denied by it.
 _DENIED_STEPS = 3.0
 
@@ -249,6 +252,35 @@ def _averaged(cloud: OrientedPoints, cell: float) -> OrientedPoints:
         # for one measurement of the weight its points have on average.
         noise=(counts / total[:, 0]).sqrt().to(points),
     )
+
+
+def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
+    """Take the normals from where the neighbours lie, whichever view they come from.
+
+    A window's slope is less certain than its depth. Neighbours on the other side of a thin
+    wall do not count; where the rest lie on no plane, their normals are averaged.
+    """
+    points = cloud.points_world.detach().cpu().numpy()
+    if len(points) < 3:
+        return cloud
+    _, nearest = cKDTree(points).query(points, k=min(_COMMON, len(points)))
+    normals, places = cloud.normals_world.double().cpu(), cloud.points_world.double().cpu()
+    weight = 1 / cloud.noise.double().cpu().clamp_min(1e-12).square()
+    found = []
+    for around in torch.split(torch.from_numpy(nearest), _AT_ONCE):
+        share = weight[around] / weight[around].sum(dim=1, keepdim=True)
+        mean = (share[..., None] * normals[around]).sum(dim=1)
+        alike = (normals[around] * mean[:, None]).sum(dim=-1) > 0
+        share = torch.where(alike, share, 0) / (share * alike).sum(dim=1, keepdim=True)
+        middle = (share[..., None] * places[around]).sum(dim=1, keepdim=True)
+        steps = places[around] - middle
+        width, axes = torch.linalg.eigh((share[..., None] * steps).mT @ steps)
+        across = axes[:, :, 0]
+        across = across * (across * mean).sum(dim=-1, keepdim=True).sign()
+        flat = width[:, 0] < _FLAT**2 * width[:, 1]
+        found.append(torch.where(flat[:, None], across, normalize(mean, dim=-1)))
+    common = torch.cat(found).to(cloud.normals_world)
+    return cloud.replace(normals_world=common)
 
 
 def sparse_oriented(
