@@ -39,6 +39,10 @@ _MOST_NOISE_STEPS = 1.0
 # Points whose places make a normal, and how many normals are made at once; bounds memory.
 _COMMON, _AT_ONCE = 24, 50_000
 
+# Length of the mean of unit normals round a point, at least: that of normals which scatter by
+# 60 degrees.
+_LEAST_AGREEMENT = 0.5
+
 # Steps in front of what another view sees, beyond which a point is denied by it.
 _DENIED_STEPS = 3.0
 
@@ -258,7 +262,8 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
     """Take the normals from where the neighbours lie, whichever view they come from.
 
     A window's slope is less certain than its depth. Neighbours on the other side of a thin
-    wall do not count; where the rest lie on no plane, their normals are averaged.
+    wall do not count; where the rest lie on no plane, their normals are averaged. Points whose
+    neighbours face anywhere are no surface and are left out.
     """
     points = cloud.points_world.detach().cpu().numpy()
     if len(points) < 3:
@@ -266,7 +271,7 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
     _, nearest = cKDTree(points).query(points, k=min(_COMMON, len(points)))
     normals, places = cloud.normals_world.double().cpu(), cloud.points_world.double().cpu()
     weight = 1 / cloud.noise.double().cpu().clamp_min(1e-12).square()
-    found = []
+    found, agreement = [], []
     for around in torch.split(torch.from_numpy(nearest), _AT_ONCE):
         share = weight[around] / weight[around].sum(dim=1, keepdim=True)
         mean = (share[..., None] * normals[around]).sum(dim=1)
@@ -279,8 +284,10 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
         across = across * (across * mean).sum(dim=-1, keepdim=True).sign()
         flat = width[:, 0] < _FLAT**2 * width[:, 1]
         found.append(torch.where(flat[:, None], across, normalize(mean, dim=-1)))
+        agreement.append(mean.norm(dim=-1))
     common = torch.cat(found).to(cloud.normals_world)
-    return cloud.replace(normals_world=common)
+    alike = torch.cat(agreement).to(common) > _LEAST_AGREEMENT
+    return cloud.replace(normals_world=common).take(alike)
 
 
 def sparse_oriented(

@@ -40,7 +40,7 @@ def test_windows_match_on_the_true_surface_under_any_light_and_nowhere_else():
     inner = torch.isfinite(depth) & (truth.normals_world[2][..., 2] > 0.6)
     true = torch.where(depth.isfinite(), 1 / depth, 0.25)
     assert matcher.score(true)[inner].median() > 0.95
-    assert matcher.score(1.05 * true)[inner].median() < 0.6
+    assert matcher.score(1.1 * true)[inner].median() < 0.6
     # A photograph twice as bright, as another exposure: the same.
     brighter = level.replace(
         tone=level.tone * torch.tensor([1.4, 0.8, 1.0, 1.2, 0.9])[:, None, None]
@@ -64,13 +64,15 @@ def test_a_sweep_finds_the_offset_between_its_steps():
     assert score[inner].median() > 0.9
 
 
-def test_the_mean_of_the_largest_is_that_of_a_sort(generator):
+def test_the_mean_of_the_largest_is_that_of_a_sort():
+    generator = torch.Generator().manual_seed(0)
     values = torch.randn(5, 4, 3, generator=generator)
     assert_close(mean_of_largest(values, 3), values.topk(3, dim=0).values.mean(dim=0))
     assert_close(mean_of_largest(values, 9), values.mean(dim=0))
 
 
-def test_holes_are_filled_from_around_and_the_rest_stays(generator):
+def test_holes_are_filled_from_around_and_the_rest_stays():
+    generator = torch.Generator().manual_seed(0)
     values = torch.rand(13, 18, generator=generator) + 1
     known = torch.rand(13, 18, generator=generator) > 0.7
     filled = push_pull(values, known)

@@ -16,7 +16,7 @@ from pimper_torch.scenes.shapes import Sphere
 from pimper_torch.scenes.sparse import sparse_scene
 
 SETTINGS = EncloseConfig(
-    num_facets=600, densify=DensifyConfig(coarsest_px=160, levels=1), hole_px=12.0
+    num_facets=600, densify=DensifyConfig(coarsest_px=120, levels=1), hole_px=12.0
 )
 
 
@@ -55,7 +55,7 @@ def round_about():
     ring = (1 - height.square()).sqrt()
     eyes = 4 * torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), height], dim=-1)
     frames = look_at(eyes, torch.zeros(3).double(), torch.tensor([0.1, 0.2, 1.0]).double())
-    return photographed(pinholes(frames, 240.0, 160, 130))
+    return photographed(pinholes(frames, 180.0, 120, 100))
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_views_all_round_give_one_closed_surface(enclosed):
 def test_the_surface_is_where_the_ball_is_and_faces_outward(enclosed):
     mesh = enclosed.mesh
     middle = mesh.vertices_world[mesh.faces].mean(dim=1)
-    # A pixel is 1 / 80 of the radius; facets of a ball of 600 lie up to 0.01 inside it.
+    # A pixel is 1 / 60 of the radius; facets of a ball of 600 lie up to 0.01 inside it.
     assert (middle.norm(dim=1) - 1).abs().mean() < 0.01
     assert (middle.norm(dim=1) - 1).abs().max() < 0.05
     outward = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
@@ -94,7 +94,7 @@ def test_facets_carry_the_cloud(enclosed, round_about):
 
 
 def test_a_few_views_on_an_arc_give_the_side_that_they_see():
-    cameras = arc_cameras(6, width=160, height=130, focal_px=240.0, distance=4.0, sway_deg=4.0)
+    cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
     scene = photographed(cameras)
     mesh = Enclose(SETTINGS)(scene).mesh
     # Whatever is seen by nobody is gone, and black background gave nothing.
@@ -109,17 +109,14 @@ def test_a_few_views_on_an_arc_give_the_side_that_they_see():
     assert (distance < 0.03).all()
 
 
-def test_masks_keep_the_rest_out(round_about):
-    views = round_about.views
-    masks = views.inside.clone()
-    masks[:, :, :80] = False  # half of every picture
-    masked = Enclose(SETTINGS)(round_about.replace(views=views.replace(masks=masks)))
-    for view in (0, 9):
-        frame = round_about.cameras.cam_from_world[view]
-        assert masked.mesh.faces.shape[0] > 0
-        assert frame.isfinite().all()
-    seen_less = masked.mesh.vertices_world
-    assert (seen_less.norm(dim=1) - 1).abs().max() < 0.1
+def test_masks_keep_the_rest_out():
+    cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=0.0)
+    scene = photographed(cameras)
+    masks = scene.views.inside.clone()
+    masks[:, 50:] = False  # the lower half of the ball in every picture
+    mesh = Enclose(SETTINGS)(scene.replace(views=scene.views.replace(masks=masks))).mesh
+    assert mesh.vertices_world[:, 1].min() > -0.1  # y is up
+    assert mesh.vertices_world[:, 1].max() > 0.6
 
 
 def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_about):
@@ -146,7 +143,7 @@ def test_a_small_mesh_that_is_brought_stays_as_it_is(round_about):
         (lambda v, f: (v, f[:0]), "no faces"),
         (lambda v, f: (v, f + len(v)), "name vertices"),
         (lambda v, f: (v / 0, f), "not finite"),
-        (lambda v, f: (v + 100, f), "no photograph shows"),
+        (lambda v, f: (v + 1e4, f), "no photograph shows"),
     ],
 )
 def test_a_mesh_that_cannot_be_used_is_refused(round_about, change, told):
@@ -168,7 +165,8 @@ def test_settings_out_of_range_are_refused():
         EncloseConfig(num_facets=3)
 
 
-def test_the_nearest_facet_is_that_of_a_search_over_all(generator):
+def test_the_nearest_facet_is_that_of_a_search_over_all():
+    generator = torch.Generator().manual_seed(0)
     vertices, faces = icosphere(1)
     directions = normalize(torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=-1)
     facet, distance = nearest_facets(1.1 * directions, vertices, faces)
