@@ -37,8 +37,8 @@ class DensifyConfig:
         agreeing: Other views that have to agree.
     """
 
-    coarsest_px: int = 200
-    levels: int = 2
+    coarsest_px: int = 100
+    levels: int = 3
     sources: int = 5
     best_sources: int = 3
     radius: int = 2

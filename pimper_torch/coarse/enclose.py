@@ -151,7 +151,8 @@ class Enclose(nn.Module):
             )
         maps = depth_maps(scene, trusted, config.densify)
         pixel = _pixel_size(scene, trusted) * maps[-1].factor
-        dense = with_common_normals(thinned(oriented_points(maps), config.cell_px * pixel))
+        # The coarsest windows of three reach past contours: they only say where to look.
+        dense = with_common_normals(thinned(oriented_points(maps[-2:]), config.cell_px * pixel))
         cloud = joined_points(dense, sparse_oriented(scene, trusted, dense, 3 * pixel))
         if len(cloud.points_world) < 16:
             raise ReconstructionError(
