@@ -16,7 +16,9 @@ from pimper_torch.scenes.shapes import Sphere
 from pimper_torch.scenes.sparse import sparse_scene
 
 SETTINGS = EncloseConfig(
-    num_facets=600, densify=DensifyConfig(coarsest_px=120, levels=1), hole_px=12.0
+    num_facets=600,
+    densify=DensifyConfig(coarsest_px=120, levels=1, most_hypotheses=48),
+    hole_px=12.0,
 )
 
 
