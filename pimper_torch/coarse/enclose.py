@@ -30,7 +30,7 @@ from pimper_torch.coarse.trim import (
 )
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 from pimper_torch.sfm.colmap import poisson_surface, simplified
 
@@ -129,6 +129,11 @@ class Enclose(nn.Module):
             pixel = _pixel_size(scene, trusted) if len(trusted) else float("inf")
         if len(faces) > config.num_facets:
             vertices, faces = _few(vertices, faces, config)
+        if mesh is None:
+            faces = two_faces_an_edge(vertices, faces)
+            whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
+            pieces = large_pieces(vertices, faces, whole, config.min_share)
+            vertices, faces = _used(vertices, faces[pieces])
         normals = smooth_over_mesh(vertex_normals(vertices, faces), faces, config.smoothing_rounds)
         return CoarseMesh(
             mesh=Mesh(vertices_world=vertices, faces=faces, normals_world=normals),
@@ -237,6 +242,21 @@ class Enclose(nn.Module):
             covariance_world=point_covariances(scene, chosen),
             facet=facet[near],
         )
+
+
+def two_faces_an_edge(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Int[Tensor, "kept 3"]:
+    """Drop the smallest face of edges with three or more until each has two at most."""
+    while True:
+        edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+        _, edge, counts = torch.unique(edges, dim=0, return_inverse=True, return_counts=True)
+        crowded = (counts[edge] > 2).reshape(-1, 3).any(dim=1)
+        if not bool(crowded.any()):
+            return faces
+        area = face_normals(vertices, faces).norm(dim=-1)
+        smallest = torch.where(crowded, area, torch.inf).argmin()
+        faces = torch.cat([faces[:smallest], faces[smallest + 1 :]])
 
 
 def nearest_facets(

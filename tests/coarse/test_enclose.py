@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.coarse.densify import DensifyConfig
-from pimper_torch.coarse.enclose import Enclose, EncloseConfig, nearest_facets
+from pimper_torch.coarse.enclose import Enclose, EncloseConfig, nearest_facets, two_faces_an_edge
 from pimper_torch.errors import ConfigError, InputError, ReconstructionError
 from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.surfaces import face_normals, face_pairs
@@ -178,3 +178,9 @@ def test_the_nearest_facet_is_that_of_a_search_over_all():
     above = (1.1 * directions) @ normals.T - height
     assert (distance >= above.amax(dim=1) - 0.02).all()
     assert (above.gather(1, facet[:, None])[:, 0] >= above.amax(dim=1) - 0.02).all()
+
+
+def test_of_three_faces_at_an_edge_the_smallest_goes():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.1]])
+    faces = torch.tensor([[0, 1, 2], [1, 0, 4], [1, 0, 3]])
+    assert two_faces_an_edge(vertices, faces).tolist() == [[0, 1, 2], [1, 0, 3]]
