@@ -42,7 +42,7 @@ def checked(
             f"coarse mesh: faces of the mesh that was given name vertices from {int(faces.min())} "
             f"to {int(faces.max())}, but it has {len(vertices)}. Write the mesh again."
         )
-    bad = int((~vertices[faces.unique()].isfinite()).any(dim=1).sum())
+    bad = int((~vertices[torch.unique(faces)].isfinite()).any(dim=1).sum())
     if bad:
         raise InputError(
             f"coarse mesh: {bad} vertices of the mesh that was given are not finite. Remove them."

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
-from pimper_torch.coarse.matching import Level, Matcher, Pairing, Windows, level_of, pair
+from pimper_torch.coarse.matching import Level, Matcher, Windows, level_of, pair
 from pimper_torch.coarse.neighbours import choose_sources, inverse_depths, step_for_one_pixel
 from pimper_torch.config import require
 from pimper_torch.geometry.pixels import grid_from_pixels
@@ -37,8 +37,8 @@ class DensifyConfig:
         agreeing: Other views that have to agree.
     """
 
-    coarsest_px: int = 200
-    levels: int = 2
+    coarsest_px: int = 100
+    levels: int = 3
     sources: int = 5
     best_sources: int = 3
     radius: int = 2

@@ -1,5 +1,6 @@
 """Coarse mesh all round: facets on everything that a few views see, without a reference view."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -16,13 +17,20 @@ from pimper_torch.coarse.oriented import (
     oriented_points,
     sparse_oriented,
     thinned,
+    with_common_normals,
 )
 from pimper_torch.coarse.select import frontal_view, named_view, triangulation_angles
 from pimper_torch.coarse.triangulate import smooth_over_mesh
-from pimper_torch.coarse.trim import evidence, large_pieces, near_points, without_small_holes
+from pimper_torch.coarse.trim import (
+    evidence,
+    hanging_together,
+    large_pieces,
+    point_distances,
+    without_small_holes,
+)
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 from pimper_torch.sfm.colmap import poisson_surface, simplified
 
@@ -40,11 +48,13 @@ class EncloseConfig:
         max_reprojection_px: Mean reprojection error it may have.
         min_angle_deg: Widest angle between rays it must have.
         densify: The search for depth maps.
-        cell_px: The points' grid, and the finest cell of the surface.
+        cell_px: The points' finest grid; the surface's own has cells twice as wide.
         max_depth: Of the surface's octree, whatever the cell.
         point_weight: Of points against smoothness, in the surface.
         reach_px: A face nearer to a point of the cloud than this is borne out by it.
         least_views: That have to see a face which is not.
+        gap_px: Distance from all points of the cloud, above which seen faces without any go,
+            and all that hang together with them.
         hole_px: Side of a square as large as the largest hole that is closed.
         min_share: Of the area borne out, that a piece apart has to have.
         boundary_weight: Of rims against the surface, in simplification.
@@ -61,9 +71,10 @@ class EncloseConfig:
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     cell_px: float = 1.0
     max_depth: int = 10
-    point_weight: float = 2.0
+    point_weight: float = 1.0
     reach_px: float = 4.0
     least_views: int = 2
+    gap_px: float = 40.0
     hole_px: float = 24.0
     min_share: float = 0.01
     boundary_weight: float = 10.0
@@ -118,6 +129,11 @@ class Enclose(nn.Module):
             pixel = _pixel_size(scene, trusted) if len(trusted) else float("inf")
         if len(faces) > config.num_facets:
             vertices, faces = _few(vertices, faces, config)
+        if mesh is None:
+            faces = two_faces_an_edge(vertices, faces)
+            whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
+            pieces = large_pieces(vertices, faces, whole, config.min_share)
+            vertices, faces = _used(vertices, faces[pieces])
         normals = smooth_over_mesh(vertex_normals(vertices, faces), faces, config.smoothing_rounds)
         return CoarseMesh(
             mesh=Mesh(vertices_world=vertices, faces=faces, normals_world=normals),
@@ -140,7 +156,8 @@ class Enclose(nn.Module):
             )
         maps = depth_maps(scene, trusted, config.densify)
         pixel = _pixel_size(scene, trusted) * maps[-1].factor
-        dense = thinned(oriented_points(maps), config.cell_px * pixel)
+        # The coarsest windows of three reach past contours: they only say where to look.
+        dense = with_common_normals(thinned(oriented_points(maps[-2:]), config.cell_px * pixel))
         cloud = joined_points(dense, sparse_oriented(scene, trusted, dense, 3 * pixel))
         if len(cloud.points_world) < 16:
             raise ReconstructionError(
@@ -172,8 +189,8 @@ class Enclose(nn.Module):
     ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
         points = cloud.points_world
         extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
-        cells = extent / (self.config.cell_px * pixel)
-        depth = min(self.config.max_depth, max(4, int(torch.tensor(cells).log2().ceil())))
+        cells = extent / (2 * self.config.cell_px * pixel)
+        depth = min(self.config.max_depth, max(4, round(math.log2(cells))))
         # COLMAP works in single precision: a cloud far from the origin is brought there.
         middle = points.median(dim=0).values
         vertices, faces = poisson_surface(
@@ -196,9 +213,13 @@ class Enclose(nn.Module):
         config = self.config
         said = evidence(vertices, faces, maps)
         middle = vertices[faces].mean(dim=1)
-        supported = near_points(middle, cloud.points_world, config.reach_px * pixel)
+        distance = point_distances(middle, cloud.points_world)
+        supported = distance <= config.reach_px * pixel
         kept = (said.seen >= config.least_views) & supported
-        kept |= (said.lit >= config.least_views) & (said.denied < config.least_views)
+        between = (said.lit >= config.least_views) & (said.denied < config.least_views)
+        between &= ~supported
+        gaps = hanging_together(faces, between, distance > config.gap_px * pixel)
+        kept |= between & ~gaps
         kept = without_small_holes(vertices, faces, kept, (config.hole_px * pixel) ** 2)
         chosen = kept.nonzero()[:, 0]
         pieces = large_pieces(vertices, faces[chosen], supported[chosen], config.min_share)
@@ -221,6 +242,21 @@ class Enclose(nn.Module):
             covariance_world=point_covariances(scene, chosen),
             facet=facet[near],
         )
+
+
+def two_faces_an_edge(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Int[Tensor, "kept 3"]:
+    """Drop the smallest face of edges with three or more until each has two at most."""
+    while True:
+        edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+        _, edge, counts = torch.unique(edges, dim=0, return_inverse=True, return_counts=True)
+        crowded = (counts[edge] > 2).reshape(-1, 3).any(dim=1)
+        if not bool(crowded.any()):
+            return faces
+        area = face_normals(vertices, faces).norm(dim=-1)
+        smallest = torch.where(crowded, area, torch.inf).argmin()
+        faces = torch.cat([faces[:smallest], faces[smallest + 1 :]])
 
 
 def nearest_facets(

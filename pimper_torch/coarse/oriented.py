@@ -23,11 +23,25 @@ _REACH_STEPS = 3.0
 
 # Share of a window that has to lie on the plane: where it is less, the pixel is beside the
 # contour of what is in front, which windows that match make too large.
-_LEAST_SHARE = 0.5
+_LEAST_SHARE = 0.7
 
 # Points round a sparse one that tell its normal; the standard deviation across their plane
 # over the smaller one along it that is still a plane; the cosine to the mean ray at least.
 _NEIGHBOURS, _FLAT, _FACING = 12, 0.3, 0.2
+
+# Of a grid's cells, for noisy points.
+_MOST_DOUBLINGS = 3
+
+# Steps of inverse depth that a window's pixels may scatter round their plane: more is a match
+# without texture, and a coarser window knows better.
+_MOST_NOISE_STEPS = 1.0
+
+# Points whose places make a normal, and how many normals are made at once; bounds memory.
+_COMMON, _AT_ONCE = 24, 50_000
+
+# Length of the mean of unit normals round a point, at least: that of normals which scatter by
+# 60 degrees.
+_LEAST_AGREEMENT = 0.5
 
 # Steps in front of what another view sees, beyond which a point is denied by it.
 _DENIED_STEPS = 3.0
@@ -75,13 +89,14 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
         maps: Of all resolutions, the coarsest first.
     """
     clouds = []
-    for rank, one in enumerate(maps):
-        finer = maps[rank + 1] if rank + 1 < len(maps) else None
-        for view in range(one.valid.shape[0]):
-            wanted = one.valid[view]
+    for view in range(maps[0].valid.shape[0]):
+        finer = None
+        for one in reversed(maps):
+            wanted = torch.ones_like(one.valid[view])
             if finer is not None:
-                wanted = wanted & ~_covered(finer.valid[view], wanted)
-            clouds.append(_of_view(one, view, wanted))
+                wanted &= ~_covered(finer, wanted)
+            cloud, finer = _of_view(one, view, wanted)
+            clouds.append(cloud)
     return joined_points(*clouds)
 
 
@@ -89,17 +104,21 @@ def _covered(
     finer: Bool[Tensor, "fine_height fine_width"], like: Bool[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:
     """Mark coarse pixels on or beside which a finer one is valid."""
-    share = adaptive_avg_pool2d(finer[None, None].float(), like.shape)
+    height, width = like.shape
+    share = adaptive_avg_pool2d(finer[None, None].float(), (height, width))
     return max_pool2d(share, 3, 1, 1)[0, 0] > 0
 
 
-def _of_view(maps: DepthMaps, view: int, wanted: Bool[Tensor, "height width"]) -> OrientedPoints:
+def _of_view(
+    maps: DepthMaps, view: int, wanted: Bool[Tensor, "height width"]
+) -> tuple[OrientedPoints, Bool[Tensor, "height width"]]:
+    """Give a view's points where they are wanted, and where they or finer ones are."""
     intrinsics = maps.level.cameras.intrinsics[view]
     frame = maps.level.cameras.cam_from_world[view]
     inverse_depth, slope, spread, fine = fitted_planes(
         maps.inverse_depth[view], maps.valid[view], float(maps.step[view])
     )
-    fine &= wanted
+    fine &= wanted & (spread <= _MOST_NOISE_STEPS * maps.step[view])
     height, width = fine.shape
     pixels = pixel_centers(width, height, like=intrinsics)[fine]
     q, slope, spread = inverse_depth[fine], slope[fine], spread[fine]
@@ -113,7 +132,10 @@ def _of_view(maps: DepthMaps, view: int, wanted: Bool[Tensor, "height width"]) -
     noise = spread / q.square() * rays.norm(dim=-1) * oblique
     cloud = OrientedPoints(points_world=points, normals_world=normals, noise=noise)
     borne_out = _denied(maps, view, points) <= maps.agreed[view][fine]
-    return cloud.take(borne_out & (oblique > 0))
+    kept = borne_out & (oblique > 0)
+    known = ~wanted
+    known[fine] = kept
+    return cloud.take(kept), known
 
 
 def fitted_planes(
@@ -191,10 +213,25 @@ def _denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int
 def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     """Average points that share a cell of a grid and face the same way.
 
+    Noisy points share larger cells, up to eight times as wide: a surface through them is then
+    as smooth as it can be known.
+
     Args:
         cloud: Any.
-        cell: Side of the grid's cells, scene units.
+        cell: Side of the finest grid's cells, scene units; fine for points whose noise is
+            within a third of it.
     """
+    if len(cloud.points_world) == 0:
+        return cloud
+    doublings = (cloud.noise / (cell / 3)).clamp(1e-6).log2().ceil().clamp(0, _MOST_DOUBLINGS)
+    parts = [
+        _averaged(cloud.take(doublings == rank), cell * 2**rank)
+        for rank in range(_MOST_DOUBLINGS + 1)
+    ]
+    return joined_points(*parts)
+
+
+def _averaged(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     points = cloud.points_world
     if len(points) == 0:
         return cloud
@@ -207,18 +244,50 @@ def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     _, index, counts = torch.unique(key, return_inverse=True, return_counts=True)
     weight = 1 / cloud.noise.double().clamp_min(1e-12).square()
 
-    def averaged(values: Float[Tensor, "point channel"]) -> Float[Tensor, "cell channel"]:
+    def summed(values: Float[Tensor, "point channel"]) -> Float[Tensor, "cell channel"]:
         total = torch.zeros(len(counts), values.shape[1], dtype=torch.double, device=values.device)
         return total.index_add(0, index, weight[:, None] * values.double())
 
-    total = averaged(torch.ones_like(points[:, :1]))
+    total = summed(torch.ones_like(points[:, :1]))
     return OrientedPoints(
-        points_world=(averaged(points) / total).to(points),
-        normals_world=normalize(averaged(cloud.normals_world), dim=-1).to(points),
+        points_world=(summed(points) / total).to(points),
+        normals_world=normalize(summed(cloud.normals_world), dim=-1).to(points),
         # Errors of windows that overlap, in one view, do not average out: each cell counts
         # for one measurement of the weight its points have on average.
         noise=(counts / total[:, 0]).sqrt().to(points),
     )
+
+
+def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
+    """Take the normals from where the neighbours lie, whichever view they come from.
+
+    A window's slope is less certain than its depth. Neighbours on the other side of a thin
+    wall do not count; where the rest lie on no plane, their normals are averaged. Points whose
+    neighbours face anywhere are no surface and are left out.
+    """
+    points = cloud.points_world.detach().cpu().numpy()
+    if len(points) < 3:
+        return cloud
+    _, nearest = cKDTree(points).query(points, k=min(_COMMON, len(points)))
+    normals, places = cloud.normals_world.double().cpu(), cloud.points_world.double().cpu()
+    weight = 1 / cloud.noise.double().cpu().clamp_min(1e-12).square()
+    found, agreement = [], []
+    for around in torch.split(torch.from_numpy(nearest), _AT_ONCE):
+        share = weight[around] / weight[around].sum(dim=1, keepdim=True)
+        mean = (share[..., None] * normals[around]).sum(dim=1)
+        alike = (normals[around] * mean[:, None]).sum(dim=-1) > 0
+        share = torch.where(alike, share, 0) / (share * alike).sum(dim=1, keepdim=True)
+        middle = (share[..., None] * places[around]).sum(dim=1, keepdim=True)
+        steps = places[around] - middle
+        width, axes = torch.linalg.eigh((share[..., None] * steps).mT @ steps)
+        across = axes[:, :, 0]
+        across = across * (across * mean).sum(dim=-1, keepdim=True).sign()
+        flat = width[:, 0] < _FLAT**2 * width[:, 1]
+        found.append(torch.where(flat[:, None], across, normalize(mean, dim=-1)))
+        agreement.append(mean.norm(dim=-1))
+    common = torch.cat(found).to(cloud.normals_world)
+    alike = torch.cat(agreement).to(common) > _LEAST_AGREEMENT
+    return cloud.replace(normals_world=common).take(alike)
 
 
 def sparse_oriented(

@@ -78,15 +78,22 @@ def _shown(
     return within.nonzero()[:, 0], column, row, depth[within]
 
 
-def near_points(
-    places: Float[Tensor, "place 3"], points: Float[Tensor, "point 3"], reach: float
-) -> Bool[Tensor, " place"]:
-    """Mark places with a point within reach."""
-    if len(points) == 0:
-        return torch.zeros(len(places), dtype=torch.bool, device=places.device)
-    tree = cKDTree(points.detach().cpu().numpy())
-    distance, _ = tree.query(places.detach().cpu().numpy(), distance_upper_bound=reach)
-    return torch.from_numpy(distance <= reach).to(places.device)
+def point_distances(
+    places: Float[Tensor, "place 3"], points: Float[Tensor, "point 3"]
+) -> Float[Tensor, " place"]:
+    """Give each place's distance to the nearest point."""
+    distance, _ = cKDTree(points.detach().cpu().numpy()).query(places.detach().cpu().numpy())
+    return torch.from_numpy(distance).to(places)
+
+
+def hanging_together(
+    faces: Int[Tensor, "face 3"], among: Bool[Tensor, " face"], marked: Bool[Tensor, " face"]
+) -> Bool[Tensor, " face"]:
+    """Mark all faces that hang together with marked ones through faces ``among`` only."""
+    pairs, _ = face_pairs(faces)
+    label = graph_components(pairs[among[pairs].all(dim=1)], len(faces))
+    count = torch.zeros_like(label).index_add(0, label, (marked & among).long())
+    return among & (count[label] > 0)
 
 
 def without_small_holes(

@@ -1,0 +1,148 @@
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.coarse.densify import push_pull, sweep
+from pimper_torch.coarse.matching import Matcher, Windows, level_of, mean_of_largest, pair
+from pimper_torch.coarse.oriented import OrientedPoints, fitted_planes, thinned
+from pimper_torch.coarse.trim import hanging_together, large_pieces, without_small_holes
+from pimper_torch.scenes.cameras import arc_cameras
+from pimper_torch.scenes.meshes import icosphere
+from pimper_torch.scenes.render import render_shape
+from pimper_torch.scenes.shapes import Sphere
+from pimper_torch.scenes.sparse import sparse_scene
+from pimper_torch.sfm.colmap import poisson_surface, simplified
+
+WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
+
+
+def mottled(points):
+    waves = 12 * torch.randn(20, 3, generator=torch.Generator().manual_seed(1)).to(points)
+    tone = torch.sin(points @ waves.T + torch.arange(20).to(points)).mean(dim=-1, keepdim=True)
+    return (0.5 + tone).clamp(0.05, 1).expand_as(points)
+
+
+def ball(num_views=5):
+    cameras = arc_cameras(
+        num_views, width=160, height=120, focal_px=240.0, distance=4.0, sway_deg=0.0
+    )
+    lights = torch.tensor(
+        [[0.2 + 0.05 * view, 0.1 * (view % 3 - 1), 0.05, 0.4] for view in range(num_views)]
+    ).double()
+    scene = render_shape(Sphere(), cameras, lights, mottled)
+    return scene, sparse_scene(scene, 300, torch.Generator().manual_seed(0))
+
+
+def test_windows_match_on_the_true_surface_under_any_light_and_nowhere_else():
+    truth, scene = ball()
+    level = level_of(scene, 1)
+    matcher = Matcher(level, pair(level, 2, torch.tensor([0, 1, 3, 4])), WINDOWS)
+    depth = truth.depth[2].float()
+    inner = torch.isfinite(depth) & (truth.normals_world[2][..., 2] > 0.6)
+    true = torch.where(depth.isfinite(), 1 / depth, 0.25)
+    assert matcher.score(true)[inner].median() > 0.95
+    assert matcher.score(1.1 * true)[inner].median() < 0.6
+    # A photograph twice as bright, as another exposure: the same.
+    brighter = level.replace(
+        tone=level.tone * torch.tensor([1.4, 0.8, 1.0, 1.2, 0.9])[:, None, None]
+    )
+    other = Matcher(brighter, pair(level, 2, torch.tensor([0, 1, 3, 4])), WINDOWS)
+    assert other.score(true)[inner].median() > 0.95
+    # Darkness matches nothing.
+    assert matcher.score(true)[:10, :10].abs().max() < 0.05
+
+
+def test_a_sweep_finds_the_offset_between_its_steps():
+    truth, scene = ball()
+    level = level_of(scene, 1)
+    matcher = Matcher(level, pair(level, 2, torch.tensor([0, 1, 3, 4])), WINDOWS)
+    depth = truth.depth[2].float()
+    inner = torch.isfinite(depth) & (truth.normals_world[2][..., 2] > 0.7)
+    true = torch.where(depth.isfinite(), 1 / depth, 0.25)
+    step = 0.004
+    found, score = sweep(matcher, true + 1.3 * step, [step * rank for rank in range(-3, 4)])
+    assert ((found - true)[inner].abs().median() / step) < 0.15
+    assert score[inner].median() > 0.9
+
+
+def test_the_mean_of_the_largest_is_that_of_a_sort():
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(5, 4, 3, generator=generator)
+    assert_close(mean_of_largest(values, 3), values.topk(3, dim=0).values.mean(dim=0))
+    assert_close(mean_of_largest(values, 9), values.mean(dim=0))
+
+
+def test_holes_are_filled_from_around_and_the_rest_stays():
+    generator = torch.Generator().manual_seed(0)
+    values = torch.rand(13, 18, generator=generator) + 1
+    known = torch.rand(13, 18, generator=generator) > 0.7
+    filled = push_pull(values, known)
+    assert_close(filled[known], values[known])
+    assert filled.min() >= values[known].min() - 1e-6
+    assert filled.max() <= values[known].max() + 1e-6
+    even = push_pull(torch.full_like(values, 3.0), known)
+    assert_close(even, torch.full_like(values, 3.0))
+
+
+def test_a_plane_is_fitted_exactly_and_a_step_is_not_smoothed():
+    u, v = torch.arange(20.0), torch.arange(16.0)
+    plane = 0.2 + 0.001 * u[None] - 0.002 * v[:, None]
+    valid = torch.ones_like(plane, dtype=torch.bool)
+    fitted, slope, _, fine = fitted_planes(plane, valid, 0.004)
+    inner = (slice(3, -3), slice(3, -3))
+    assert fine[inner].all()
+    assert_close(fitted[inner], plane[inner], atol=1e-5, rtol=0)
+    expected = torch.tensor([0.001, -0.002]).expand_as(slope[inner])
+    assert_close(slope[inner], expected, atol=1e-5, rtol=0)
+    stepped = plane + 0.2 * (u > 9)
+    near, _, _, fine = fitted_planes(stepped, valid, 0.004)
+    assert_close(near[fine], stepped[fine], atol=2e-4, rtol=0)
+    assert not fine[3:-3, 9:11].any()  # beside the step half a window is elsewhere
+
+
+def test_noisy_points_share_larger_cells_and_sides_stay_apart():
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0))
+    points[:, 2] = 0.5
+    up = torch.tensor([0.0, 0, 1]).expand(4000, 3)
+    exact, noisy = torch.full((4000,), 1e-3), torch.full((4000,), 0.08)
+
+    def count(noise, normals):
+        cloud = OrientedPoints(points_world=points, normals_world=normals, noise=noise)
+        return len(thinned(cloud, 0.1).noise)
+
+    assert 100 <= count(exact, up) <= 121
+    assert count(noisy, up) < 0.2 * count(exact, up)
+    both = torch.where(torch.arange(4000)[:, None] % 2 == 0, up, -up)
+    assert 1.8 * count(exact, up) < count(exact, both) <= 2 * count(exact, up)
+
+
+def test_poisson_puts_a_ball_through_points_of_a_ball_and_simplification_keeps_it():
+    vertices, _ = icosphere(4)
+    found, faces = poisson_surface(vertices, vertices, depth=6, point_weight=1.0, threads=1)
+    assert (found.norm(dim=1) - 1).abs().max() < 0.02
+    few, left = simplified(found, faces, num_faces=200, boundary_weight=10.0, threads=1)
+    assert 150 <= len(left) <= 200
+    assert (few.norm(dim=1) - 1).abs().max() < 0.06
+    a, b, c = few[left].unbind(dim=1)
+    assert (torch.linalg.cross(b - a, c - a) * (a + b + c)).sum(dim=-1).min() > 0
+
+
+def test_small_holes_are_closed_and_large_ones_and_crumbs_are_not():
+    vertices, faces = icosphere(3)
+    middle = vertices[faces].mean(dim=1)
+    kept = (middle[:, 2] < 0.6) & ~(middle[:, 0] > 0.95)
+    whole = torch.ones(len(faces), dtype=torch.bool)
+    assert (large_pieces(vertices, faces, whole, 0.9)).all()
+    mended = without_small_holes(vertices, faces, kept, 1.0)
+    assert mended[middle[:, 0] > 0.95].all()  # 0.3 of the area unit
+    assert not mended[middle[:, 2] > 0.6].any()  # 2.5
+    crumbs = (middle[:, 2] < 0) | (middle[:, 2] > 0.97)
+    pieces = large_pieces(vertices, faces[crumbs], whole[crumbs], 0.05)
+    assert (pieces == (middle[crumbs][:, 2] < 0)).all()
+
+
+def test_faces_go_with_what_they_hang_together_with():
+    vertices, faces = icosphere(3)
+    height = vertices[faces].mean(dim=1)[:, 2]
+    caps = height.abs() > 0.5
+    found = hanging_together(faces, caps, height > 0.99)
+    assert (found == (height > 0.5)).all()

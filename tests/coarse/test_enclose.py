@@ -1,0 +1,186 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.coarse.densify import DensifyConfig
+from pimper_torch.coarse.enclose import Enclose, EncloseConfig, nearest_facets, two_faces_an_edge
+from pimper_torch.errors import ConfigError, InputError, ReconstructionError
+from pimper_torch.geometry.components import face_components
+from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.records import Mesh
+from pimper_torch.scenes.cameras import arc_cameras, look_at, pinholes
+from pimper_torch.scenes.meshes import icosphere
+from pimper_torch.scenes.render import render_shape
+from pimper_torch.scenes.shapes import Sphere
+from pimper_torch.scenes.sparse import sparse_scene
+
+SETTINGS = EncloseConfig(
+    num_facets=600,
+    densify=DensifyConfig(coarsest_px=120, levels=1, most_hypotheses=48),
+    hole_px=12.0,
+)
+
+
+def mottled(points):
+    """Waves in many directions, fine enough to be matched, none of them twice."""
+    generator = torch.Generator().manual_seed(3)
+    waves = 14 * torch.randn(24, 3, generator=generator, dtype=torch.float64).to(points)
+    phases = torch.arange(24).to(points)
+    tone = torch.sin(points @ waves.T + phases).mean(dim=-1, keepdim=True)
+    return (0.5 + 1.2 * tone).clamp(0.05, 1).expand_as(points)
+
+
+def photographed(cameras):
+    generator = torch.Generator().manual_seed(0)
+    count = cameras.num_views
+    # The lamp goes with the camera and is never quite the same.
+    towards = normalize(cameras.centers_world, dim=-1)
+    aside = 0.4 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    lights = torch.cat(
+        [
+            0.2 + 0.2 * torch.rand(count, 1, generator=generator, dtype=torch.float64),
+            0.5 * normalize(towards + aside, dim=-1),
+        ],
+        dim=-1,
+    )
+    scene = render_shape(Sphere(), cameras, lights, mottled)
+    return sparse_scene(scene, 400, generator)
+
+
+@pytest.fixture(scope="module")
+def round_about():
+    """A ball seen from 24 places all round."""
+    place = torch.arange(24, dtype=torch.float64)
+    height = 1 - (2 * place + 1) / 24
+    azimuth = place * torch.pi * (3 - 5**0.5)
+    ring = (1 - height.square()).sqrt()
+    eyes = 4 * torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), height], dim=-1)
+    frames = look_at(eyes, torch.zeros(3).double(), torch.tensor([0.1, 0.2, 1.0]).double())
+    return photographed(pinholes(frames, 180.0, 120, 100))
+
+
+@pytest.fixture(scope="module")
+def enclosed(round_about):
+    return Enclose(SETTINGS)(round_about)
+
+
+def test_views_all_round_give_one_closed_surface(enclosed):
+    mesh = enclosed.mesh
+    pairs, _ = face_pairs(mesh.faces)
+    assert 2 * len(pairs) == 3 * len(mesh.faces)  # every edge has two faces: no rim
+    assert int(face_components(mesh.faces).max()) == 0
+    assert 500 <= len(mesh.faces) <= 600
+    assert len(mesh.vertices_world) - len(pairs) + len(mesh.faces) == 2  # Euler: a ball
+
+
+def test_the_surface_is_where_the_ball_is_and_faces_outward(enclosed):
+    mesh = enclosed.mesh
+    middle = mesh.vertices_world[mesh.faces].mean(dim=1)
+    # A pixel is 1 / 60 of the radius; facets of a ball of 600 lie up to 0.01 inside it.
+    assert (middle.norm(dim=1) - 1).abs().mean() < 0.01
+    assert (middle.norm(dim=1) - 1).abs().max() < 0.05
+    outward = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
+    assert ((outward * normalize(middle, dim=-1)).sum(dim=-1) > 0.8).all()
+    assert (mesh.normals_world * normalize(mesh.vertices_world, dim=-1)).sum(dim=-1).min() > 0.8
+
+
+def test_facets_carry_the_cloud(enclosed, round_about):
+    points = enclosed.points
+    assert len(points.facet) > 0.9 * len(round_about.points_world)
+    corners = enclosed.mesh.vertices_world[enclosed.mesh.faces[points.facet]]
+    reach = (corners - corners.mean(dim=1, keepdim=True)).norm(dim=-1).amax(dim=1)
+    assert ((points.points_world - corners.mean(dim=1)).norm(dim=-1) < 1.2 * reach).all()
+    assert points.covariance_world.shape == (len(points.facet), 3, 3)
+    assert not enclosed.is_point.any()
+
+
+def test_a_few_views_on_an_arc_give_the_side_that_they_see():
+    cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
+    scene = photographed(cameras)
+    mesh = Enclose(SETTINGS)(scene).mesh
+    # Whatever is seen by nobody is gone, and black background gave nothing.
+    assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 0.1
+    assert mesh.vertices_world[:, 2].min() > -0.6
+    # Two views at least see 50 degrees up, down and to the sides.
+    wanted = normalize(
+        torch.tensor([[0.0, 0, 1], [0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.7, 0.7], [0, -0.7, 0.7]]),
+        dim=-1,
+    )
+    _, distance = nearest_facets(wanted, mesh.vertices_world, mesh.faces)
+    assert (distance < 0.03).all()
+
+
+def test_masks_keep_the_rest_out():
+    cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=0.0)
+    scene = photographed(cameras)
+    masks = scene.views.inside.clone()
+    masks[:, 50:] = False  # the lower half of the ball in every picture
+    mesh = Enclose(SETTINGS)(scene.replace(views=scene.views.replace(masks=masks))).mesh
+    assert mesh.vertices_world[:, 1].min() > -0.1  # y is up
+    assert mesh.vertices_world[:, 1].max() > 0.6
+
+
+def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_about):
+    vertices, faces = icosphere(3)
+    inside_out = Mesh(vertices_world=vertices.float(), faces=faces.flip(1))
+    coarse = Enclose(SETTINGS)(round_about, inside_out)
+    outward = face_normals(coarse.mesh.vertices_world, coarse.mesh.faces)
+    middle = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
+    assert ((outward * middle).sum(dim=-1) > 0).all()
+    assert len(coarse.mesh.faces) <= 600 < len(faces)
+    assert (middle.norm(dim=1) - 1).abs().max() < 0.03
+    assert len(coarse.points.facet) > 0.9 * len(round_about.points_world)
+
+
+def test_a_small_mesh_that_is_brought_stays_as_it_is(round_about):
+    vertices, faces = icosphere(1)
+    coarse = Enclose(SETTINGS)(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
+    assert_close(coarse.mesh.vertices_world[coarse.mesh.faces], vertices.float()[faces])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda v, f: (v, f[:0]), "no faces"),
+        (lambda v, f: (v, f + len(v)), "name vertices"),
+        (lambda v, f: (v / 0, f), "not finite"),
+        (lambda v, f: (v + 1e4, f), "no photograph shows"),
+    ],
+)
+def test_a_mesh_that_cannot_be_used_is_refused(round_about, change, told):
+    vertices, faces = change(*icosphere(1))
+    with pytest.raises(InputError, match=told):
+        Enclose(SETTINGS)(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
+
+
+def test_without_points_to_trust_nothing_is_made(round_about):
+    doubtful = round_about.replace(reprojection_errors_px=round_about.reprojection_errors_px + 100)
+    with pytest.raises(ReconstructionError, match="0 of"):
+        Enclose(SETTINGS)(doubtful)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ConfigError, match="best_sources"):
+        DensifyConfig(sources=2, best_sources=3)
+    with pytest.raises(ConfigError, match="num_facets"):
+        EncloseConfig(num_facets=3)
+
+
+def test_the_nearest_facet_is_that_of_a_search_over_all():
+    generator = torch.Generator().manual_seed(0)
+    vertices, faces = icosphere(1)
+    directions = normalize(torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=-1)
+    facet, distance = nearest_facets(1.1 * directions, vertices, faces)
+    # From above a convex solid, the nearest facet's plane is met first or a neighbour's is.
+    normals = normalize(face_normals(vertices, faces), dim=-1)
+    height = (normals * vertices[faces[:, 0]]).sum(dim=-1)
+    above = (1.1 * directions) @ normals.T - height
+    assert (distance >= above.amax(dim=1) - 0.02).all()
+    assert (above.gather(1, facet[:, None])[:, 0] >= above.amax(dim=1) - 0.02).all()
+
+
+def test_of_three_faces_at_an_edge_the_smallest_goes():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.1]])
+    faces = torch.tensor([[0, 1, 2], [1, 0, 4], [1, 0, 3]])
+    assert two_faces_an_edge(vertices, faces).tolist() == [[0, 1, 2], [1, 0, 3]]
