@@ -1,7 +1,7 @@
 r"""Least squares over evidence of several kinds, whose noise is estimated along with the answer.
 
-Every kind claims variances that are right up to one factor. The factor is what its weighted
-squared residuals show, over what they should show: of ``m`` equations,
+Every kind claims variances that are right up to one factor. The factor is what its squared
+residuals show, robustly, over what they should show: of ``m`` equations,
 :math:`m - \mathrm{tr}(A_k A^{-1})` are left over to tell, with :math:`A_k` what the kind adds to
 the matrix of the solution. Outliers lose weight by Cauchy's function as the factors settle.
 
@@ -29,8 +29,11 @@ _CAUCHY = 2.385
 # Of the heights, in the energy norm, relative: far below what the evidence leaves open.
 _ACCURACY = 1e-5
 
-# The mean weighted square of unit Gaussian noise under these weights.
-_WEIGHTED_SQUARE = 0.697
+# Of the square of unit Gaussian noise.
+_MEDIAN_SQUARE = 0.4549
+
+# Evidence whose residuals vanish, as where all is flat, is not infinitely sure.
+_LEAST_FACTOR = 1e-6
 
 # Evidence that seems to be used up whole still has this share left to judge it by.
 _LEAST_LEFT = 0.05
@@ -86,31 +89,25 @@ def fuse_evidence(
                 weight = weights[place] * kind.information / factors[place]
                 used = (weight * _sum(kind, probe) * _sum(kind, answer)).sum()
                 left = 1 - float(used / weights[place].sum())
-                factors[place] = noise_factor(square, factors[place], max(left, _LEAST_LEFT))
+                square = square / max(left, _LEAST_LEFT)
+                factors[place] = noise_factor(square)
                 weights[place] = 1 / (1 + square / (_CAUCHY**2 * factors[place]))
     matrix, rhs = _system(kinds, weights, factors, start, hold)
     return Fused(heights=matrix.solve(rhs), factors=tuple(factors))
 
 
-def noise_factor(square: Float[Tensor, " equation"], factor: float, left: float) -> float:
-    """Find the variance under which Cauchy's weighted squares are those of Gaussian noise.
+def noise_factor(square: Float[Tensor, " equation"]) -> float:
+    """Tell the variance of Gaussian noise from its squares, by their median.
 
     Args:
-        square: Of residuals, in units of the variance that is claimed.
-        factor: To start from.
-        left: Share of the equations that the solution leaves over.
+        square: Of residuals, in units of the variance that is claimed, over the share of the
+            equations that the solution leaves over.
 
     >>> noise = torch.randn(10000, generator=torch.Generator().manual_seed(1))
-    >>> abs(noise_factor(4 * noise.double().square(), 1.0, 1.0) - 4) < 0.2
+    >>> abs(noise_factor(4 * noise.double().square()) - 4) < 0.2
     True
     """
-    for _ in range(30):
-        weight = 1 / (1 + square / (_CAUCHY**2 * factor))
-        shown = float((weight * square).mean()) / (_WEIGHTED_SQUARE * left)
-        factor, before = max(shown, 1e-12), factor
-        if abs(factor - before) <= 1e-3 * before:
-            break
-    return factor
+    return max(float(square.median()) / _MEDIAN_SQUARE, _LEAST_FACTOR)
 
 
 def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:

@@ -32,10 +32,10 @@ class ExtractConfig:
     """
 
     min_confidence: float = 0.0
-    max_hole: float = 0.2
+    max_hole: float = 1.0
     max_stretch: float = 10.0
     drop_overturned: bool = True
-    min_piece: float = 1.0
+    min_piece: float = 0.01
 
     def __post_init__(self) -> None:
         require(0 <= self.min_confidence < 1, "min_confidence", self.min_confidence, "in [0, 1)")

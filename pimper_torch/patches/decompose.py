@@ -29,7 +29,7 @@ class DecomposeConfig:
     """
 
     samples_per_pixel: float = 1.0
-    overlap_samples: float = 6.0
+    overlap_samples: float = 2.0
     bucket_samples: int = 100_000
 
     def __post_init__(self) -> None:

@@ -21,28 +21,28 @@ def inconsistency(
 
     .. math:: C = \sum_g \tfrac12 \log(1 + (x_g - \rho s_g)^2 / c^2)
 
-    with the albedo by so many re-weighted means, the first with equal weights.
+    with the albedo that is the median of what single views say, then so many re-weighted means.
 
     Args:
         radiance: What each view shows of the sample if the hypothesis holds.
-        shading: Of albedo 1, the same for all hypotheses.
+        shading: Of albedo 1, the same for all hypotheses; positive where seen.
         seen: Views that take part; the same for all hypotheses, as costs of different sets
             could not be compared.
         scale: ``c``, in units of radiance.
         rounds: Of the albedo.
 
-    Differentiable in radiance and shading.
+    Differentiable in radiance and shading, the albedo held: exact where it has converged, as
+    the cost is least there.
     """
-    s = torch.where(seen, shading, 0)[..., None]
-    per_scale = 1 / scale[:, None, None]
-    weight = seen[..., None].to(radiance)
-    residual = radiance
-    for again in range(rounds):
-        if again:
-            weight = seen[..., None] / (1 + (residual * per_scale).square())
-        lit = weight * s
-        square = (lit * s).sum(dim=1, keepdim=True)
-        albedo = (lit * radiance).sum(dim=1, keepdim=True) / torch.where(square > 0, square, 1)
-        residual = radiance - albedo * s
-    relative = (residual * per_scale).square()
-    return 0.5 * torch.where(seen[..., None], torch.log1p(relative), 0).sum(dim=1)
+    s = torch.where(seen, shading, 1)[..., None]
+    taken, per_scale = seen[..., None].to(radiance), 1 / scale[:, None, None]
+    with torch.no_grad():
+        said = torch.where(seen[..., None], radiance / s, torch.nan)
+        albedo = said.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
+        for _ in range(rounds):
+            residual = (radiance - albedo * s) * per_scale
+            lit = taken * s / (1 + residual.square())
+            square = (lit * s).sum(dim=1, keepdim=True)
+            albedo = (lit * radiance).sum(dim=1, keepdim=True) / torch.where(square > 0, square, 1)
+    residual = (radiance - albedo * s) * per_scale
+    return 0.5 * (taken * torch.log1p(residual.square())).sum(dim=1)

@@ -255,7 +255,7 @@ class Sweep(nn.Module):
                 level = (across * squeezed.sqrt()).clamp_min(1).log2()
                 level = level[:, None].expand(-1, moves.shape[1]).flatten()
             radiance = look_up([image[view] for image in gray], pixels, level)
-            found = found.index_copy(0, slot, radiance.reshape(len(slot), -1))
+            found = found.index_copy(0, slot, radiance.reshape(len(slot), -1).to(found))
         return found.reshape(*rows.chosen.shape, -1)
 
 

@@ -1,0 +1,128 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.fusion.estimate import fuse_evidence, noise_factor
+from pimper_torch.fusion.evidence import Evidence
+
+COUNT = 900
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(72)
+
+
+def smooth() -> torch.Tensor:
+    x = torch.linspace(0, 12, COUNT, dtype=torch.float64)
+    return x.sin() + 0.3 * (3 * x).cos()
+
+
+def steps(noise: torch.Tensor, deviation: float) -> Evidence:
+    """Differences of a chain of heights, each measured three times, as in a triangle mesh."""
+    first = torch.arange(COUNT - 1).repeat(3)
+    return Evidence(
+        unknowns=torch.stack([first, first + 1], dim=1),
+        coefficients=torch.tensor([-1.0, 1.0]).double().expand(len(first), 2),
+        targets=smooth().diff().repeat(3) + noise,
+        information=torch.full((len(first),), deviation**-2, dtype=torch.float64),
+        correlated=torch.ones(len(first), dtype=torch.float64),
+    )
+
+
+def places(noise: torch.Tensor, deviation: float) -> Evidence:
+    return Evidence(
+        unknowns=torch.arange(COUNT)[:, None],
+        coefficients=torch.ones(COUNT, 1, dtype=torch.float64),
+        targets=smooth() + noise,
+        information=torch.full((COUNT,), deviation**-2, dtype=torch.float64),
+        correlated=torch.ones(COUNT, dtype=torch.float64),
+    )
+
+
+def fused(kinds, rounds: int = 6):
+    return fuse_evidence(
+        kinds, torch.zeros(COUNT).double(), torch.full((COUNT,), 1e-9).double(), rounds
+    )
+
+
+def drawn(generator, deviation: float, count: int = COUNT) -> torch.Tensor:
+    return deviation * torch.randn(count, generator=generator, dtype=torch.float64)
+
+
+def test_the_noise_of_each_kind_is_found_whatever_it_claims(generator):
+    kinds = [
+        steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.005),  # claims a quarter of its noise
+        places(drawn(generator, 0.1), 0.3),  # and three times its own
+    ]
+    found = fused(kinds, rounds=12)
+    assert abs(found.factors[0] / 16 - 1) < 0.25
+    assert abs(found.factors[1] * 9 - 1) < 0.25
+
+
+def test_the_answer_beats_each_kind_alone(generator):
+    slopes, heights = drawn(generator, 0.02, 3 * (COUNT - 1)), drawn(generator, 0.1)
+    both = fused([steps(slopes, 0.05), places(heights, 0.05)], rounds=20).heights - smooth()
+    assert both.square().mean().sqrt() < 0.5 * heights.square().mean().sqrt()
+    mean = slopes.reshape(3, -1).mean(dim=0)
+    integrated = torch.cat([torch.zeros(1), mean]).cumsum(0)
+    integrated = integrated - integrated.mean()
+    assert both.square().mean().sqrt() < 0.3 * integrated.square().mean().sqrt()
+
+
+def test_outliers_are_let_go(generator):
+    wrong = drawn(generator, 0.05)
+    wrong[::10] = 4.0
+    found = fused([steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02), places(wrong, 0.05)])
+    clean = drawn(generator, 0.05)
+    clean[::10] = 0
+    there = fused([steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02), places(clean, 0.05)])
+    off = (found.heights - smooth()).square().mean().sqrt()
+    assert off < 2 * (there.heights - smooth()).square().mean().sqrt()
+    assert abs(float((found.heights - smooth()).mean())) < 0.05  # the mean alone would be 0.4 off
+
+
+def test_one_solve_is_plain_least_squares(generator):
+    kinds = [steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02), places(drawn(generator, 0.1), 0.1)]
+    J = torch.zeros(4 * COUNT - 3, COUNT, dtype=torch.float64)
+    row = 0
+    for kind in kinds:
+        scale = kind.information.sqrt()
+        index = torch.arange(row, row + len(scale))
+        for term in range(kind.unknowns.shape[1]):
+            J[index, kind.unknowns[:, term]] += scale * kind.coefficients[:, term]
+        row += len(scale)
+    right = torch.cat([kind.information.sqrt() * kind.targets for kind in kinds])
+    assert_close(fused(kinds, rounds=1).heights, torch.linalg.lstsq(J, right).solution)
+
+
+def test_vertices_that_nothing_is_known_of_stay():
+    kind = places(torch.zeros(COUNT).double(), 0.1)
+    some = kind.replace(
+        unknowns=kind.unknowns[:10],
+        coefficients=kind.coefficients[:10],
+        targets=kind.targets[:10],
+        information=kind.information[:10],
+        correlated=kind.correlated[:10],
+    )
+    start = torch.full((COUNT,), 5.0, dtype=torch.float64)
+    found = fuse_evidence([some], start, torch.full((COUNT,), 1e-9).double(), 1).heights
+    assert_close(found[10:], start[10:])
+    assert_close(found[:10], smooth()[:10], rtol=0, atol=1e-6)
+
+
+def test_gradients_of_the_answer_are_those_of_the_last_solve():
+    target = smooth().clone().requires_grad_()
+    kind = places(torch.zeros(COUNT).double(), 0.1)
+    found = fused([steps(torch.zeros(3 * (COUNT - 1)).double(), 0.1), kind.replace(targets=target)], 3)
+    found.heights.sum().backward()
+    # Lifting all heights alike lifts the answer as much.
+    assert target.grad is not None
+    assert_close(target.grad.sum(), torch.tensor(float(COUNT)).double(), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("outliers", [0, 1000])
+def test_the_noise_is_told_in_spite_of_outliers(generator, outliers):
+    square = 9.0 * drawn(generator, 1.0, 20000).square()
+    square[:outliers] = 1e6
+    assert abs(noise_factor(square) / 9 - 1) < (0.25 if outliers else 0.05)

@@ -1,0 +1,109 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.fusion.evidence import (
+    cloud_points,
+    edges_of,
+    kept_slopes,
+    slopes,
+    swept_heights,
+)
+from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.records import FacetPoints
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(71)
+
+
+@pytest.fixture
+def lattice():
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    return subdivide(corners, facets, torch.full((2,), 0.1, dtype=torch.float64))
+
+
+def paraboloid(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Heights, and normals not yet unit, of a surface whose slopes change linearly."""
+    x, y = points[:, 0], points[:, 1]
+    height = 0.3 * x - 0.1 * y + 0.2 * x * x + 0.15 * x * y - 0.1 * y * y
+    slope = torch.stack([0.3 + 0.4 * x + 0.15 * y, -0.1 + 0.15 * x - 0.2 * y], dim=1)
+    return height, torch.cat([-slope, torch.ones_like(slope[:, :1])], dim=1)
+
+
+def test_every_edge_is_listed_once(lattice):
+    edges = edges_of(lattice.faces)
+    assert len(torch.unique(edges, dim=0)) == len(edges)
+    # Euler's formula for a disc.
+    assert len(lattice.points) - len(edges) + len(lattice.faces) == 1
+
+
+def test_slopes_of_a_smooth_surface_are_met_by_it_and_by_no_other(lattice):
+    height, normals = paraboloid(lattice.points)
+    along = UP.expand(len(height), 3)
+    edges = edges_of(lattice.faces)
+    ones = torch.ones_like(height)
+    found = slopes(edges, lattice.points, along, normalize(normals, dim=1), 1e-4 * ones)
+    # The mean of unit normals is that of slopes to third order in the edge's length.
+    assert found.residual(height).abs().max() < 1e-4
+    assert_close(found.residual(height + 0.7), found.residual(height), rtol=0, atol=1e-3)
+    assert found.residual(1.1 * height).abs().median() > 1e-3
+
+
+def test_an_angles_error_moves_an_edges_end_by_its_length(lattice):
+    along = UP.expand(len(lattice.points), 3)
+    edges = edges_of(lattice.faces)
+    variance = torch.full_like(lattice.points[:, 0], 4e-4)
+    found = slopes(edges, lattice.points, along, along, variance)
+    length = (lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]]).norm(dim=1)
+    assert_close(1 / found.information, 4e-4 * length.square())
+    shared = slopes(edges, lattice.points, along, along, variance, 3 * variance)
+    assert_close(shared.information, found.information / 4)
+    assert_close(shared.correlated, torch.full_like(length, 4.0))
+
+
+def test_kept_slopes_are_those_of_the_surface_there_is(lattice, generator):
+    height = torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
+    along = UP.expand(len(height), 3)
+    edges = edges_of(lattice.faces)
+    found = kept_slopes(edges, lattice.points, along, along, height, 0.01)
+    assert_close(found.residual(height), torch.zeros(len(edges)).double())
+    assert_close(found.residual(height + 3), torch.zeros(len(edges)).double(), rtol=0, atol=1e-12)
+    assert not found.judged
+
+
+def test_offsets_along_slanting_normals_are_longer_along_the_direction():
+    carried = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
+    offsets = torch.tensor([0.1, 0.1, 0.1], dtype=torch.float64)
+    information = torch.tensor([4.0, 4.0, 0.0], dtype=torch.float64)
+    facing = torch.tensor([1.0, 0.5, 1.0], dtype=torch.float64)
+    found = swept_heights(carried, offsets, information, facing, 25.0)
+    assert found.unknowns.flatten().tolist() == [0, 1]
+    assert_close(found.targets, torch.tensor([1.1, 1.2], dtype=torch.float64))
+    assert_close(found.information, torch.tensor([4.0, 1.0], dtype=torch.float64))
+
+
+def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice, generator):
+    along = normalize(UP + 0.1 * (lattice.points - 0.5), dim=1)  # directions fan out
+    carried = torch.zeros(len(along), dtype=torch.float64)
+    xy = 0.1 + 0.8 * torch.rand(40, 2, generator=generator, dtype=torch.float64)
+    lift = 0.05 * (torch.rand(40, 1, generator=generator, dtype=torch.float64) - 0.5)
+    points = torch.cat([xy, lift], dim=1)
+    covariance = torch.diag(torch.tensor([1.0, 1.0, 1e-4])).double().expand(40, 3, 3)
+    cloud = FacetPoints(
+        points_world=points, covariance_world=covariance, facet=torch.zeros(40, dtype=torch.long)
+    )
+    found = cloud_points(cloud, lattice.points, lattice.faces, carried, along, reach=1.0)
+    assert len(found.targets) == 40
+    assert_close(found.coefficients.sum(dim=1), torch.ones(40).double())
+    assert_close(found.targets, lift[:, 0], rtol=0.02, atol=1e-4)
+    # Uncertain across, sure along: only what is across a slanting line blurs it.
+    assert (1 / found.information < 0.05).all()
+    assert (1 / found.information >= 1e-4).all()
+    near = cloud_points(cloud, lattice.points, lattice.faces, carried, along, reach=0.01)
+    assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())

@@ -1,0 +1,127 @@
+import pytest
+import torch
+from torch.testing import assert_close
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.frames import invert_rigid, rotate, transform
+from pimper_torch.patches.carry import carried_normals, carry, coarse_normals
+from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.patches.warp import Warp
+from pimper_torch.records import CoarseMesh, Mesh
+
+
+def bump(xy: torch.Tensor) -> torch.Tensor:
+    return 0.1 * (1 - xy.square().sum(dim=-1))
+
+
+def surface(size: int = 100) -> Mesh:
+    """A low dome over the square of the facets, facing +z."""
+    side = torch.linspace(-2.0, 2.0, size, dtype=torch.float64)
+    y, x = torch.meshgrid(side, side, indexing="ij")
+    xy = torch.stack([x, y], dim=-1).reshape(-1, 2)
+    vertices = torch.cat([xy, bump(xy)[:, None]], dim=1)
+    first = (torch.arange(size - 1)[:, None] * size + torch.arange(size - 1)).reshape(-1)
+    faces = torch.cat(
+        [
+            torch.stack([first, first + 1, first + size + 1], dim=1),
+            torch.stack([first, first + size + 1, first + size], dim=1),
+        ]
+    )
+    return Mesh(vertices_world=vertices, faces=faces)
+
+
+@pytest.fixture
+def flat(plane_scene):
+    corners = torch.tensor([[-0.8, -0.7, 0], [0.8, -0.7, 0], [0.8, 0.7, 0], [-0.8, 0.7, 0]])
+    mesh = Mesh(vertices_world=corners.double(), faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    coarse = CoarseMesh(mesh=mesh, reference=2, is_point=torch.ones(4, dtype=torch.bool))
+    return Decompose(DecomposeConfig(samples_per_pixel=0.4))(coarse, plane_scene.cameras)
+
+
+def places(templates):
+    flat = templates.points_patch.flatten(1, 2)
+    return transform(invert_rigid(templates.patch_from_world), flat).view_as(templates.points_patch)
+
+
+def test_samples_come_to_lie_on_the_surface_above_their_places_on_the_facet(flat):
+    carried = carry(flat, surface())
+    for before, after in zip(flat.buckets, carried.buckets, strict=True):
+        assert torch.equal(before.inside, after.inside)
+        there, here = places(after)[after.inside], places(before)[before.inside]
+        assert_close(there[:, :2], here[:, :2])
+        # Faces are chords: a sixth of a thousandth below the dome, at most.
+        assert_close(there[:, 2], bump(there[:, :2]), rtol=0, atol=2e-4)
+        assert after.depth.abs().max() > 0.05
+
+
+def test_the_surfaces_normals_are_carried_along(flat):
+    carried = carry(flat, surface())
+    for templates in carried.buckets:
+        world = rotate(invert_rigid(templates.patch_from_world), templates.normals_patch.flatten(1, 2))
+        here = places(templates).reshape(len(world), -1, 3)
+        true = normalize(torch.cat([0.2 * here[..., :2], torch.ones_like(here[..., :1])], -1), dim=-1)
+        inside = templates.inside.flatten(1)
+        assert_close(world[inside], true[inside], rtol=0, atol=5e-3)
+        assert_close(carried_normals(carried.coarse, templates), templates.normals_patch)
+    flat_ones = carried_normals(flat.coarse, flat.buckets[0])
+    assert_close(flat_ones, coarse_normals(flat.coarse, flat.buckets[0]))
+
+
+def test_where_there_is_no_surface_there_is_no_sample(flat):
+    whole = surface()
+    left = whole.vertices_world[whole.faces][..., 0].amax(dim=1) < 0
+    carried = carry(flat, whole.replace(faces=whole.faces[left]))
+    for templates in carried.buckets:
+        x = places(templates)[..., 0]
+        assert not templates.inside[x > 0.05].any()
+    assert any(bucket.inside.any() for bucket in carried.buckets)
+
+
+def test_a_surface_seen_from_behind_is_not_carried(flat):
+    whole = surface()
+    turned = carry(flat, whole.replace(faces=whole.faces.flip(1)))
+    assert not any(bucket.inside.any() for bucket in turned.buckets)
+
+
+def test_the_nearer_of_two_sheets_is_carried(flat):
+    near, far = surface(), surface()
+    lifted = far.vertices_world + far.vertices_world.new_tensor([0, 0, 0.4])
+    both = Mesh(
+        vertices_world=torch.cat([near.vertices_world, lifted]),
+        faces=torch.cat([near.faces, far.faces + len(near.vertices_world)]),
+    )
+    for one, other in zip(carry(flat, near).buckets, carry(flat, both).buckets, strict=True):
+        assert_close(one.depth[one.inside], other.depth[one.inside])
+
+
+def test_depth_follows_the_vertices_it_is_blended_from(flat):
+    whole = surface(30)
+    vertices = whole.vertices_world.clone().requires_grad_()
+    carried = carry(flat, whole.replace(vertices_world=vertices))
+    sum(bucket.depth.sum() for bucket in carried.buckets).backward()
+    count = sum(int(bucket.inside.sum()) for bucket in carried.buckets)
+    padding = sum(int((bucket.depth != 0).sum()) for bucket in carried.buckets)
+    assert vertices.grad is not None
+    # Lifting all by one lifts every sample by one: against z, which runs into the surface.
+    assert_close(vertices.grad[:, 2].sum(), torch.tensor(-float(padding)).double(), rtol=1e-3, atol=0)
+    assert padding >= count
+
+
+def test_views_are_registered_on_what_is_carried(plane_scene, flat):
+    """On the true plane every view shows each sample's own albedo; on the facets none does."""
+    normal = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64)
+    whole = surface()
+    xy = whole.vertices_world[:, :2]
+    plane = whole.replace(vertices_world=torch.cat([xy, -(xy @ normal[:2, None])], dim=1))
+    carried = carry(flat, plane)
+    seen = Warp()(plane_scene.views, plane_scene.cameras, carried)
+    for registered in seen.buckets:
+        everywhere = registered.valid.all(dim=1)
+        spread = registered.gray.amax(dim=1) - registered.gray.amin(dim=1)
+        assert everywhere.any()
+        assert spread[everywhere].max() < 2e-3
+    flat_ones = Warp()(plane_scene.views, plane_scene.cameras, flat)
+    assert max(
+        float((b.gray.amax(dim=1) - b.gray.amin(dim=1))[b.valid.all(dim=1)].max())
+        for b in flat_ones.buckets
+    ) > 0.006

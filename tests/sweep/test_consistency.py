@@ -1,0 +1,79 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.sweep.consistency import inconsistency
+
+VIEWS = 8
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(61)
+
+
+@pytest.fixture
+def shading(generator):
+    return 0.3 + torch.rand(5, VIEWS, generator=generator, dtype=torch.float64)
+
+
+def all_seen() -> torch.Tensor:
+    return torch.ones(5, VIEWS, dtype=torch.bool)
+
+
+def test_views_that_show_albedo_times_shading_cost_nothing(generator, shading):
+    albedo = 0.1 + torch.rand(5, 1, 3, generator=generator, dtype=torch.float64)
+    scale = torch.full((5,), 0.01, dtype=torch.float64)
+    cost = inconsistency(albedo * shading[..., None], shading, all_seen(), scale)
+    assert_close(cost, torch.zeros(5, 3, dtype=torch.float64))
+
+
+def test_without_robustness_the_albedo_is_the_best_there_is(generator, shading):
+    radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64)
+    scale = torch.full((5,), 1e4, dtype=torch.float64)  # Cauchy's loss is the square
+    cost = inconsistency(radiance, shading, all_seen(), scale) * 2e8  # 2 c^2
+    albedo = torch.linspace(0, 3, 3001, dtype=torch.float64)
+    apart = radiance[..., None] - albedo * shading[:, :, None, None]
+    assert_close(cost, apart.square().sum(dim=1).amin(dim=-1), rtol=1e-4, atol=1e-4)
+
+
+def test_what_is_not_seen_does_not_matter(generator, shading):
+    radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64)
+    scale = torch.full((5,), 0.1, dtype=torch.float64)
+    seen = all_seen()
+    seen[:, 3] = False
+    changed = radiance.clone()
+    changed[:, 3] = 7.0
+    here = inconsistency(radiance, shading, seen, scale)
+    assert_close(here, inconsistency(changed, shading, seen, scale))
+    kept = [view for view in range(VIEWS) if view != 3]
+    assert_close(here, inconsistency(radiance[:, kept], shading[:, kept], seen[:, kept], scale))
+
+
+def test_one_view_in_shadow_hardly_shifts_the_others_cost(shading):
+    scale = torch.full((5,), 0.02, dtype=torch.float64)
+    radiance = 0.5 * shading[..., None].repeat(1, 1, 1)
+    radiance[:, 0] = 0
+    robust = inconsistency(radiance, shading, all_seen(), scale, rounds=8)
+    alone = inconsistency(radiance[:, :1], shading[:, :1], all_seen()[:, :1], scale)
+    assert (robust > 1).all()  # the shadow itself costs
+    assert (alone < 1e-9).all()  # a view alone always agrees with itself
+    right = 0.5 * torch.log1p((0.5 * shading[:, :1] / 0.02).square())
+    assert_close(robust, right, rtol=0.01, atol=0)  # and the others as good as nothing
+
+
+def test_views_that_disagree_are_outvoted_whatever_their_number_under_a_half(shading):
+    scale = torch.full((5,), 0.01, dtype=torch.float64)
+    radiance = 0.5 * shading[..., None]
+    radiance[:, :3] *= 1.6
+    right = 0.5 * torch.log1p((0.3 * shading[:, :3] / 0.01).square()).sum(dim=1, keepdim=True)
+    cost = inconsistency(radiance, shading, all_seen(), scale)
+    assert_close(cost, right, rtol=0.02, atol=0)
+
+
+def test_costs_can_be_differentiated(generator, shading):
+    radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64).requires_grad_()
+    scale = torch.full((5,), 0.2, dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda x: inconsistency(x, shading, all_seen(), scale, rounds=200), radiance
+    )

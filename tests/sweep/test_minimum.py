@@ -1,0 +1,58 @@
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.sweep.minimum import parabola_minimum, posterior_variance
+
+
+def costs(place: float, curvature: float, count: int = 9) -> torch.Tensor:
+    steps = torch.arange(count, dtype=torch.float64)
+    return (0.5 * curvature * (steps - place).square())[None]
+
+
+@pytest.mark.parametrize("place", [2.0, 3.4, 5.49, 6.51])
+def test_the_minimum_of_a_parabola_is_exact(place):
+    found, curvature, interior = parabola_minimum(costs(place, 3.0))
+    assert_close(found, torch.tensor([place], dtype=torch.float64))
+    assert_close(curvature, torch.tensor([3.0], dtype=torch.float64))
+    assert bool(interior)
+
+
+@pytest.mark.parametrize("place", [-0.6, 8.6])
+def test_a_cost_that_falls_to_the_end_of_the_range_has_no_minimum(place):
+    _, curvature, interior = parabola_minimum(costs(place, 3.0))
+    assert not bool(interior)
+    assert float(curvature) == 0
+
+
+def test_flat_costs_have_no_minimum():
+    _, curvature, interior = parabola_minimum(torch.zeros(1, 5, 2, 3))
+    assert not interior.any()
+    assert (curvature == 0).all()
+
+
+def test_minima_can_be_differentiated():
+    cost = costs(3.3, 2.0).requires_grad_()
+    assert torch.autograd.gradcheck(lambda c: parabola_minimum(c)[0], cost)
+
+
+def test_a_wide_bowl_has_the_variance_of_its_gaussian():
+    # Steps much finer than the bowl: the sum is the integral.
+    cost = costs(20.0, 1 / 9, count=41)
+    _, curvature, _ = parabola_minimum(cost)
+    variance = posterior_variance(cost, curvature)
+    # That of the hypotheses, and that of the parabola, which counts it once more here.
+    assert_close(variance, torch.tensor([18.0], dtype=torch.float64), rtol=0.01, atol=0)
+
+
+def test_two_minima_that_suit_alike_make_the_place_unsure():
+    one = torch.full((1, 9), 50.0, dtype=torch.float64)
+    one[0, 2] = 0
+    two = one.clone()
+    two[0, 7] = 1e-3
+    alone = posterior_variance(one, parabola_minimum(one)[1])
+    torn = posterior_variance(two, parabola_minimum(two)[1])
+    assert float(alone) < 0.1
+    assert math.isclose(float(torn), 2.5**2 + 0.01, rel_tol=0.01)

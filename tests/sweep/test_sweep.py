@@ -1,0 +1,99 @@
+import pytest
+import torch
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.records import SweptPatches
+from pimper_torch.sweep.sweep import Sweep, SweepConfig
+
+
+def sweep(lifted, config: SweepConfig | None = None) -> SweptPatches:
+    scene = lifted.scene
+    return Sweep(config)(scene.views, scene.cameras, lifted.seen, lifted.photometric)
+
+
+def told(swept: SweptPatches) -> tuple[torch.Tensor, torch.Tensor]:
+    """Offsets in samples, and their standard deviations, where the sweep says anything."""
+    offsets, deviations = [], []
+    for templates, found in zip(swept.patches.buckets, swept.buckets, strict=True):
+        known = found.information > 0
+        spacing = templates.spacing[:, None, None].expand_as(known)[known]
+        offsets.append(found.offset[known] / spacing)
+        deviations.append(found.information[known].rsqrt() / spacing)
+    return torch.cat(offsets), torch.cat(deviations)
+
+
+@pytest.mark.parametrize("height", [-1.7, 0.0, 1.2])
+def test_the_sweep_finds_how_far_the_facets_lie_off(lift, height):
+    lifted = lift(height)
+    offsets, _ = told(sweep(lifted))
+    inside = sum(int(bucket.inside.sum()) for bucket in lifted.seen.patches.buckets)
+    assert len(offsets) > 0.8 * inside
+    off = (offsets + lifted.height).abs()
+    assert off.median() < 0.05  # a fourteenth of a step
+    assert off.quantile(0.9) < 0.2
+
+
+def test_what_lies_beyond_the_range_is_not_told(lift):
+    lifted = lift(6.0)
+    offsets, _ = told(sweep(lifted, SweepConfig(steps=2)))
+    inside = sum(int(bucket.inside.sum()) for bucket in lifted.seen.patches.buckets)
+    assert len(offsets) < 0.5 * inside
+
+
+def test_without_texture_the_sweep_says_that_it_does_not_know(lift):
+    bare, textured = told(sweep(lift(0.5, textured=False))), told(sweep(lift(0.5)))
+    # All heights look alike but for the shading of a plane, which says nothing of height.
+    heard = [float((1 / deviation.square()).sum()) for _, deviation in (bare, textured)]
+    assert heard[0] < 0.01 * heard[1]
+
+
+def test_views_of_another_light_than_fitted_spoil_the_height_less_than_a_step(lift):
+    lifted = lift(1.2)
+    buckets = []
+    for found in lifted.photometric.buckets:
+        lights = found.lights_patch.clone()
+        lights[:, ::4] = lights[:, ::4] * 1.6  # three of nine views are wrong
+        buckets.append(found.replace(lights_patch=lights))
+    wrong = lifted.photometric.replace(buckets=tuple(buckets))
+    scene = lifted.scene
+    offsets, _ = told(Sweep()(scene.views, scene.cameras, lifted.seen, wrong))
+    assert (offsets + lifted.height).abs().median() < 0.3
+
+
+def test_fewer_views_suffice_and_too_few_are_none(lift):
+    lifted = lift(-1.0)
+    offsets, _ = told(sweep(lifted, SweepConfig(num_views=5)))
+    assert (offsets + lifted.height).abs().median() < 0.1
+    none = sweep(lifted, SweepConfig(min_views=10, num_views=10))
+    assert all((bucket.information == 0).all() for bucket in none.buckets)
+    assert all((bucket.offset == 0).all() for bucket in none.buckets)
+
+
+def test_the_claimed_deviation_is_of_the_size_of_the_error(lift):
+    lifted = lift(0.4)
+    swept = sweep(lifted)
+    offsets, deviations = told(swept)
+    error = (offsets + lifted.height) / (deviations / swept.averaged**0.5)
+    # Photographs without noise: the window's error is that of looking up between pixels.
+    assert 0.02 < float(error.abs().median()) < 3
+
+
+def test_heights_can_be_differentiated_by_the_photographs(lift):
+    lifted = lift(0.7)
+    scene = lifted.scene
+    images = scene.views.images.clone().requires_grad_()
+    swept = Sweep()(
+        scene.views.replace(images=images), scene.cameras, lifted.seen, lifted.photometric
+    )
+    sum(bucket.offset.sum() for bucket in swept.buckets).backward()
+    assert images.grad is not None
+    assert images.grad.isfinite().all()
+    assert (images.grad.abs().amax(dim=(1, 2, 3)) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("steps", 0), ("min_views", 1), ("num_views", 2), ("step_samples", 0.0)]
+)
+def test_settings_out_of_range_are_refused(field, value):
+    with pytest.raises(ConfigError, match=field):
+        SweepConfig(**{field: value})
