@@ -7,10 +7,10 @@ from pathlib import Path
 from torch import nn
 
 from pimper_torch.alignment.align import Align, AlignConfig
-from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.bundle.adjust import Adjust, AdjustConfig
 from pimper_torch.coarse.adapt import Adapt, AdaptConfig
 from pimper_torch.coarse.enclose import Enclose, EncloseConfig
+from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.config import build, find_config, overlay, read_mapping, require
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
@@ -161,7 +161,9 @@ class Pimper(nn.Module):
     ) -> tuple[Cameras, SweptPatches, Surface]:
         """All facets together, coarse to fine: every round registers on the one before."""
         views, cameras, settings = scene.views, scene.cameras, self.config.rounds
-        coarse, surface = self._coarse(scene, mesh), None
+        coarse = self._coarse(scene, mesh)
+        swept: SweptPatches | None = None
+        surface: Surface | None = None
         for number, scale in enumerate(settings.scales, start=1):
             if surface is not None:
                 coarse = self.adapt(swept, surface)
@@ -172,6 +174,7 @@ class Pimper(nn.Module):
                 cameras = self.adjust(views, cameras, seen, photometric, scene.lenses).cameras
             swept = self.sweep(views, cameras, seen, photometric)
             surface = self.fuse(swept)
+        assert swept is not None and surface is not None  # there is a round at least
         return cameras, swept, surface
 
     def _coarse(self, scene: SparseScene, mesh: Mesh | None) -> CoarseMesh:

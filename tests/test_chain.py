@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 import pimper_torch as pt
+from pimper_torch.coarse.triangulate import Triangulate
 from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.metrics import compare_in_view, pair_views, similarity_between_cameras
@@ -30,7 +31,14 @@ log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figur
 
 PUBLISHED_ERROR = 11.15  # per cent: the potatoes of the published table
 PRESETS = ("paper", "default")
-SMALL = {"triangulate": {"num_points": 20}}
+# Pictures of 80 x 60 pixels are too small to be matched densely: facets span the cloud.
+SMALL = {
+    "paper": {"triangulate": {"num_points": 20}},
+    "default": {
+        "triangulate": {"num_points": 20},
+        "rounds": {"all_round": False, "scales": [0.5, 1.0]},
+    },
+}
 
 
 class Given(nn.Module):
@@ -58,7 +66,7 @@ def photographed(shape: Shape, seed: int, **settings: object) -> RenderedScene:
 
 def surface_of(scene: RenderedScene, preset: str, num_points: int = 150) -> Reconstruction:
     generator = torch.Generator().manual_seed(17)
-    pimper = pt.Pimper(pt.load_config(preset, SMALL))
+    pimper = pt.Pimper(pt.load_config(preset, SMALL[preset]))
     pimper.reconstruct = Given(sparse_scene(scene, num_points, generator))
     return pimper(scene.views)
 
@@ -97,10 +105,11 @@ def height_over_sphere(mesh: Mesh) -> torch.Tensor:
 def test_a_cap_of_a_sphere_is_rounder_after_the_chain_than_its_facets_are(preset):
     scene = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
     result = surface_of(scene, preset)
-    coarse = height_over_sphere(result.coarse.mesh).square().mean().sqrt()
+    facets = Triangulate(pt.load_config(preset, SMALL[preset]).triangulate)(result.scene)
+    coarse = height_over_sphere(facets.mesh).square().mean().sqrt()
     fine = height_over_sphere(result.mesh).square().mean().sqrt()
     log.info("%s: sphere, facets off by %.5f, surface by %.5f", preset, coarse, fine)
-    assert fine < 0.3 * coarse  # measured 0.15 with paper, 0.20 with default
+    assert fine < 0.3 * coarse  # measured 0.15 with paper, 0.24 with default
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -1,3 +1,4 @@
+import pytest
 import torch
 from torch import nn
 
@@ -22,13 +23,18 @@ class Placed(nn.Module):
         return self.scene.replace(views=views)
 
 
-def test_gradients_run_from_the_photographs_to_the_vertices_of_the_mesh():
+@pytest.mark.parametrize("scales", [[], [0.5, 1.0]], ids=["published", "rounds"])
+def test_gradients_run_from_the_photographs_to_the_vertices_of_the_mesh(scales):
     generator = torch.Generator().manual_seed(31)
     cameras = arc_cameras(8, width=96, height=72, focal_px=300.0, distance=3.0, span_deg=40.0)
     lamps = wandering_lights(8, generator, distance=5.0, spread_deg=35.0, irradiance=0.6)
     texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
     scene = render_shape(Sphere(), cameras, lamps.harmonics_world(), texture)
-    pimper = pt.Pimper(pt.load_config(changes={"triangulate": {"num_points": 24}}))
+    changes = {
+        "triangulate": {"num_points": 24},
+        "rounds": {"all_round": False, "scales": scales},
+    }
+    pimper = pt.Pimper(pt.load_config(changes=changes))
     pimper.reconstruct = Placed(sparse_scene(scene, 120, generator))
 
     images = scene.views.images.clone().requires_grad_()

@@ -32,8 +32,9 @@ _ACCURACY = 1e-5
 # Of the square of unit Gaussian noise.
 _MEDIAN_SQUARE = 0.4549
 
-# Evidence whose residuals vanish, as where all is flat, is not infinitely sure.
-_LEAST_FACTOR = 1e-6
+# No source is more than twice too modest: where one kind is followed blindly its residuals
+# vanish, and would make it surer still.
+_LEAST_FACTOR = 0.25
 
 # Evidence that seems to be used up whole still has this share left to judge it by.
 _LEAST_LEFT = 0.05

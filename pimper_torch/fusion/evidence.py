@@ -152,6 +152,7 @@ def cloud_points(
     carried: Float[Tensor, " vertex"],
     directions: Float[Tensor, "vertex 3"],
     reach: float,
+    finest: float,
 ) -> Evidence:
     """Say that points of the cloud lie on the surface.
 
@@ -164,6 +165,7 @@ def cloud_points(
         carried: Heights of the vertices now.
         directions: ``d``, unit.
         reach: Points further off are not of this surface.
+        finest: Deviation that the surest point has, of the surface between its vertices.
     """
     tree = cKDTree(surface.detach().cpu().numpy())
     _, nearest = tree.query(points.points_world.detach().cpu().numpy())
@@ -179,7 +181,7 @@ def cloud_points(
         unknowns=corners,
         coefficients=share,
         targets=(share * carried[corners]).sum(dim=1) + lift[met] / facing,
-        information=1 / variance.clamp_min(torch.finfo(variance.dtype).tiny**0.5),
+        information=1 / variance.clamp_min(finest**2),
         correlated=torch.ones_like(variance),
     )
 

@@ -40,6 +40,9 @@ _HOLD = 1e-4
 # Points of the cloud further off the surface than this, in its spacings, are not of it.
 _REACH = 20.0
 
+# Between its vertices the surface is flat: points tell no more than this share of a spacing.
+_FINEST = 0.03
+
 # The squared length of a two-dimensional Gaussian vector has this median, in variances.
 _MEDIAN_OF_TILT = 2 * math.log(2)
 
@@ -193,6 +196,7 @@ class Fuse(nn.Module):
                     union.heights,
                     task.directions,
                     _REACH * task.spacing,
+                    _FINEST * task.spacing,
                 )
             )
         return found
@@ -256,4 +260,4 @@ def carried_reliefs(swept: SweptPatches) -> DepthPatches:
 def _variance(confidence: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
     """Undo confidence: the squared standard error of normals, in radians."""
     half = math.radians(HALF_CONFIDENCE_DEG)
-    return half**2 * (1 / confidence.detach().clamp(1e-4, 1 - 1e-4) - 1)
+    return half**2 * (1 / confidence.detach().clamp(1e-4, 1 - 1e-3) - 1)

@@ -30,9 +30,7 @@ def carry(patches: PatchSet, surface: Mesh) -> PatchSet:
     if normals is None:
         normals = vertex_normals(surface.vertices_world, surface.faces)
     caster = RayCaster(surface.vertices_world, surface.faces)
-    buckets = tuple(
-        _carrying(templates, surface, normals, caster) for templates in patches.buckets
-    )
+    buckets = tuple(_carrying(templates, surface, normals, caster) for templates in patches.buckets)
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
 
 

@@ -227,7 +227,9 @@ class Factorize(nn.Module):
                 )
                 for some in _parts(templates, len(field.soft))
             ]
-            for templates, registered, normals in zip(seen.patches.buckets, lit, coarse, strict=True)
+            for templates, registered, normals in zip(
+                seen.patches.buckets, lit, coarse, strict=True
+            )
         ]
         everything = [chunk for bucket in chunks for chunk in bucket]
         coupled = self._coupled(seen, everything, field) if config.light_coupling > 0 else None

@@ -9,13 +9,13 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
+from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.linalg.systems import prepare
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull, trend_deviation
 from pimper_torch.refinement.smoothness import reweighted
-from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 
 # Robust smoothness has settled when vertices move by less than this share of their spacing.
 _SETTLED = 1e-3

@@ -6,10 +6,8 @@ from torch import Tensor
 
 
 def parabola_minimum(
-    cost: Float[Tensor, "patch hypothesis *raster"],
-) -> tuple[
-    Float[Tensor, "patch *raster"], Float[Tensor, "patch *raster"], Bool[Tensor, "patch *raster"]
-]:
+    cost: Float[Tensor, "*batch hypothesis"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
     """Fit a parabola to the least cost and the two beside it.
 
     Returns:
@@ -23,21 +21,21 @@ def parabola_minimum(
     >>> parabola_minimum(cost)
     (tensor([2.]), tensor([2.]), tensor([True]))
     """
-    last = cost.shape[1] - 1
-    best = cost.detach().argmin(dim=1, keepdim=True)
+    last = cost.shape[-1] - 1
+    best = cost.detach().argmin(dim=-1, keepdim=True)
     interior = (best > 0) & (best < last)
     middle = best.clamp(1, last - 1)
-    before, here, after = (cost.gather(1, middle + step)[:, 0] for step in (-1, 0, 1))
+    before, here, after = (cost.gather(-1, middle + step)[..., 0] for step in (-1, 0, 1))
     curvature = before - 2 * here + after
-    bent = interior[:, 0] & (curvature > 0)
+    bent = interior[..., 0] & (curvature > 0)
     aside = (before - after) / (2 * torch.where(bent, curvature, 1))
-    place = torch.where(bent, middle[:, 0] + aside.clamp(-0.5, 0.5), best[:, 0].to(cost))
+    place = torch.where(bent, middle[..., 0] + aside.clamp(-0.5, 0.5), best[..., 0].to(cost))
     return place, torch.where(bent, curvature, 0), bent
 
 
 def posterior_variance(
-    cost: Float[Tensor, "patch hypothesis *raster"], curvature: Float[Tensor, "patch *raster"]
-) -> Float[Tensor, "patch *raster"]:
+    cost: Float[Tensor, "*batch hypothesis"], curvature: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
     r"""Give the variance of the place, in squared steps, if costs are negative log likelihoods.
 
     That of the hypotheses, :math:`p_k \propto e^{-C_k}`, and that of the parabola between
@@ -51,9 +49,9 @@ def posterior_variance(
     >>> posterior_variance(torch.tensor([[100.0, 0.0, 100.0]]), torch.tensor([200.0]))
     tensor([0.0050])
     """
-    steps = torch.arange(cost.shape[1], device=cost.device, dtype=cost.dtype)
-    steps = steps.reshape(1, -1, *(1,) * (cost.ndim - 2))
-    share = torch.softmax(-cost, dim=1)
-    mean = (share * steps).sum(dim=1, keepdim=True)
-    spread = (share * (steps - mean).square()).sum(dim=1)
-    return torch.where(curvature > 0, spread + 1 / torch.where(curvature > 0, curvature, 1), torch.inf)
+    steps = torch.arange(cost.shape[-1], device=cost.device, dtype=cost.dtype)
+    share = torch.softmax(-cost, dim=-1)
+    mean = (share * steps).sum(dim=-1, keepdim=True)
+    spread = (share * (steps - mean).square()).sum(dim=-1)
+    bent = curvature > 0
+    return torch.where(bent, spread + 1 / torch.where(bent, curvature, 1), torch.inf)

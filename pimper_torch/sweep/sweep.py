@@ -161,12 +161,13 @@ class Sweep(nn.Module):
         window = level_weight(templates.depth.detach(), swept, templates.spacing, config.max_slope)
         averaged = window_size(config.window_samples)
         costs = window_mean(costs, window, config.window_samples) * (averaged / CORRELATED_SAMPLES)
+        costs = costs.movedim(1, -1)
         place, curvature, found = parabola_minimum(costs)
         with torch.no_grad():
             variance = posterior_variance(costs, curvature)
             unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
             share = (1 / variance - 1 / unknown).clamp_min(0) / averaged
-            least = costs.amin(dim=1) * (CORRELATED_SAMPLES / averaged)
+            least = costs.amin(dim=-1) * (CORRELATED_SAMPLES / averaged)
         found = found & (window > 0) & (share > 0)
         return Heights(
             offset=torch.where(found, (place - config.steps) * step[:, None, None], 0),

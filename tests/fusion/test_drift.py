@@ -22,7 +22,9 @@ def test_a_tilt_that_all_normals_share_is_found_and_detail_is_not(lattice):
     tilted = shape + torch.tensor([0.08, -0.03, 0]).double() + detail * torch.tensor([1, 1, 0])
     known = torch.ones(len(shape), dtype=torch.bool)
     found = drift(lattice, FACETS, tilted, shape, known)
-    assert_close(found.tilt[:, :2], torch.tensor([[-0.08, 0.03]]).double().expand(2, 2), rtol=0, atol=0.02)
+    assert_close(
+        found.tilt[:, :2], torch.tensor([[-0.08, 0.03]]).double().expand(2, 2), rtol=0, atol=0.02
+    )
     corrected = tilted + found.at(lattice, FACETS)
     assert (corrected - shape - detail * torch.tensor([1, 1, 0])).norm(dim=1).max() < 0.03
 
@@ -40,7 +42,9 @@ def test_the_blend_is_continuous_and_only_normals_that_are_known_count(lattice):
     assert at.isfinite().all()
     # On the diagonal both facets have the same blend: that of its two corners.
     diagonal = (lattice.points[:, 0] - lattice.points[:, 1]).abs() < 1e-9
-    assert_close(at[diagonal][:, 0], found.tilt[1, 0].expand(int(diagonal.sum())), rtol=1e-6, atol=0)
+    assert_close(
+        at[diagonal][:, 0], found.tilt[1, 0].expand(int(diagonal.sum())), rtol=1e-6, atol=0
+    )
 
 
 def test_a_cliff_does_not_turn_a_facet_by_more_than_a_quarter(lattice):

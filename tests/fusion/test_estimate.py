@@ -53,11 +53,11 @@ def drawn(generator, deviation: float, count: int = COUNT) -> torch.Tensor:
 def test_the_noise_of_each_kind_is_found_whatever_it_claims(generator):
     kinds = [
         steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.005),  # claims a quarter of its noise
-        places(drawn(generator, 0.1), 0.3),  # and three times its own
+        places(drawn(generator, 0.1), 0.18),  # and nearly twice its own
     ]
     found = fused(kinds, rounds=12)
     assert abs(found.factors[0] / 16 - 1) < 0.25
-    assert abs(found.factors[1] * 9 - 1) < 0.25
+    assert abs(found.factors[1] * 3.24 - 1) < 0.25
 
 
 def test_the_answer_beats_each_kind_alone(generator):
@@ -83,7 +83,10 @@ def test_outliers_are_let_go(generator):
 
 
 def test_one_solve_is_plain_least_squares(generator):
-    kinds = [steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02), places(drawn(generator, 0.1), 0.1)]
+    kinds = [
+        steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02),
+        places(drawn(generator, 0.1), 0.1),
+    ]
     J = torch.zeros(4 * COUNT - 3, COUNT, dtype=torch.float64)
     row = 0
     for kind in kinds:
@@ -114,7 +117,9 @@ def test_vertices_that_nothing_is_known_of_stay():
 def test_gradients_of_the_answer_are_those_of_the_last_solve():
     target = smooth().clone().requires_grad_()
     kind = places(torch.zeros(COUNT).double(), 0.1)
-    found = fused([steps(torch.zeros(3 * (COUNT - 1)).double(), 0.1), kind.replace(targets=target)], 3)
+    found = fused(
+        [steps(torch.zeros(3 * (COUNT - 1)).double(), 0.1), kind.replace(targets=target)], 3
+    )
     found.heights.sum().backward()
     # Lifting all heights alike lifts the answer as much.
     assert target.grad is not None

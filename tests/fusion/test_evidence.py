@@ -98,12 +98,16 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
     cloud = FacetPoints(
         points_world=points, covariance_world=covariance, facet=torch.zeros(40, dtype=torch.long)
     )
-    found = cloud_points(cloud, lattice.points, lattice.faces, carried, along, reach=1.0)
+    found = cloud_points(
+        cloud, lattice.points, lattice.faces, carried, along, reach=1.0, finest=1e-9
+    )
     assert len(found.targets) == 40
     assert_close(found.coefficients.sum(dim=1), torch.ones(40).double())
     assert_close(found.targets, lift[:, 0], rtol=0.02, atol=1e-4)
     # Uncertain across, sure along: only what is across a slanting line blurs it.
     assert (1 / found.information < 0.05).all()
     assert (1 / found.information >= 1e-4).all()
-    near = cloud_points(cloud, lattice.points, lattice.faces, carried, along, reach=0.01)
+    near = cloud_points(
+        cloud, lattice.points, lattice.faces, carried, along, reach=0.01, finest=1e-9
+    )
     assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())

@@ -1,7 +1,7 @@
 import pytest
 import torch
-from torch.testing import assert_close
 from torch.nn.functional import normalize
+from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.patches.carry import carried_normals, carry, coarse_normals
@@ -57,9 +57,13 @@ def test_samples_come_to_lie_on_the_surface_above_their_places_on_the_facet(flat
 def test_the_surfaces_normals_are_carried_along(flat):
     carried = carry(flat, surface())
     for templates in carried.buckets:
-        world = rotate(invert_rigid(templates.patch_from_world), templates.normals_patch.flatten(1, 2))
+        world = rotate(
+            invert_rigid(templates.patch_from_world), templates.normals_patch.flatten(1, 2)
+        )
         here = places(templates).reshape(len(world), -1, 3)
-        true = normalize(torch.cat([0.2 * here[..., :2], torch.ones_like(here[..., :1])], -1), dim=-1)
+        true = normalize(
+            torch.cat([0.2 * here[..., :2], torch.ones_like(here[..., :1])], -1), dim=-1
+        )
         inside = templates.inside.flatten(1)
         assert_close(world[inside], true[inside], rtol=0, atol=5e-3)
         assert_close(carried_normals(carried.coarse, templates), templates.normals_patch)
@@ -103,7 +107,9 @@ def test_depth_follows_the_vertices_it_is_blended_from(flat):
     padding = sum(int((bucket.depth != 0).sum()) for bucket in carried.buckets)
     assert vertices.grad is not None
     # Lifting all by one lifts every sample by one: against z, which runs into the surface.
-    assert_close(vertices.grad[:, 2].sum(), torch.tensor(-float(padding)).double(), rtol=1e-3, atol=0)
+    assert_close(
+        vertices.grad[:, 2].sum(), torch.tensor(-float(padding)).double(), rtol=1e-3, atol=0
+    )
     assert padding >= count
 
 
@@ -121,7 +127,10 @@ def test_views_are_registered_on_what_is_carried(plane_scene, flat):
         assert everywhere.any()
         assert spread[everywhere].max() < 2e-3
     flat_ones = Warp()(plane_scene.views, plane_scene.cameras, flat)
-    assert max(
-        float((b.gray.amax(dim=1) - b.gray.amin(dim=1))[b.valid.all(dim=1)].max())
-        for b in flat_ones.buckets
-    ) > 0.006
+    assert (
+        max(
+            float((b.gray.amax(dim=1) - b.gray.amin(dim=1))[b.valid.all(dim=1)].max())
+            for b in flat_ones.buckets
+        )
+        > 0.006
+    )

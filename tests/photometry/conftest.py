@@ -8,10 +8,10 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import invert_rigid, rigid, transform
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
+from pimper_torch.patches.carry import coarse_normals
 from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.patches.carry import coarse_normals
 from pimper_torch.records import CoarseMesh, Mesh, PatchSet, PatchViews, Registered, Templates
 
 

@@ -6,9 +6,9 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.patches.carry import coarse_normals
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.patches.carry import coarse_normals
 from pimper_torch.records import PatchVerdict, PatchViews
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)

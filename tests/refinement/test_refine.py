@@ -3,11 +3,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
+from pimper_torch.fusion.union import ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import boundary_vertices
-from pimper_torch.fusion.union import vertex_spacing
 from pimper_torch.refinement.refine import Refine, RefineConfig
-from pimper_torch.fusion.union import ray_directions, unite
 
 SPACING = 0.02
 

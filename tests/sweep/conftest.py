@@ -86,9 +86,13 @@ def lift():
             )
         photometric = PhotometricPatches(patches=patches, buckets=tuple(buckets))
         return Lifted(
-            scene=scene, seen=seen, photometric=photometric, height=height * float(
-                patches.buckets[0].spacing[0] / spacing
-            ) * spacing / float(patches.buckets[0].spacing[0])
+            scene=scene,
+            seen=seen,
+            photometric=photometric,
+            height=height
+            * float(patches.buckets[0].spacing[0] / spacing)
+            * spacing
+            / float(patches.buckets[0].spacing[0]),
         )
 
     return make

@@ -13,7 +13,8 @@ def test_the_best_usable_views_are_chosen_and_no_others():
         mine = set(chosen[row][meant[row]].tolist())
         assert len(mine) == min(4, int(usable[row].sum()))
         assert all(usable[row, view] for view in mine)
-        left = [float(score[row, view]) for view in range(9) if usable[row, view] and view not in mine]
+        others = [view for view in range(9) if usable[row, view] and view not in mine]
+        left = [float(score[row, view]) for view in others]
         assert all(float(score[row, view]) > max(left, default=-1.0) for view in mine)
 
 
