@@ -37,6 +37,7 @@ SMALL = {
     "default": {
         "triangulate": {"num_points": 20},
         "rounds": {"all_round": False, "scales": [0.5, 1.0]},
+        "extract": {"max_hole": 0.2},  # beyond the cloud's hull facets lie where they may
     },
 }
 

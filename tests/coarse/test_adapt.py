@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.coarse.adapt import Adapt, AdaptConfig, adapt
+from pimper_torch.coarse.adapt import AdaptConfig, adapt
 from pimper_torch.coarse.fill import delaunay
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.geometry.lattice import subdivide
@@ -237,7 +237,7 @@ def test_a_spike_of_the_surface_does_not_fold_the_mesh(generator):
 def test_a_surface_of_another_mesh_is_refused(generator):
     coarse, other = sheet(generator), sheet(generator, side=9)
     with pytest.raises(InputError, match="facets"):
-        Adapt()(coarse, surface_on(other, lambda points: points), SPACING)
+        adapt(coarse, surface_on(other, lambda points: points), SPACING)
 
 
 def test_impossible_settings_are_refused():

@@ -81,7 +81,7 @@ def test_unsupported_groups_are_measured_one_by_one():
 
 def test_islands_go_and_the_largest_piece_stays():
     surface = sheet(confidence=((columns(sheet()) < 6) | (columns(sheet()) > 9)).double())
-    mesh = Extract(ExtractConfig(max_hole=0.1))(surface)
+    mesh = Extract(ExtractConfig(max_hole=0.1, min_piece=1.0))(surface)
     assert columns(mesh).min() == 10
     assert len(as_trimesh(mesh).split(only_watertight=False)) == 1
     both = Extract(ExtractConfig(max_hole=0.1, min_piece=0.0))(surface)
@@ -101,7 +101,7 @@ def test_pieces_that_touch_in_a_vertex_are_parted():
     assert waist.sum() == 2
     assert (
         len(
-            Extract(ExtractConfig(max_hole=0.1))(
+            Extract(ExtractConfig(max_hole=0.1, min_piece=1.0))(
                 surface.replace(confidence=hourglass.double())
             ).vertices_world
         )
@@ -152,7 +152,7 @@ def test_a_surface_without_confidence_anywhere_is_kept_whole():
 
 def test_a_surface_without_enough_support_is_refused():
     with pytest.raises(ReconstructionError, match="0 have support"):
-        Extract(ExtractConfig(min_confidence=0.5))(
+        Extract(ExtractConfig(min_confidence=0.5, max_hole=0.2))(
             sheet(confidence=torch.full((SIDE**2,), 0.1).double())
         )
 

@@ -113,7 +113,11 @@ def test_coupled_lights_agree_in_the_world_and_keep_the_normals(scene, coupling)
     free, coupled = (
         Factorize(
             FactorizeConfig(
-                light="soft", light_coupling=strength, light_pull=0.1, geometry_weight=0.0
+                light="soft",
+                light_coupling=strength,
+                light_pull=0.1,
+                geometry_weight=0.0,
+                loss_scale=2.0,
             )
         )(true.seen)
         for strength in (0.0, coupling)
