@@ -49,7 +49,7 @@ class RoundsConfig:
             but one; kept only if facets held out of it agree better.
     """
 
-    scales: tuple[float, ...] = (0.25, 0.5)
+    scales: tuple[float, ...] = (0.25, 0.5, 1.0)
     all_round: bool = True
     bundle: bool = False
 
@@ -174,7 +174,8 @@ class Pimper(nn.Module):
                 cameras = self.adjust(views, cameras, seen, photometric, scene.lenses).cameras
             swept = self.sweep(views, cameras, seen, photometric)
             surface = self.fuse(swept)
-        assert swept is not None and surface is not None  # there is a round at least
+        assert swept is not None  # there is a round at least
+        assert surface is not None
         return cameras, swept, surface
 
     def _coarse(self, scene: SparseScene, mesh: Mesh | None) -> CoarseMesh:

@@ -44,10 +44,13 @@ class InputOptions:
         masks: Folder with a mask for each photograph, of the same name; zero off the object.
         sparse: Folder of a COLMAP model of these photographs, used instead of structure
             from motion.
+        mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB), used instead of the
+            one that the photographs themselves give.
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     sparse: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,8 +119,12 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         config=(LEVELS,),
     )
     if job.common.reference:
-        triangulate = dataclasses.replace(job.config.triangulate, reference=job.common.reference)
-        config = dataclasses.replace(job.config, triangulate=triangulate)
+        named = job.common.reference
+        config = dataclasses.replace(
+            job.config,
+            triangulate=dataclasses.replace(job.config.triangulate, reference=named),
+            enclose=dataclasses.replace(job.config.enclose, reference=named),
+        )
         job = dataclasses.replace(job, config=config)
     return job
 

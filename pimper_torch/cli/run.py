@@ -12,6 +12,7 @@ from pimper_torch.cli.bars import Bars
 from pimper_torch.cli.options import Job, parse
 from pimper_torch.errors import ConfigError
 from pimper_torch.io.folders import prepare_output
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.pipeline import Pimper
@@ -36,7 +37,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
     console = Console(stderr=True)
     with Bars(console) as bars:
         views = _watched(bars, "read", lambda: _read(job))
-        result = Pimper(job.config, bars)(views.to(common.device), job.inputs.sparse)
+        mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
+        result = Pimper(job.config, bars)(views.to(common.device), job.inputs.sparse, mesh)
         _watched(bars, "write", lambda: _write(job, result))
     _conclude(Console(), job, result)
 
@@ -55,6 +57,7 @@ def _write(job: Job, result: Reconstruction) -> None:
         "photographs": str(job.photos),
         "masks": _text(job.inputs.masks),
         "sparse": _text(job.inputs.sparse),
+        "mesh": _text(job.inputs.mesh),
         "response": str(job.config.photographs.response),
         "max_size_px": job.common.max_size_px,
         "preset": job.common.preset,

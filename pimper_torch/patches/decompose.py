@@ -25,16 +25,20 @@ class DecomposeConfig:
         samples_per_pixel: Template samples per pixel of the reference view; the paper's
             zeta, made independent of the scene's unit.
         overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
+        max_samples: In all facets together: where there would be more, they lie further apart.
+            Bounds time and memory; infinite for no limit.
         bucket_samples: Samples of all templates that are batched together; bounds memory.
     """
 
     samples_per_pixel: float = 1.0
     overlap_samples: float = 2.0
+    max_samples: float = 1e6
     bucket_samples: int = 100_000
 
     def __post_init__(self) -> None:
         require(self.samples_per_pixel > 0, "samples_per_pixel", self.samples_per_pixel, "above 0")
         require(self.overlap_samples >= 1, "overlap_samples", self.overlap_samples, "1 or more")
+        require(self.max_samples >= 1, "max_samples", self.max_samples, "1 or more")
         require(self.bucket_samples >= 1, "bucket_samples", self.bucket_samples, "1 or more")
 
 
@@ -55,7 +59,8 @@ class Decompose(nn.Module):
         """Decompose a coarse mesh.
 
         The samples of all templates are equally far apart: one over ``samples_per_pixel``
-        times ``scale`` pixels of the reference view at the median depth of the mesh.
+        times ``scale`` pixels of the reference view at the median depth of the mesh, or further
+        where ``max_samples`` asks for it.
 
         Args:
             coarse: The facets.
@@ -76,6 +81,8 @@ class Decompose(nn.Module):
         corners = transform(patch_from_world, vertices[faces])[..., :2]
         density = self.config.samples_per_pixel * scale
         spacing = sample_spacing(vertices, cameras, coarse.reference, density)
+        area = face_normals(vertices, faces).norm(dim=-1).sum() / 2
+        spacing = torch.maximum(spacing, (area / self.config.max_samples).sqrt())
         enlarged = enlarge(corners, self.config.overlap_samples * spacing)
         # A sliver's enlarged corner runs far away; no patch needs more than twice the overlap.
         reach = 2 * self.config.overlap_samples * spacing

@@ -27,8 +27,9 @@ def chain(reconstruction, monkeypatch):
         def __init__(self, config, observer):
             self.config, self.observer = config, observer
 
-        def __call__(self, views, sparse_model=None):
+        def __call__(self, views, sparse_model=None, mesh=None):
             Chain.given = (self.config, views, sparse_model)
+            Chain.mesh = mesh
             self.observer.started("warp")
             self.observer.progressed(1, 2)
             self.work()

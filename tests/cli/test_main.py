@@ -9,10 +9,12 @@ import yaml
 
 from pimper_torch.cli.main import main
 from pimper_torch.errors import PimperWarning, ReconstructionError
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.results import RESULT_NAMES
 from pimper_torch.io.version import installed_version
 from pimper_torch.pipeline import PimperConfig, load_config
 from pimper_torch.radiometry import Encoding
+from pimper_torch.records import Mesh
 
 
 def run(*arguments):
@@ -189,3 +191,15 @@ def test_an_unknown_option_is_refused(photos, chain, tmp_path, capsys):
         run("reconstruct", photos, "-o", tmp_path / "out", "--sede", "3")
     assert ended.value.code == 2
     assert chain.given is None
+
+
+def test_a_mesh_of_ones_own_reaches_the_chain(photos, chain, tmp_path):
+    square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    mesh = Mesh(vertices_world=square, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    write_ply(mesh, tmp_path / "rough.ply")
+    out = tmp_path / "out"
+    assert run("reconstruct", photos, "-o", out, "--mesh", tmp_path / "rough.ply") == 0
+    assert torch.equal(chain.mesh.faces, mesh.faces)
+    assert json.loads((out / "summary.json").read_text())["mesh"] == str(tmp_path / "rough.ply")
+    assert run("reconstruct", photos, "-o", tmp_path / "b", "--mesh", tmp_path / "none.ply") != 0
+    assert not (tmp_path / "b").exists()

@@ -145,3 +145,23 @@ def test_a_mesh_without_facets_is_refused(plane_scene, plane_mesh):
 def test_impossible_settings_are_refused():
     with pytest.raises(ConfigError, match="overlap_samples"):
         DecomposeConfig(overlap_samples=0.0)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_samples_lie_as_far_apart_as_the_scale_of_the_photographs_says(
+    plane_scene, plane_mesh, scale
+):
+    one = Decompose()(plane_mesh, plane_scene.cameras).buckets[0].spacing[0]
+    scaled = Decompose()(plane_mesh, plane_scene.cameras, None, scale).buckets[0].spacing[0]
+    assert_close(scaled, one / scale)
+
+
+def test_no_more_samples_are_laid_than_asked_for(plane_scene, plane_mesh):
+    def on_facets(**settings: float) -> int:
+        patches = Decompose(DecomposeConfig(**settings))(plane_mesh, plane_scene.cameras)
+        return sum(int((b.barycentric >= 0).all(dim=-1).sum()) for b in patches.buckets)
+
+    free, bound = on_facets(), on_facets(max_samples=1000.0)
+    assert free > 3000
+    assert abs(bound / 1000 - 1) < 0.05
+    assert on_facets(max_samples=2.0 * free) == free
