@@ -26,6 +26,13 @@ from pimper_torch.pipeline import Pimper, load_config
 from pimper_torch.records import Capture, DepthPatches, Mesh, SparseScene
 from pimper_torch.refinement.refine import Refine, RefineConfig
 
+# The chain that aligns patches, whose figures the README gives.
+SETTINGS = {
+    "decompose": {"overlap_samples": 6.0, "max_samples": float("inf")},
+    "factorize": {"loss_scale": 2.0, "shadows": False},
+    "extract": {"max_hole": 0.2, "min_piece": 1.0},
+}
+
 CASES: dict[str, tuple[AlignConfig | None, RefineConfig]] = {
     "not aligned": (None, RefineConfig()),
     "default: bas-relief": (AlignConfig(), RefineConfig()),
@@ -48,7 +55,7 @@ def main() -> None:
     truth = read_rendered(options.folder, photographs=False)
     masks = options.folder / "masks"
     views = load_views(options.folder / "photos", masks=masks if masks.exists() else None)
-    pimper = Pimper(load_config())
+    pimper = Pimper(load_config(changes=SETTINGS))
     scene = pimper.reconstruct(views)
     patches = pimper.decompose(pimper.triangulate(scene), scene.cameras)
     seen = pimper.warp(scene.views, scene.cameras, patches)
@@ -58,7 +65,7 @@ def main() -> None:
     for name in options.only:
         align, refine = CASES[name]
         aligned = depths if align is None else Align(align)(depths)
-        mesh = Extract()(Refine(refine)(aligned))
+        mesh = Extract(pimper.config.extract)(Refine(refine)(aligned))
         left = sum(int((~bucket.aligned).sum()) for bucket in aligned.buckets)
         print(f"| {name} | {compare(mesh, aligned, scene, truth)} | {left} |", flush=True)  # noqa: T201
 

@@ -78,7 +78,11 @@ def main() -> None:
     if options.model is not None:
         write_colmap_model(carton_scene(options.data, capture), options.model)
         return
-    changes = {"triangulate": {"reference": options.reference, "num_points": options.num_points}}
+    named = {"reference": options.reference}
+    changes = {
+        "triangulate": named | {"num_points": options.num_points},
+        "enclose": named,
+    }
     pimper = Pimper(load_config(options.preset, changes))
     views = capture.views
     if not options.sfm:

@@ -32,7 +32,7 @@ class DecomposeConfig:
 
     samples_per_pixel: float = 1.0
     overlap_samples: float = 2.0
-    max_samples: float = 1e6
+    max_samples: float = 1.5e6
     bucket_samples: int = 100_000
 
     def __post_init__(self) -> None:

@@ -203,12 +203,10 @@ class Heights(Record):
         information: Inverse variance of the offset, one over scene units squared; 0 where
             nothing tells. A sample's own share: neighbours that were averaged with it have
             theirs.
-        misfit: Root mean square of what is left of the radiance there; 0 where not swept.
     """
 
     offset: Float[Tensor, "patch height width"]
     information: Float[Tensor, "patch height width"]
-    misfit: Float[Tensor, "patch height width"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

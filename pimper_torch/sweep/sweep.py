@@ -147,7 +147,7 @@ class Sweep(nn.Module):
         rows = self._rows(templates, registered, photometry, carried, cameras)
         nothing = torch.zeros_like(templates.depth)
         if len(rows.place) == 0:
-            return Heights(offset=nothing, information=nothing, misfit=nothing)
+            return Heights(offset=nothing, information=nothing)
         step = config.step_samples * templates.spacing
         ladder = torch.arange(-config.steps, config.steps + 1, device=step.device).to(step)
         moves = step[rows.patch, None] * ladder
@@ -167,12 +167,10 @@ class Sweep(nn.Module):
             variance = posterior_variance(costs, curvature)
             unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
             share = (1 / variance - 1 / unknown).clamp_min(0) / averaged
-            least = costs.amin(dim=-1) * (CORRELATED_SAMPLES / averaged)
         found = found & (window > 0) & (share > 0)
         return Heights(
             offset=torch.where(found, (place - config.steps) * step[:, None, None], 0),
             information=torch.where(found, share / step[:, None, None].square(), 0),
-            misfit=torch.where(found, least, 0),
         )
 
     def _rows(
