@@ -26,6 +26,9 @@ _ON_EDGE = 1e-6
 # Share of a facet's lattice vertices that must lie within the distance it is said to depart by.
 _DEPARTURE_SHARE = 0.9
 
+# Views that have to see a facet which is to stay.
+_SEEING = 2
+
 # A facet smaller than this share of what it was before its corners moved has collapsed.
 _LEAST_AREA = 0.05
 
@@ -77,15 +80,19 @@ class Adapt(nn.Module):
     ) -> CoarseMesh:
         """Adapt the mesh that the patches stand on to the surface that was found.
 
-        Lengths count in samples of these patches; the residual is their photometry's.
+        Lengths count in samples of these patches; the residual is their photometry's. A facet
+        that two views see has data, whether or not light tells its normals.
         """
         patches = swept.patches
-        residual = torch.full((patches.num_patches,), torch.nan)
+        residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
+        seen = torch.zeros_like(residual, dtype=torch.bool)
         for templates, found in zip(patches.buckets, swept.photometric.buckets, strict=True):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
-            residual = residual.to(known).index_copy(0, templates.facet, known)
+            residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
+            views = (found.lights_patch != 0).any(dim=2).sum(dim=1)
+            seen = seen.index_copy(0, templates.facet, views >= _SEEING)
         spacing = float(patches.buckets[0].spacing[0])
-        return adapt(patches.coarse, surface, spacing, self.config, residual=residual)
+        return adapt(patches.coarse, surface, spacing, self.config, residual=residual, seen=seen)
 
 
 @torch.no_grad()

@@ -1,0 +1,116 @@
+import pytest
+import torch
+
+from pimper_torch.coarse.adapt import Adapt
+from pimper_torch.errors import ConfigError
+from pimper_torch.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.sweep.sweep import Sweep
+
+
+@pytest.fixture(scope="session")
+def swept(lift):
+    def make(height: float):
+        lifted = lift(height)
+        scene = lifted.scene
+        return lifted, Sweep()(scene.views, scene.cameras, lifted.seen, lifted.photometric)
+
+    return make
+
+
+def off_plane(lifted, surface) -> torch.Tensor:
+    """Distances from the plane, in samples."""
+    spacing = lifted.seen.patches.buckets[0].spacing[0]
+    return (surface.vertices_world.double() @ lifted.normal) / spacing
+
+
+@pytest.mark.parametrize("height", [-1.5, 1.0])
+def test_facets_beside_a_plane_come_to_lie_on_it(swept, height):
+    lifted, given = swept(height)
+    surface = Fuse()(given)
+    off = off_plane(lifted, surface).abs()
+    assert off.quantile(0.9) < 0.05
+    assert off.max() < 0.3
+    cosine = (surface.normals_world.double() @ lifted.normal).clamp(-1, 1)
+    assert cosine.acos().rad2deg().quantile(0.9) < 0.5
+    assert (
+        abs(
+            float(surface.convergence.residual) / float(lifted.seen.patches.buckets[0].spacing[0])
+            - abs(lifted.height)
+        )
+        < 0.1
+    )
+
+
+def test_heights_alone_do_and_slopes_alone_stay_where_they_are(swept):
+    lifted, given = swept(1.0)
+    heights = Fuse(FuseConfig(slopes=False))(given)
+    assert off_plane(lifted, heights).abs().median() < 0.05
+    slopes = Fuse(FuseConfig(heights=False, points=False))(given)
+    # Nothing knows how high: the facets, which are parallel, stay a sample above.
+    assert (off_plane(lifted, slopes) - lifted.height).abs().max() < 0.05
+
+
+def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
+    lifted, given = swept(0.5)
+    buckets = []
+    for found in given.photometric.buckets:
+        wrong = found.normals_patch + torch.tensor([0.15, 0.0, 0.0]).double()
+        buckets.append(found.replace(normals_patch=torch.nn.functional.normalize(wrong, dim=-1)))
+    photometric = given.photometric.replace(buckets=tuple(buckets))
+    tilted = given.replace(photometric=photometric)
+    kept = off_plane(lifted, Fuse()(tilted))
+    trusting = off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(tilted))
+    assert kept.std() < 0.1
+    assert kept.std() < 0.5 * trusting.std()
+
+
+def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
+    lifted, given = swept(0.8)
+    nothing = tuple(
+        found.replace(
+            valid=torch.zeros_like(found.valid), confidence=torch.zeros_like(found.confidence)
+        )
+        for found in given.photometric.buckets
+    )
+    blind = tuple(
+        found.replace(information=torch.zeros_like(found.information)) for found in given.buckets
+    )
+    photometric = given.photometric.replace(buckets=nothing)
+    surface = Fuse()(given.replace(photometric=photometric, buckets=blind))
+    off = off_plane(lifted, surface)
+    assert off.std() < 1e-4  # as flat as the facets, and where they were
+    assert abs(float(off.mean()) - lifted.height) < 0.02
+    assert (surface.confidence == 0).all()
+
+
+def test_facets_that_views_see_stay_though_light_tells_nothing_of_them(swept):
+    _, given = swept(0.8)
+    surface = Fuse()(given)
+    dark = surface.replace(confidence=torch.zeros_like(surface.confidence))
+    dark.confidence[0] = 1.0  # so that there is some confidence at all
+    kept = Adapt()(given, dark)
+    assert len(kept.mesh.faces) >= len(given.patches.coarse.mesh.faces)
+
+
+def test_the_surface_can_be_differentiated_by_normals_and_offsets(swept):
+    _, given = swept(0.5)
+    normals = [b.normals_patch.clone().requires_grad_() for b in given.photometric.buckets]
+    offsets = [b.offset.clone().requires_grad_() for b in given.buckets]
+    photometric = given.photometric.replace(
+        buckets=tuple(
+            b.replace(normals_patch=n)
+            for b, n in zip(given.photometric.buckets, normals, strict=True)
+        )
+    )
+    heights = tuple(b.replace(offset=o) for b, o in zip(given.buckets, offsets, strict=True))
+    surface = Fuse()(given.replace(photometric=photometric, buckets=heights))
+    surface.vertices_world.square().sum().backward()
+    for leaf in normals + offsets:
+        assert leaf.grad is not None
+        assert leaf.grad.isfinite().all()
+        assert leaf.grad.abs().max() > 0
+
+
+def test_without_any_evidence_nothing_can_be_fused():
+    with pytest.raises(ConfigError, match="slopes"):
+        FuseConfig(slopes=False, heights=False, points=False)
