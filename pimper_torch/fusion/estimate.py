@@ -26,8 +26,9 @@ from pimper_torch.records import Record
 # Cauchy's weights are 95 % efficient on Gaussian noise with this many standard deviations.
 _CAUCHY = 2.385
 
-# Of the heights, in the energy norm, relative: far below what the evidence leaves open.
-_ACCURACY = 1e-5
+# Of the heights, in the energy norm, relative: below what the evidence leaves open. Weights range
+# over many orders, so that with less the residuals of the weakest are still large.
+_ACCURACY = 1e-8
 
 # Of the square of unit Gaussian noise.
 _MEDIAN_SQUARE = 0.4549
