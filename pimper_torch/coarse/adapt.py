@@ -32,6 +32,9 @@ _SEEING = 2
 # A facet smaller than this share of what it was before its corners moved has collapsed.
 _LEAST_AREA = 0.05
 
+# A facet that gets so many times longer has a corner that ran away.
+_MOST_STRETCH = 4.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptConfig:
@@ -109,7 +112,8 @@ def adapt(
 
     Every facet is split in four at most, neighbours are cut so that the mesh stays conforming
     (see :mod:`~pimper_torch.coarse.splitting`), and all vertices, old and new, move onto the
-    surface. Where that would turn or flatten a facet its vertices stay on the old mesh.
+    surface. Where that would turn or flatten a facet, or draw it out to a needle, its vertices
+    stay on the old mesh.
 
     Args:
         coarse: The facets that ``surface`` is the lattice of.
@@ -330,14 +334,23 @@ def _worst_first(
 def _without_folds(
     flat: Float[Tensor, "vertex 3"], onto: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
 ) -> Float[Tensor, "vertex 3"]:
-    """Move vertices onto the surface, except those of facets that would fold or collapse."""
+    """Move vertices onto the surface, except where that folds, flattens or draws out facets."""
     before = face_normals(flat, faces)
     size = before.square().sum(dim=1)
+    longest = _MOST_STRETCH * _longest_edge(flat, faces)
     moving = onto.isfinite().all(dim=1)
     while True:
         places = torch.where(moving[:, None], onto, flat)
         along = (face_normals(places, faces) * before).sum(dim=1)
-        bad = (along <= _LEAST_AREA * size) & moving[faces].any(dim=1)
+        bad = (along <= _LEAST_AREA * size) | (_longest_edge(places, faces) > longest)
+        bad &= moving[faces].any(dim=1)
         if not bool(bad.any()):
             return places
         moving[faces[bad].flatten()] = False
+
+
+def _longest_edge(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, " face"]:
+    corners = vertices[faces]
+    return (corners - corners.roll(1, dims=1)).norm(dim=-1).amax(dim=1)

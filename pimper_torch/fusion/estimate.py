@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.fusion.evidence import Evidence
 from pimper_torch.linalg.equations import normal_equations
-from pimper_torch.linalg.multigrid import Multigrid
-from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.linalg.systems import prepare
 from pimper_torch.records import Record
 
@@ -82,7 +81,7 @@ def fuse_evidence(
     for _ in range(rounds - 1):
         with torch.no_grad():
             matrix, rhs = _system(kinds, weights, factors, start, hold)
-            heights, answer = matrix.solve(rhs), matrix.solve(probe)
+            heights, answer = _solutions(matrix, rhs, probe)
             for place, kind in enumerate(kinds):
                 if not kind.judged or len(kind.targets) == 0:
                     continue
@@ -95,7 +94,8 @@ def fuse_evidence(
                 factors[place] = noise_factor(square)
                 weights[place] = 1 / (1 + square / (_CAUCHY**2 * factors[place]))
     matrix, rhs = _system(kinds, weights, factors, start, hold)
-    return Fused(heights=matrix.solve(rhs), factors=tuple(factors))
+    (heights,) = _solutions(matrix, rhs)
+    return Fused(heights=heights, factors=tuple(factors))
 
 
 def noise_factor(square: Float[Tensor, " equation"]) -> float:
@@ -116,13 +116,39 @@ def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " eq
     return (kind.coefficients * values[kind.unknowns]).sum(dim=1)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Matrix(Record):
+    """Entries of a symmetric positive definite matrix; those named twice add up."""
+
+    rows: Int[Tensor, " entry"]
+    cols: Int[Tensor, " entry"]
+    values: Float[Tensor, " entry"]
+
+
+def _solutions(
+    matrix: _Matrix, *sides: Float[Tensor, " vertex"]
+) -> tuple[Float[Tensor, " vertex"], ...]:
+    """Solve by whichever solver suits, and by a factor where iterations do not get there.
+
+    Slivers among the facets, and evidence a million times surer than its neighbours', can hold
+    multigrid up.
+    """
+    entries = (matrix.rows, matrix.cols, matrix.values, len(sides[0]), "the fusion")
+    try:
+        prepared = prepare(*entries, tolerance=_ACCURACY)
+        return tuple(prepared.solve(side) for side in sides)
+    except SingularSystemError:
+        prepared = prepare(*entries, method="cholesky")
+        return tuple(prepared.solve(side) for side in sides)
+
+
 def _system(
     kinds: Sequence[Evidence],
     weights: Sequence[Float[Tensor, " _"]],
     factors: Sequence[float],
     start: Float[Tensor, " vertex"],
     hold: Float[Tensor, " vertex"],
-) -> tuple[SparseCholesky | Multigrid, Float[Tensor, " vertex"]]:
+) -> tuple[_Matrix, Float[Tensor, " vertex"]]:
     everything = torch.arange(len(start), device=start.device)
     rows, cols, values = [everything], [everything], [hold.double()]
     rhs = hold.double() * start.double()
@@ -138,12 +164,5 @@ def _system(
         cols.append(col)
         values.append(value)
         rhs = rhs + right
-    matrix = prepare(
-        torch.cat(rows),
-        torch.cat(cols),
-        torch.cat(values),
-        len(start),
-        "the fusion",
-        tolerance=_ACCURACY,
-    )
+    matrix = _Matrix(rows=torch.cat(rows), cols=torch.cat(cols), values=torch.cat(values))
     return matrix, rhs

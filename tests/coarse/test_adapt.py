@@ -234,6 +234,16 @@ def test_a_spike_of_the_surface_does_not_fold_the_mesh(generator):
     assert (face_normals(found.mesh.vertices_world, found.mesh.faces)[:, 2] > 0).all()
 
 
+def test_a_vertex_that_ran_away_draws_no_needle(generator):
+    coarse = sheet(generator)
+    surface = surface_on(coarse, lambda points: points)
+    corner = (surface.barycentric > 0.999).any(dim=1).nonzero()[20, 0]
+    ran = surface.vertices_world.clone()
+    ran[corner, 2] += 20.0  # straight up: no facet folds
+    found = adapt(coarse, surface.replace(vertices_world=ran), SPACING)
+    assert found.mesh.vertices_world[:, 2].abs().max() < 1e-9
+
+
 def test_a_surface_of_another_mesh_is_refused(generator):
     coarse, other = sheet(generator), sheet(generator, side=9)
     with pytest.raises(InputError, match="facets"):

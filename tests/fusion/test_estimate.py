@@ -4,6 +4,8 @@ from torch.testing import assert_close
 
 from pimper_torch.fusion.estimate import fuse_evidence, noise_factor
 from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.systems import prepare
 
 COUNT = 900
 
@@ -131,3 +133,21 @@ def test_the_noise_is_told_in_spite_of_outliers(generator, outliers):
     square = 9.0 * drawn(generator, 1.0, 20000).square()
     square[:outliers] = 1e6
     assert abs(noise_factor(square) / 9 - 1) < (0.25 if outliers else 0.05)
+
+
+def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch):
+    kinds = [steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02), places(0 * smooth(), 0.1)]
+    expected = fused(kinds)
+    stuck = []
+
+    def refusing(*entries, method="auto", **settings):
+        if method == "auto":
+            stuck.append(method)
+            raise SingularSystemError("no convergence")
+        return prepare(*entries, method=method, **settings)
+
+    monkeypatch.setattr("pimper_torch.fusion.estimate.prepare", refusing)
+    found = fused(kinds)
+    assert stuck
+    assert_close(found.heights, expected.heights)
+    assert found.factors == pytest.approx(expected.factors)
