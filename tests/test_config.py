@@ -210,10 +210,13 @@ def leaves(mapping, section=""):
             yield f"{section}{key}", value
 
 
-@pytest.mark.parametrize("name", presets())
+ABLATIONS = sorted((Path(__file__).parents[1] / "configs" / "ablation").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", [*presets(), *ABLATIONS], ids=lambda name: Path(name).stem)
 def test_a_preset_holds_only_what_differs_from_the_stages_defaults(name):
     mapping = read_mapping(find_config(name))
-    assert build(PimperConfig, mapping, name) == load_config(name)
+    assert build(PimperConfig, mapping, str(name)) == load_config(name)
     defaults = dict(leaves(to_mapping(PimperConfig())))
     assert not [path for path, value in leaves(mapping) if defaults[path] == value]
 

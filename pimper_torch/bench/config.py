@@ -1,6 +1,7 @@
 """What the table is made of."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from pimper_torch.config import require
@@ -56,7 +57,8 @@ class BenchConfig:
         require(len(self.scenes) > 0, "scenes", self.scenes, "one scene or more")
         require(len(self.chosen_methods) > 0, "methods", self.methods, "one method or more")
         for name, given in (("scenes", self.scenes), ("methods", self.chosen_methods)):
-            require(len(set(given)) == len(given), name, given, "each only once")
+            labels = {Path(one).stem for one in given}
+            require(len(labels) == len(given), name, given, "each name only once, of files too")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
         require(self.samples >= 1, "samples", self.samples, "1 or more")
         require(self.processes >= 1, "processes", self.processes, "1 or more")

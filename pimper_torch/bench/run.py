@@ -77,7 +77,7 @@ def run_bench(
         OutputError: The folder holds something else, or cannot be written.
     """
     observer = observer or Silent()
-    methods = {name: method_named(name) for name in config.chosen_methods}
+    methods = {Path(name).stem: method_named(name) for name in config.chosen_methods}
     folder = Path(folder)
     rows: list[Row] = []
     sheet: list[SceneRow] = []
@@ -164,7 +164,7 @@ def _cell(
         row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
         return Measured(row=row, panels=MethodPanels(method=method, note=row.note))
     mesh = carry(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
-    file = f"{scene}_{Path(method).stem}"
+    file = f"{scene}_{method}"
     write_ply(mesh, staging / "meshes" / f"{file}.ply")
     heatmap = staging / "heatmaps" / f"{file}.png"
     return Measured(

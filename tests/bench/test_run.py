@@ -216,7 +216,14 @@ def test_presets_and_rivals_have_names():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"scenes": ()}, {"methods": ("lim", "lim")}, {"methods": ()}, {"processes": 0}, {"seed": -1}],
+    [
+        {"scenes": ()},
+        {"methods": ("lim", "lim")},
+        {"methods": ("default", "mine/default.yaml")},  # one name in the table
+        {"methods": ()},
+        {"processes": 0},
+        {"seed": -1},
+    ],
 )
 def test_a_table_that_makes_no_sense_is_refused(wrong):
     with pytest.raises(ConfigError):
