@@ -49,7 +49,7 @@ ROOMS = [
 ]
 
 SOLE_IMPORTERS = {
-    "pycolmap": {"sfm/colmap.py"},
+    "pycolmap": {"sfm/binding.py"},
     "embreex": {"geometry/visibility.py"},
     "fcpw": {"metrics/nearest.py"},
     "kornia_rs": {"io/decode.py"},

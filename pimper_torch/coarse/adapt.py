@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from pimper_torch.coarse.carry import UNSURE, fitted_normals, with_points
+from pimper_torch.coarse.inherit import UNSURE, fitted_normals, with_points
 from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.config import require
 from pimper_torch.errors import InputError

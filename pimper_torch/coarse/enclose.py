@@ -32,7 +32,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
-from pimper_torch.sfm.colmap import poisson_surface, simplified
+from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

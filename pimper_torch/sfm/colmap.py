@@ -1,27 +1,22 @@
-"""The one place that talks to COLMAP.
+"""COLMAP's structure from motion and its models of cameras.
 
-pycolmap is loaded when a function needs it, so that importing this package stays light.
 Photographs go by their number here: the file ``000007.png`` is view 7.
 """
 
-import signal
-import sys
 import tempfile
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from pimper_torch.errors import InputError, OutputError, ReconstructionError
+from pimper_torch.errors import InputError, OutputError
 from pimper_torch.records import Lens
-from pimper_torch.sfm.exchange import read_faces, write_cloud, write_faces
+from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.model import SparseModel
 
 
@@ -106,7 +101,7 @@ def extract_features(
     Returns:
         How many features each file has.
     """
-    pycolmap = _loaded()
+    pycolmap = loaded()
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -121,7 +116,7 @@ def extract_features(
     if masks is not None:
         reader.mask_path = str(masks)
     mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
-    with _quiet():
+    with quiet():
         pycolmap.extract_features(
             database,
             images,
@@ -146,7 +141,7 @@ def set_focals(database: Path, focals_px: dict[str, float]) -> None:
         database: With its images.
         focals_px: By file. A camera shared by several photographs gets their median.
     """
-    pycolmap = _loaded()
+    pycolmap = loaded()
 
     with pycolmap.Database.open(database) as stored:
         known: dict[int, list[float]] = {}
@@ -165,7 +160,7 @@ def set_focals(database: Path, focals_px: dict[str, float]) -> None:
 
 def match_features(database: Path, settings: MatchSettings) -> None:
     """Match every photograph with every other and verify the matches."""
-    pycolmap = _loaded()
+    pycolmap = loaded()
 
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -176,7 +171,7 @@ def match_features(database: Path, settings: MatchSettings) -> None:
     verification.min_num_inliers = settings.min_inliers
     verification.ransac.max_error = settings.max_error_px
     verification.ransac.random_seed = settings.seed
-    with _quiet():
+    with quiet():
         pycolmap.match_exhaustive(
             database,
             matching_options=options,
@@ -191,7 +186,7 @@ def map_views(database: Path, images: Path, settings: MapSettings) -> list[Spars
     Returns:
         One model a component, the one with most views first. Names are files of ``images``.
     """
-    pycolmap = _loaded()
+    pycolmap = loaded()
 
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 3
@@ -200,7 +195,7 @@ def map_views(database: Path, images: Path, settings: MapSettings) -> list[Spars
     options.random_seed = settings.seed
     options.mapper.abs_pose_min_num_inliers = settings.min_inliers
     options.triangulation.ignore_two_view_tracks = not settings.pairs_count
-    with tempfile.TemporaryDirectory(dir=database.parent) as output, _quiet():
+    with tempfile.TemporaryDirectory(dir=database.parent) as output, quiet():
         found = pycolmap.incremental_mapping(database, images, output, options)
     models = [_model_of(reconstruction) for reconstruction in found.values()]
     return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))
@@ -215,7 +210,7 @@ def read_model(folder: Path) -> SparseModel:
     Raises:
         InputError: The folder holds no model, or one that COLMAP cannot read.
     """
-    pycolmap = _loaded()
+    pycolmap = loaded()
 
     parts = ("cameras", "images", "points3D")
     complete = any(
@@ -227,7 +222,7 @@ def read_model(folder: Path) -> SparseModel:
             "or all .txt. Point to the folder that has them, often named sparse/0."
         )
     try:
-        with _quiet():
+        with quiet():
             reconstruction = pycolmap.Reconstruction(str(folder))
     except (ValueError, RuntimeError, IndexError) as error:
         raise InputError(
@@ -248,7 +243,7 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
     Raises:
         OutputError: The files cannot be written.
     """
-    with _quiet():
+    with quiet():
         reconstruction = _reconstruction_of(model, colors)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -258,80 +253,6 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
                 f"The sparse model cannot be written to {folder}: {error}. "
                 "Choose a folder that exists and may be written."
             ) from error
-
-
-def poisson_surface(
-    points: Float[Tensor, "point 3"],
-    normals: Float[Tensor, "point 3"],
-    *,
-    depth: int,
-    point_weight: float,
-    threads: int,
-) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Put a closed surface through oriented points by screened Poisson reconstruction.
-
-    Args:
-        points: On the surface, any unit.
-        normals: Outward.
-        depth: Of the octree: the longest side of the points' box is at most ``2 ** depth``
-            cells.
-        point_weight: Of the points against the smoothness.
-        threads: -1 for all cores.
-
-    Returns:
-        Vertices and faces, counter-clockwise from outside; without faces if there is no
-        surface. It closes where there are no points, too: what is not borne out is the
-        caller's to cut off.
-
-    Raises:
-        ReconstructionError: COLMAP cannot make a surface of the points.
-
-    Source: Kazhdan & Hoppe, Screened Poisson surface reconstruction, TOG 32(3), 2013.
-    """
-    pycolmap = _loaded()
-
-    options = pycolmap.PoissonMeshingOptions()
-    options.depth, options.point_weight = depth, point_weight
-    options.trim, options.color, options.num_threads = 0.0, False, threads
-    with tempfile.TemporaryDirectory() as folder:
-        cloud, surface = Path(folder) / "cloud.ply", Path(folder) / "surface.ply"
-        write_cloud(points, normals, cloud)
-        return _made(surface, "Poisson", pycolmap.poisson_meshing, cloud, surface, options)
-
-
-def simplified(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    *,
-    num_faces: int,
-    boundary_weight: float,
-    threads: int,
-) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
-    """Merge vertices of a mesh where that changes its planes least, until few faces are left.
-
-    Args:
-        vertices: Any unit.
-        faces: More than ``num_faces``.
-        num_faces: About so many are left.
-        boundary_weight: How much more rims count than the surface.
-        threads: -1 for all cores.
-
-    Raises:
-        ReconstructionError: COLMAP cannot simplify the mesh.
-
-    Source: Garland & Heckbert, Surface simplification using quadric error metrics,
-    SIGGRAPH 1997.
-    """
-    pycolmap = _loaded()
-
-    options = pycolmap.MeshSimplificationOptions()
-    options.target_face_ratio = num_faces / max(1, len(faces))
-    options.boundary_weight, options.num_threads = boundary_weight, threads
-    options.interpolate_colors = False
-    with tempfile.TemporaryDirectory() as folder:
-        before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
-        write_faces(vertices, faces, before)
-        return _made(after, "simplification", pycolmap.simplify_mesh, before, after, options)
 
 
 def pinhole_of(lens: Lens) -> Float[Tensor, "3 3"]:
@@ -379,26 +300,8 @@ def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
     )
 
 
-def _made(
-    path: Path,
-    what: str,
-    program: Callable[..., object],
-    *arguments: object,
-) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Run a program of COLMAP's that writes a mesh, and read that."""
-    try:
-        with _quiet():
-            program(*arguments)
-        return read_faces(path)
-    except (ValueError, RuntimeError, OSError) as error:
-        raise ReconstructionError(
-            f"coarse mesh: COLMAP's {what} made no mesh ({error}). Take more photographs of "
-            "textured surface, or bring a mesh of your own."
-        ) from error
-
-
 def _camera_of(lens: Lens) -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    pycolmap = _loaded()
+    pycolmap = loaded()
 
     camera = pycolmap.Camera.create_from_model_name(
         lens.camera, lens.model, 1.0, lens.width, lens.height
@@ -447,7 +350,7 @@ def _lens_of(camera: Any) -> Lens:  # noqa: ANN401 - see _camera_of
 
 
 def _reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> Any:  # noqa: ANN401
-    pycolmap = _loaded()
+    pycolmap = loaded()
 
     reconstruction = pycolmap.Reconstruction()
     for lens in {lens.camera: lens for lens in model.lenses}.values():
@@ -474,26 +377,3 @@ def _reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> 
         reconstruction.add_point3D(xyz, track, rgb[index])
     reconstruction.update_point_3d_errors()
     return reconstruction
-
-
-def _loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace."""
-    fresh = "pycolmap" not in sys.modules
-    import pycolmap
-
-    if fresh and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
-    return pycolmap
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    # COLMAP's log goes to stderr line by line; what matters comes back as results or exceptions.
-    pycolmap = _loaded()
-
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level

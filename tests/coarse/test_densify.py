@@ -10,7 +10,7 @@ from pimper_torch.scenes.meshes import icosphere
 from pimper_torch.scenes.render import render_shape
 from pimper_torch.scenes.shapes import Sphere
 from pimper_torch.scenes.sparse import sparse_scene
-from pimper_torch.sfm.colmap import poisson_surface, simplified
+from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
 

@@ -3,13 +3,13 @@ import sys
 
 SCRIPT = """
 import os, signal
-from pimper_torch.sfm import colmap
+from pimper_torch.sfm.binding import quiet
 
 def interrupt(number, frame):
     raise KeyboardInterrupt
 
 signal.signal(signal.SIGTERM, interrupt)
-with colmap._quiet():
+with quiet():
     pass
 try:
     os.kill(os.getpid(), signal.SIGTERM)

@@ -1,0 +1,31 @@
+"""The one place that loads pycolmap: when a function needs it, so that imports stay light."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
+    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace."""
+    fresh = "pycolmap" not in sys.modules
+    import pycolmap
+
+    if fresh and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    return pycolmap
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep COLMAP's log off stderr; what matters comes back as results or exceptions."""
+    pycolmap = loaded()
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level

@@ -1,0 +1,104 @@
+"""COLMAP's surfaces: screened Poisson reconstruction, and simplification."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm.exchange import read_faces, write_cloud, write_faces
+
+
+def poisson_surface(
+    points: Float[Tensor, "point 3"],
+    normals: Float[Tensor, "point 3"],
+    *,
+    depth: int,
+    point_weight: float,
+    threads: int,
+) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """Put a closed surface through oriented points by screened Poisson reconstruction.
+
+    Args:
+        points: On the surface, any unit.
+        normals: Outward.
+        depth: Of the octree: the longest side of the points' box is at most ``2 ** depth``
+            cells.
+        point_weight: Of the points against the smoothness.
+        threads: -1 for all cores.
+
+    Returns:
+        Vertices and faces, counter-clockwise from outside; without faces if there is no
+        surface. It closes where there are no points, too: what is not borne out is the
+        caller's to cut off.
+
+    Raises:
+        ReconstructionError: COLMAP cannot make a surface of the points.
+
+    Source: Kazhdan & Hoppe, Screened Poisson surface reconstruction, TOG 32(3), 2013.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.PoissonMeshingOptions()
+    options.depth, options.point_weight = depth, point_weight
+    options.trim, options.color, options.num_threads = 0.0, False, threads
+    with tempfile.TemporaryDirectory() as folder:
+        cloud, surface = Path(folder) / "cloud.ply", Path(folder) / "surface.ply"
+        write_cloud(points, normals, cloud)
+        return _made(surface, "Poisson", pycolmap.poisson_meshing, cloud, surface, options)
+
+
+def simplified(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    *,
+    num_faces: int,
+    boundary_weight: float,
+    threads: int,
+) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
+    """Merge vertices of a mesh where that changes its planes least, until few faces are left.
+
+    Args:
+        vertices: Any unit.
+        faces: More than ``num_faces``.
+        num_faces: About so many are left.
+        boundary_weight: How much more rims count than the surface.
+        threads: -1 for all cores.
+
+    Raises:
+        ReconstructionError: COLMAP cannot simplify the mesh.
+
+    Source: Garland & Heckbert, Surface simplification using quadric error metrics,
+    SIGGRAPH 1997.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.MeshSimplificationOptions()
+    options.target_face_ratio = num_faces / max(1, len(faces))
+    options.boundary_weight, options.num_threads = boundary_weight, threads
+    options.interpolate_colors = False
+    with tempfile.TemporaryDirectory() as folder:
+        before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
+        write_faces(vertices, faces, before)
+        return _made(after, "simplification", pycolmap.simplify_mesh, before, after, options)
+
+
+def _made(
+    path: Path,
+    what: str,
+    program: Callable[..., object],
+    *arguments: object,
+) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """Run a program of COLMAP's that writes a mesh, and read that."""
+    try:
+        with quiet():
+            program(*arguments)
+        return read_faces(path)
+    except (ValueError, RuntimeError, OSError) as error:
+        raise ReconstructionError(
+            f"coarse mesh: COLMAP's {what} made no mesh ({error}). Take more photographs of "
+            "textured surface, or bring a mesh of your own."
+        ) from error
