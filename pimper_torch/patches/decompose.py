@@ -25,14 +25,14 @@ class DecomposeConfig:
         samples_per_pixel: Template samples per pixel of the reference view; the paper's
             zeta, made independent of the scene's unit.
         overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
-        max_samples: In all facets together: where there would be more, they lie further apart.
-            Bounds time and memory; infinite for no limit.
+        max_samples: In all facets times the views that may see them: where there would be more,
+            samples lie further apart. Bounds time and memory; infinite for no limit.
         bucket_samples: Samples of all templates that are batched together; bounds memory.
     """
 
     samples_per_pixel: float = 1.0
     overlap_samples: float = 2.0
-    max_samples: float = 1.5e6
+    max_samples: float = 4.5e7
     bucket_samples: int = 100_000
 
     def __post_init__(self) -> None:
@@ -82,7 +82,8 @@ class Decompose(nn.Module):
         density = self.config.samples_per_pixel * scale
         spacing = sample_spacing(vertices, cameras, coarse.reference, density)
         area = face_normals(vertices, faces).norm(dim=-1).sum() / 2
-        spacing = torch.maximum(spacing, (area / self.config.max_samples).sqrt())
+        most = self.config.max_samples / cameras.num_views
+        spacing = torch.maximum(spacing, (area / most).sqrt())
         enlarged = enlarge(corners, self.config.overlap_samples * spacing)
         # A sliver's enlarged corner runs far away; no patch needs more than twice the overlap.
         reach = 2 * self.config.overlap_samples * spacing
