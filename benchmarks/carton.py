@@ -19,7 +19,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from PIL import Image
 from scipy.spatial import cKDTree
+from sides import drawn, far_apart, square_round
 from torch import Tensor, nn
 
 from pimper_torch.datasets import read_llff, write_colmap
@@ -102,6 +104,18 @@ def main() -> None:
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)
             write_ply(mesh, options.out / f"{title}.ply")
+    if options.out is not None:
+        draw(result.mesh, result.cameras, options.out / "sides.jpg")
+
+
+def draw(mesh: Mesh, cameras: Cameras, path: Path, sides: int = 6, width: int = 330) -> None:
+    """Draw the surface from several sides, shape alone."""
+    vertices = mesh.vertices_world
+    row = []
+    for view in far_apart(cameras, vertices.mean(dim=0), 0, sides).tolist():
+        camera = cameras.take([view])
+        row.append(drawn(mesh, camera, *square_round(vertices, camera), width))
+    Image.fromarray(np.concatenate(row, axis=1)).save(path, quality=85)
 
 
 class Given(nn.Module):

@@ -4,8 +4,8 @@
 
 RESULT is a folder that ``pimper reconstruct`` wrote, PHOTOS the photographs it was made of. The
 first side is the reference view, each further one the view that looks from furthest away from
-those before. The surface is grey matte stuff under a lamp from the upper left: what looks like
-relief is relief.
+those before. What lies beyond a photograph's border is black. The surface is grey matte stuff
+under a lamp from the upper left: what looks like relief is relief.
 """
 
 import argparse
@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.estimates import read_estimate
-from pimper_torch.records import Cameras
+from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viz.render import bounding_box, shade
 
 
@@ -41,9 +41,12 @@ def main() -> None:
     columns = []
     for view in far_apart(found.cameras, vertices.mean(dim=0), first, options.sides).tolist():
         camera = found.cameras.take([view])
+        corner, side = square_round(vertices, camera)
         with Image.open(options.photos / found.names[view]) as photograph:
-            picture, cropped = around(photograph.convert("RGB"), camera, vertices, options.width)
-        surface = np.uint8(255 * shade(found.mesh, cropped).numpy())
+            scale = photograph.width / float(camera.sizes_px[0, 0])  # cameras may see it smaller
+            box = [round(scale * float(edge)) for edge in (*corner, *(corner + side))]
+            picture = photograph.convert("RGB").crop(box).resize((options.width, options.width))
+        surface = drawn(found.mesh, camera, corner, side, options.width)
         columns.append(np.concatenate([np.asarray(picture), surface]))
     Image.fromarray(np.concatenate(columns, axis=1)).save(options.out, quality=85)
 
@@ -60,20 +63,19 @@ def far_apart(
     return torch.tensor(chosen)
 
 
-def around(
-    photograph: Image.Image, camera: Cameras, points: Float[Tensor, "point 3"], width: int
-) -> tuple[Image.Image, Cameras]:
-    """Cut a square round some points out of a photograph, and the camera that sees just that.
-
-    Where the square reaches past the photograph it is black.
-    """
-    scale = float(camera.sizes_px[0, 0]) / photograph.width  # cameras may be of a smaller one
+def square_round(
+    points: Float[Tensor, "point 3"], camera: Cameras
+) -> tuple[Float[Tensor, " 2"], float]:
+    """Give upper left corner and side, in pixels, of a square that a camera sees points in."""
     low, high = bounding_box(camera, points, 0.03)
-    side, middle = float((high - low).max()), (low + high) / 2
-    corner = middle - side / 2
-    left, top = (float(value) / scale for value in corner)
-    box = (left, top, left + side / scale, top + side / scale)
-    picture = photograph.crop(tuple(round(value) for value in box)).resize((width, width))
+    side = float((high - low).max())
+    return (low + high - side) / 2, side
+
+
+def drawn(
+    mesh: Mesh, camera: Cameras, corner: Float[Tensor, " 2"], side: float, width: int
+) -> UInt8[np.ndarray, "{width} {width} 3"]:
+    """Shade what a camera sees in a square."""
     intrinsics = camera.intrinsics.clone()
     intrinsics[:, :2, 2] -= corner
     cropped = Cameras(
@@ -81,7 +83,7 @@ def around(
         cam_from_world=camera.cam_from_world,
         sizes_px=torch.full((1, 2), width),
     )
-    return picture, cropped
+    return np.uint8(255 * shade(mesh, cropped).numpy())
 
 
 if __name__ == "__main__":

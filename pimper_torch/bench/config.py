@@ -22,7 +22,7 @@ METHODS = {
         "colmap-dense",
     ),
 }
-"""What each scale runs unless told otherwise; quick is to end within ten minutes."""
+"""What each scale runs unless told otherwise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
