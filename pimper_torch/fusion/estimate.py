@@ -18,8 +18,7 @@ from torch import Tensor
 
 from pimper_torch.fusion.evidence import Evidence
 from pimper_torch.linalg.equations import normal_equations
-from pimper_torch.linalg.singular import SingularSystemError
-from pimper_torch.linalg.systems import prepare
+from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Record
 
 # Cauchy's weights are 95 % efficient on Gaussian noise with this many standard deviations.
@@ -71,7 +70,7 @@ def fuse_evidence(
     whose weights and factors are constants.
 
     Raises:
-        SingularSystemError: See :func:`~pimper_torch.linalg.systems.prepare`.
+        SingularSystemError: See :func:`~pimper_torch.linalg.systems.solutions`.
     """
     factors = [1.0 for _ in kinds]
     weights = [torch.ones_like(kind.information).double() for kind in kinds]
@@ -80,8 +79,10 @@ def fuse_evidence(
     probe = probe.double().to(start.device)
     for _ in range(rounds - 1):
         with torch.no_grad():
-            matrix, rhs = _system(kinds, weights, factors, start, hold)
-            heights, answer = _solutions(matrix, rhs, probe)
+            entries, rhs = _system(kinds, weights, factors, start, hold)
+            heights, answer = solutions(
+                *entries, rhs, probe, what="the fusion", tolerance=_ACCURACY
+            )
             for place, kind in enumerate(kinds):
                 if not kind.judged or len(kind.targets) == 0:
                     continue
@@ -93,8 +94,8 @@ def fuse_evidence(
                 square = square / max(left, _LEAST_LEFT)
                 factors[place] = noise_factor(square)
                 weights[place] = 1 / (1 + square / (_CAUCHY**2 * factors[place]))
-    matrix, rhs = _system(kinds, weights, factors, start, hold)
-    (heights,) = _solutions(matrix, rhs)
+    entries, rhs = _system(kinds, weights, factors, start, hold)
+    (heights,) = solutions(*entries, rhs, what="the fusion", tolerance=_ACCURACY)
     return Fused(heights=heights, factors=tuple(factors))
 
 
@@ -116,39 +117,17 @@ def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " eq
     return (kind.coefficients * values[kind.unknowns]).sum(dim=1)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Matrix(Record):
-    """Entries of a symmetric positive definite matrix; those named twice add up."""
-
-    rows: Int[Tensor, " entry"]
-    cols: Int[Tensor, " entry"]
-    values: Float[Tensor, " entry"]
-
-
-def _solutions(
-    matrix: _Matrix, *sides: Float[Tensor, " vertex"]
-) -> tuple[Float[Tensor, " vertex"], ...]:
-    """Solve by whichever solver suits, and by a factor where iterations do not get there.
-
-    Slivers among the facets, and evidence a million times surer than its neighbours', can hold
-    multigrid up.
-    """
-    entries = (matrix.rows, matrix.cols, matrix.values, len(sides[0]), "the fusion")
-    try:
-        prepared = prepare(*entries, tolerance=_ACCURACY)
-        return tuple(prepared.solve(side) for side in sides)
-    except SingularSystemError:
-        prepared = prepare(*entries, method="cholesky")
-        return tuple(prepared.solve(side) for side in sides)
-
-
 def _system(
     kinds: Sequence[Evidence],
     weights: Sequence[Float[Tensor, " _"]],
     factors: Sequence[float],
     start: Float[Tensor, " vertex"],
     hold: Float[Tensor, " vertex"],
-) -> tuple[_Matrix, Float[Tensor, " vertex"]]:
+) -> tuple[
+    tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]],
+    Float[Tensor, " vertex"],
+]:
+    """Give rows, columns and values of the matrix, and the right-hand side."""
     everything = torch.arange(len(start), device=start.device)
     rows, cols, values = [everything], [everything], [hold.double()]
     rhs = hold.double() * start.double()
@@ -164,5 +143,4 @@ def _system(
         cols.append(col)
         values.append(value)
         rhs = rhs + right
-    matrix = _Matrix(rows=torch.cat(rows), cols=torch.cat(cols), values=torch.cat(values))
-    return matrix, rhs
+    return (torch.cat(rows), torch.cat(cols), torch.cat(values)), rhs

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid
+from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.linalg.sparse import SparseCholesky
 
 # Here a factor takes three times as long to make as a hierarchy, and a third as long to use; it
@@ -51,6 +52,43 @@ def prepare(
     ):
         return Multigrid(rows, cols, values, size, what, tolerance)
     return SparseCholesky(rows, cols, values, size, what)
+
+
+def solutions(
+    rows: Int[Tensor, " entry"],
+    cols: Int[Tensor, " entry"],
+    values: Float[Tensor, " entry"],
+    *sides: Float[Tensor, "unknown ..."],
+    what: str = "the linear system",
+    tolerance: float = DEFAULT_TOLERANCE,
+) -> tuple[Float[Tensor, "unknown ..."], ...]:
+    """Solve for some right-hand sides, by a factor where iterations do not get there.
+
+    Slivers among the faces of a mesh, and equations a million times surer than their neighbours,
+    can hold multigrid up.
+
+    Args:
+        rows: As in :func:`prepare`.
+        cols: The same.
+        values: The same.
+        sides: Right-hand sides, one at least.
+        what: Names the system in errors.
+        tolerance: Of multigrid.
+
+    Differentiable in ``values`` and in the sides.
+
+    Raises:
+        SingularSystemError: See :func:`prepare`.
+    """
+    size = len(sides[0])
+    prepared = prepare(rows, cols, values, size, what, tolerance=tolerance)
+    try:
+        return tuple(prepared.solve(side) for side in sides)
+    except SingularSystemError:
+        if isinstance(prepared, SparseCholesky):
+            raise
+    factor = SparseCholesky(rows, cols, values, size, what)
+    return tuple(factor.solve(side) for side in sides)
 
 
 def _like_a_laplacian(

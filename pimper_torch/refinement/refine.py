@@ -12,7 +12,7 @@ from pimper_torch.config import require
 from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.linalg.systems import prepare
+from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull, trend_deviation
 from pimper_torch.refinement.smoothness import reweighted
@@ -160,10 +160,8 @@ def smooth_seams(
         rhs = system.mass[:, None] * points.double()
         if config.hold_planes:
             rhs = rhs + plane_pull(lattice, trends, fitted, stiffness, crease)
-        matrix = prepare(
-            system.rows, system.cols, system.values, size=len(points), what="the refinement"
-        )
-        return matrix.solve(rhs)
+        (found,) = solutions(system.rows, system.cols, system.values, rhs, what="the refinement")
+        return found
 
     def deviation(places: Float[Tensor, "vertex 3"]) -> Float[Tensor, " face"]:
         return trend_deviation(lattice, places, trends)
