@@ -33,6 +33,7 @@ from pimper_torch.metrics.planarity import dihedrals, planar_faces
 from pimper_torch.pipeline import Pimper, load_config
 from pimper_torch.records import Cameras, Capture, Lens, Mesh, SparseScene, Views
 from pimper_torch.sfm.scene import write_model
+from pimper_torch.viz.render import crop
 
 # Share of the views whose masks a point must lie in to be the object's: masks were drawn for
 # each view apart, and miss a pixel of the rim here and there.
@@ -114,7 +115,7 @@ def draw(mesh: Mesh, cameras: Cameras, path: Path, sides: int = 6, width: int = 
     row = []
     for view in far_apart(cameras, vertices.mean(dim=0), 0, sides).tolist():
         camera = cameras.take([view])
-        row.append(drawn(mesh, camera, *square_round(vertices, camera), width))
+        row.append(drawn(mesh, crop(camera, *square_round(vertices, camera), width)))
     Image.fromarray(np.concatenate(row, axis=1)).save(path, quality=85)
 
 

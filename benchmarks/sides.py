@@ -18,10 +18,9 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.records import Cameras, Mesh
-from pimper_torch.viz.render import bounding_box, shade
+from pimper_torch.viz.render import bounding_box, crop, shade
 
 
 def main() -> None:
@@ -41,12 +40,12 @@ def main() -> None:
     columns = []
     for view in far_apart(found.cameras, vertices.mean(dim=0), first, options.sides).tolist():
         camera = found.cameras.take([view])
-        corner, side = square_round(vertices, camera)
+        low, high = square_round(vertices, camera)
         with Image.open(options.photos / found.names[view]) as photograph:
             scale = photograph.width / float(camera.sizes_px[0, 0])  # cameras may see it smaller
-            box = [round(scale * float(edge)) for edge in (*corner, *(corner + side))]
+            box = [round(scale * float(edge)) for edge in (*low, *high)]
             picture = photograph.convert("RGB").crop(box).resize((options.width, options.width))
-        surface = drawn(found.mesh, camera, corner, side, options.width)
+        surface = drawn(found.mesh, crop(camera, low, high, options.width))
         columns.append(np.concatenate([np.asarray(picture), surface]))
     Image.fromarray(np.concatenate(columns, axis=1)).save(options.out, quality=85)
 
@@ -65,25 +64,16 @@ def far_apart(
 
 def square_round(
     points: Float[Tensor, "point 3"], camera: Cameras
-) -> tuple[Float[Tensor, " 2"], float]:
-    """Give upper left corner and side, in pixels, of a square that a camera sees points in."""
+) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"]]:
+    """Give the corners, in pixels, of a square that a camera sees points in."""
     low, high = bounding_box(camera, points, 0.03)
-    side = float((high - low).max())
-    return (low + high - side) / 2, side
+    half = (high - low).max() / 2
+    return (low + high) / 2 - half, (low + high) / 2 + half
 
 
-def drawn(
-    mesh: Mesh, camera: Cameras, corner: Float[Tensor, " 2"], side: float, width: int
-) -> UInt8[np.ndarray, "{width} {width} 3"]:
-    """Shade what a camera sees in a square."""
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, :2, 2] -= corner
-    cropped = Cameras(
-        intrinsics=scale_intrinsics(intrinsics, width / side, width / side),
-        cam_from_world=camera.cam_from_world,
-        sizes_px=torch.full((1, 2), width),
-    )
-    return np.uint8(255 * shade(mesh, cropped).numpy())
+def drawn(mesh: Mesh, camera: Cameras) -> UInt8[np.ndarray, "height width 3"]:
+    """Shade what a camera sees."""
+    return np.uint8(255 * shade(mesh, camera).numpy())
 
 
 if __name__ == "__main__":

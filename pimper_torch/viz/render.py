@@ -90,7 +90,20 @@ def frame(
         longer_side_px: Of the new picture.
         margin: Round the box, as a share of its longer side.
     """
-    low, high = bounding_box(camera, points_world, margin)
+    return crop(camera, *bounding_box(camera, points_world, margin), longer_side_px)
+
+
+def crop(
+    camera: Cameras, low: Float[Tensor, " 2"], high: Float[Tensor, " 2"], longer_side_px: int
+) -> Cameras:
+    """Crop and scale a camera's picture to a rectangle.
+
+    Args:
+        camera: One view.
+        low: Upper left corner, pixels; may lie outside the picture, as all of it may.
+        high: Lower right corner.
+        longer_side_px: Of the new picture.
+    """
     factor = longer_side_px / float((high - low).detach().max())
     cropped = camera.intrinsics.clone()
     cropped[:, :2, 2] = cropped[:, :2, 2] - low
