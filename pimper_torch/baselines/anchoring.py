@@ -16,6 +16,7 @@ from pimper_torch.baselines.template import Template
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.reliefs import sample_raster
+from pimper_torch.geometry.surfaces import side_lengths
 from pimper_torch.photometry.lights import CAUCHY_TUNING
 from pimper_torch.photometry.robust import cauchy_weights, spread
 from pimper_torch.records import CoarseMesh
@@ -45,7 +46,7 @@ def points_on(
     depth = look_up(template, template.depth, placed)
     covered = look_up(template, template.inside.to(placed), placed) > 0.999
     corners = coarse.mesh.vertices_world[coarse.mesh.faces]
-    edge = (corners - corners.roll(1, dims=1)).norm(dim=-1).median()
+    edge = side_lengths(corners).median()
     height, width = template.depth.shape
     cell = (placed[:, :2] - template.origin) / template.spacing
     framed = ((cell >= 0) & (cell <= cell.new_tensor([width - 1, height - 1]))).all(dim=1)

@@ -25,7 +25,12 @@ from torch.nn.functional import normalize
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.lattice import Lattice, subdivide
-from pimper_torch.geometry.surfaces import boundary_vertices, face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import (
+    boundary_vertices,
+    face_normals,
+    side_lengths,
+    vertex_normals,
+)
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 
@@ -120,7 +125,7 @@ def thin_plate(
     """
     points = lattice.points.double()
     corners = mesh.vertices_world.double()[mesh.faces]
-    edge = (corners - corners.roll(1, dims=1)).norm(dim=-1).median()
+    edge = side_lengths(corners).median()
     rim = boundary_vertices(lattice.faces, len(points))
     operator, mass = _laplacian(lattice)
     keep = torch.where(rim, 0, 1 / mass.sqrt())

@@ -16,6 +16,7 @@ from pimper_torch.geometry.surfaces import (
     face_edges,
     face_normals,
     face_pairs,
+    side_lengths,
 )
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
 
@@ -337,20 +338,13 @@ def _without_folds(
     """Move vertices onto the surface, except where that folds, flattens or draws out facets."""
     before = face_normals(flat, faces)
     size = before.square().sum(dim=1)
-    longest = _MOST_STRETCH * _longest_edge(flat, faces)
+    longest = _MOST_STRETCH * side_lengths(flat[faces]).amax(dim=1)
     moving = onto.isfinite().all(dim=1)
     while True:
         places = torch.where(moving[:, None], onto, flat)
         along = (face_normals(places, faces) * before).sum(dim=1)
-        bad = (along <= _LEAST_AREA * size) | (_longest_edge(places, faces) > longest)
+        bad = (along <= _LEAST_AREA * size) | (side_lengths(places[faces]).amax(dim=1) > longest)
         bad &= moving[faces].any(dim=1)
         if not bool(bad.any()):
             return places
         moving[faces[bad].flatten()] = False
-
-
-def _longest_edge(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Float[Tensor, " face"]:
-    corners = vertices[faces]
-    return (corners - corners.roll(1, dims=1)).norm(dim=-1).amax(dim=1)

@@ -30,7 +30,7 @@ from pimper_torch.coarse.trim import (
 )
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
@@ -286,7 +286,7 @@ def nearest_facets(
     off_plane = (offset * normal).sum(dim=-1)
     # Beside the facet, the sample's distance counts as far as the lattice does not explain it.
     beside = (offset - off_plane[:, None] * normal).norm(dim=-1)
-    spacing = (corner - corner.roll(1, dims=1)).norm(dim=-1).amax(dim=1) / divisions
+    spacing = side_lengths(corner).amax(dim=1) / divisions
     return facet, torch.hypot(off_plane, (beside - spacing).clamp_min(0))
 
 

@@ -29,6 +29,7 @@ from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.surfaces import (
     face_normals,
+    side_lengths,
     vertex_normals,
 )
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
@@ -253,7 +254,7 @@ class Triangulate(nn.Module):
         )
         facing = (normals * to_camera).sum(dim=-1)
         steepest = torch.deg2rad(facing.new_tensor(self.config.max_tilt_deg)).cos()
-        longest = _edges(vertices[faces]).amax(dim=1)
+        longest = side_lengths(vertices[faces]).amax(dim=1)
         far = longest > self.config.max_stretch * longest.median()
         faces = faces[(facing > steepest) & ~(far & (facing < 0.5))]  # 0.5: turned by 60 degrees
         gray = views.images[reference].mean(dim=0)
@@ -345,15 +346,11 @@ def _shown(
 
 def _altitude(corners_px: Float[Tensor, "face 3 2"]) -> Float[Tensor, " face"]:
     """Give the smallest height over the longest edge, in the image; 0.87 for equal sides."""
-    longest = _edges(corners_px).amax(dim=1)
+    longest = side_lengths(corners_px).amax(dim=1)
     a, b, c = corners_px.unbind(dim=1)
     ab, ac = b - a, c - a
     area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs()
     return area / longest.square().clamp_min(1e-30)
-
-
-def _edges(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"]:
-    return (corners - corners.roll(1, dims=1)).norm(dim=-1)
 
 
 def _sharp(corners_px: Float[Tensor, "face 3 2"], max_angle_deg: float) -> Bool[Tensor, "face 3"]:

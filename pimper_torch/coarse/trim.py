@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.geometry.components import graph_components
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.geometry.surfaces import face_normals, face_pairs, side_lengths
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Record
 
@@ -48,7 +48,7 @@ def evidence(
     level, cameras = maps.level, maps.level.cameras
     middle = vertices[faces].mean(dim=1)
     normals = normalize(face_normals(vertices, faces), dim=-1)
-    side = (vertices[faces] - vertices[faces].roll(1, dims=1)).norm(dim=-1).amax(dim=1)
+    side = side_lengths(vertices[faces]).amax(dim=1)
     caster = RayCaster(vertices, faces)
     seen, lit, denied = (torch.zeros_like(faces[:, 0]) for _ in range(3))
     for view in range(cameras.num_views):

@@ -31,6 +31,11 @@ def face_normals(
     return torch.linalg.cross(b - a, c - a)
 
 
+def side_lengths(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"]:
+    """Give the lengths of the faces' sides: from the last corner to the first, then on."""
+    return (corners - corners.roll(1, dims=1)).norm(dim=-1)
+
+
 def vertex_normals(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
 ) -> Float[Tensor, "vertex 3"]:

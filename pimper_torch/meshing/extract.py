@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.components import face_components, vertex_components, vertex_fans
-from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.surfaces import face_normals, side_lengths
 from pimper_torch.records import Mesh, Surface
 
 
@@ -99,7 +99,7 @@ class Extract(nn.Module):
     def _spikes(self, surface: Surface) -> Bool[Tensor, " face"]:
         vertices = surface.vertices_world.detach()
         corners = vertices[surface.faces]
-        longest = (corners - corners.roll(1, dims=1)).norm(dim=-1)
+        longest = side_lengths(corners)
         spikes = longest.amax(dim=1) > self.config.max_stretch * longest.median()
         if self.config.drop_overturned:
             spikes = spikes | overturned(vertices, surface.faces, surface.facet)

@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.components import face_components
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
 from pimper_torch.records import Mesh, Record
 
 # Points that candidates for planes are judged by, and candidates for each plane.
@@ -273,7 +273,7 @@ def _smoothed_face_normals(
 ) -> Float[Tensor, "face 3"]:
     """Average normals over about ``length``: n rounds over the mesh reach the root of n edges."""
     corners = vertices[faces]
-    edge = float((corners - corners.roll(1, dims=1)).norm(dim=-1).median())
+    edge = float(side_lengths(corners).median())
     rounds = min(_MOST_ROUNDS, round((length / max(edge, 1e-30)) ** 2))
     if rounds == 0:
         return normalize(face_normals(vertices, faces), dim=1)
