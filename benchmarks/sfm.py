@@ -30,6 +30,7 @@ COLMAP = ReconstructConfig(
     max_error_px=4.0,
     min_registration_points=30,
     starts=1,
+    track_rounds=0,
 )
 
 
@@ -51,6 +52,7 @@ def variants() -> dict[str, ReconstructConfig]:
     """Name the settings to compare: one change after another, from COLMAP's own to ours."""
     change = dataclasses.replace
     ours = ReconstructConfig()
+    features = change(ours, track_rounds=0)
     return {
         "COLMAP's": COLMAP,
         "contrast 0.002": change(COLMAP, peak_threshold=0.002),
@@ -58,13 +60,14 @@ def variants() -> dict[str, ReconstructConfig]:
         "guided": change(COLMAP, guided_matching=True),
         "0.002, affine": change(COLMAP, peak_threshold=0.002, affine_shape=True),
         "0.002, DSP": change(COLMAP, peak_threshold=0.002, domain_size_pooling=True),
-        "0.002, affine, guided": change(ours, max_error_px=4.0, starts=1),
-        "0.002, affine, guided, 2 px": change(ours, starts=1),
-        "ours: the same, at most 3 starts": ours,
-        "ours, edge 20": change(ours, edge_threshold=20.0),
-        "ours, ratio 0.9": change(ours, max_ratio=0.9),
-        "ours, DSP": change(ours, domain_size_pooling=True),
-        "ours, 1 px": change(ours, max_error_px=1.0),
+        "0.002, affine, guided": change(features, max_error_px=4.0, starts=1),
+        "0.002, affine, guided, 2 px": change(features, starts=1),
+        "the same, at most 3 starts": features,
+        "ours: the same, tracks found again": ours,
+        "features, edge 20": change(features, edge_threshold=20.0),
+        "features, ratio 0.9": change(features, max_ratio=0.9),
+        "features, DSP": change(features, domain_size_pooling=True),
+        "features, 1 px": change(features, max_error_px=1.0),
     }
 
 

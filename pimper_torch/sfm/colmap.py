@@ -197,7 +197,7 @@ def map_views(database: Path, images: Path, settings: MapSettings) -> list[Spars
     options.triangulation.ignore_two_view_tracks = not settings.pairs_count
     with tempfile.TemporaryDirectory(dir=database.parent) as output, quiet():
         found = pycolmap.incremental_mapping(database, images, output, options)
-    models = [_model_of(reconstruction) for reconstruction in found.values()]
+    models = [model_of(reconstruction) for reconstruction in found.values()]
     return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))
 
 
@@ -229,7 +229,7 @@ def read_model(folder: Path) -> SparseModel:
             f"The COLMAP model in {folder} cannot be read: {error}. Write it again with COLMAP's "
             "model_converter, or leave it out to run structure from motion."
         ) from error
-    return _model_of(reconstruction)
+    return model_of(reconstruction)
 
 
 def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: Path) -> None:
@@ -244,7 +244,7 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
         OutputError: The files cannot be written.
     """
     with quiet():
-        reconstruction = _reconstruction_of(model, colors)
+        reconstruction = reconstruction_of(model, colors)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             reconstruction.write_binary(str(folder))
@@ -310,7 +310,8 @@ def _camera_of(lens: Lens) -> Any:  # noqa: ANN401 - pycolmap has no types befor
     return camera
 
 
-def _model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see _camera_of
+def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see _camera_of
+    """Read COLMAP's own model; views by their ids, points by theirs."""
     image_ids = sorted(reconstruction.reg_image_ids())
     number = {image_id: index for index, image_id in enumerate(image_ids)}
     images = [reconstruction.image(image_id) for image_id in image_ids]
@@ -349,7 +350,8 @@ def _lens_of(camera: Any) -> Lens:  # noqa: ANN401 - see _camera_of
     )
 
 
-def _reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> Any:  # noqa: ANN401
+def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> Any:  # noqa: ANN401
+    """Make COLMAP's own model; its ids keep the order of views and points."""
     pycolmap = loaded()
 
     reconstruction = pycolmap.Reconstruction()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
@@ -38,6 +38,22 @@ class SparseModel(Record):
     def num_views(self) -> int:
         """How many views are registered."""
         return len(self.names)
+
+    @property
+    def observed(self) -> Bool[Tensor, "point view"]:
+        """True where a view sees a point."""
+        table = torch.zeros(len(self.points_world), self.num_views, dtype=torch.bool)
+        table[self.observation_point, self.observation_view] = True
+        return table
+
+    def without(self, observations: Bool[Tensor, " observation"]) -> "SparseModel":
+        """Leave observations out, and points that fewer than two views see then."""
+        kept = self.replace(
+            observation_point=self.observation_point[~observations],
+            observation_view=self.observation_view[~observations],
+            observation_pixels=self.observation_pixels[~observations],
+        )
+        return select_views(kept, range(self.num_views))
 
 
 def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:

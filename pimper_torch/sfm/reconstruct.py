@@ -23,6 +23,7 @@ from pimper_torch.sfm.model import (
     select_views,
 )
 from pimper_torch.sfm.photographs import write_photographs
+from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.scene import assemble_scene
 
 
@@ -50,6 +51,8 @@ class ReconstructConfig:
             is kept, after one more run that also counts points that only two views see.
         min_share: Of the photographs that the largest component must hold when the model
             splits.
+        track_rounds: Of finding the points again in every view, by aligning what photographs
+            show round them, and adjusting cameras to that; 0 leaves the features' places.
         threads: 0 for all cores. With 1 the result is the same bit for bit.
         seed: Of everything random.
     """
@@ -68,6 +71,7 @@ class ReconstructConfig:
     min_registration_points: int = 30
     starts: int = 3
     min_share: float = 0.6
+    track_rounds: int = 2
     threads: int = 0
     seed: int = 0
 
@@ -92,6 +96,7 @@ class ReconstructConfig:
         )
         require(self.starts >= 1, "starts", self.starts, "at least 1")
         require(0 < self.min_share <= 1, "min_share", self.min_share, "in (0, 1]")
+        require(self.track_rounds >= 0, "track_rounds", self.track_rounds, "0 or more")
         require(self.threads >= 0, "threads", self.threads, "0 for all cores, or a number of them")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
 
@@ -100,8 +105,10 @@ class Reconstruct(nn.Module):
     """Find cameras and a sparse cloud, and undistort the photographs to pinholes.
 
     The photographs are written as 8-bit sRGB files to a temporary folder, where COLMAP
-    finds SIFT features on the CPU, matches every pair and grows a model. The world frame
-    and its scale are whatever the model comes in.
+    finds SIFT features on the CPU, matches every pair and grows a model. Its points are then
+    found again in all views by aligning patches, and everything is adjusted to that, see
+    :func:`~pimper_torch.sfm.refine_tracks.refine_tracks`. The world frame and its scale are
+    whatever the model comes in.
 
     A constant to autograd.
     """
@@ -170,7 +177,16 @@ class Reconstruct(nn.Module):
         parts = [model.names for model in models]
         model = models[choose_component(parts, views.names, config.min_share)]
         placed = [model.names.index(name) for name in views.names if name in model.names]
-        return select_views(model, placed)
+        model = select_views(model, placed)
+        return refine_tracks(
+            views.take([views.names.index(name) for name in model.names]),
+            model,
+            TrackSettings(
+                rounds=config.track_rounds,
+                fewest_points=config.min_registration_points,
+                threads=config.threads or -1,
+            ),
+        )
 
     def _find_features(self, views: Views, place: Path) -> tuple[str, ...]:
         config = self.config

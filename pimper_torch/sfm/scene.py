@@ -3,17 +3,17 @@
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.reprojection import reprojection_errors
 from pimper_torch.sfm.undistort import undistort
 
 
@@ -74,24 +74,6 @@ def write_model(scene: SparseScene, folder: Path) -> None:
         observation_pixels=scene.observation_pixels.detach().cpu().double(),
     )
     colmap.write_binary(model, point_colors(scene), folder)
-
-
-def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
-    """Average the distance between where a point is seen and where it should be, in pixels.
-
-    Infinite for a point that a camera sees from behind.
-    """
-    residual = torch.full_like(model.observation_pixels[:, 0], torch.inf)
-    for index, lens in enumerate(model.lenses):
-        here = torch.nonzero(model.observation_view == index)[:, 0]
-        points = model.points_world[model.observation_point[here]]
-        expected = colmap.distort(lens, transform(model.cam_from_world[index], points))
-        distance = (expected - model.observation_pixels[here]).norm(dim=-1)
-        residual[here] = distance.nan_to_num(nan=torch.inf)
-    total = torch.zeros_like(model.points_world[:, 0])
-    total = total.index_add(0, model.observation_point, residual)
-    count = torch.bincount(model.observation_point, minlength=len(total))
-    return total / count.clamp_min(1)
 
 
 def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:

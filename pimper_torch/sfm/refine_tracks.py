@@ -1,0 +1,159 @@
+"""Tracks found again in the photographs, and cameras adjusted to them."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.records import Cameras, Views
+from pimper_torch.sfm import colmap
+from pimper_torch.sfm.bundling import bundle
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.reprojection import observation_errors
+from pimper_torch.sfm.sightings import Sightings, SightingSettings, sight
+from pimper_torch.sfm.tangents import tangents
+from pimper_torch.sfm.undistort import undistort
+
+# Views that must show a point, its reference among them, for its features to be given up.
+_FEWEST_SIGHTINGS = 3
+
+# Residual at which a sighting counts half, before the residuals themselves tell; then their
+# spread, between bounds. Cauchy's 2.4 spreads would suit Gaussian residuals; these have long
+# tails, from light that is no slope: one spread puts points a quarter nearer to the truth.
+_FIRST_SCALE_PX, _SCALES_PX = 0.5, (0.05, 1.0)
+
+# Median length of a two-dimensional Gaussian's draws, in standard deviations.
+_MEDIAN_LENGTH = 1.1774
+
+# Scales beyond which an observation is an outlier, and pixels in which features are none.
+_OUTLIER_SCALES, _FEATURE_PX = 10.0, 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackSettings:
+    """How tracks are refined.
+
+    Attributes:
+        rounds: Of finding points again and adjusting cameras.
+        fewest_points: A view that shows fewer of the points that were found keeps its features.
+        threads: -1 for all cores.
+        sightings: When a point counts as found.
+    """
+
+    rounds: int
+    fewest_points: int
+    threads: int
+    sightings: SightingSettings = field(default_factory=SightingSettings)
+
+
+def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> SparseModel:
+    """Find the points again in every view, and adjust cameras, lenses and points to that.
+
+    Features are found in each photograph by itself, off by half a pixel; patches are aligned
+    with one another, off by less than a tenth, and in views whose features did not match. A
+    point that is not found again in three views keeps its features, which then weigh little.
+
+    Args:
+        views: The photographs, in the model's order.
+        model: As structure from motion found it.
+        settings: How.
+
+    Returns:
+        The same views. Points that nothing agrees about are left out.
+    """
+    pictures = _gray(views)
+    for _ in range(settings.rounds):
+        undistorted, intrinsics = undistort(pictures, model.lenses)
+        cameras = Cameras(
+            intrinsics=intrinsics.double(),
+            cam_from_world=model.cam_from_world,
+            sizes_px=undistorted.sizes_px.cpu(),
+        )
+        planes = tangents(model.points_world, model.observed, cameras)
+        found = sight(undistorted, cameras, planes, settings.sightings)
+        renewed, aligned = _renewed(model, found, cameras, settings.fewest_points)
+        if not bool(aligned.any()):
+            return model
+        model = _adjusted(renewed, aligned, settings)
+    return model
+
+
+def _gray(views: Views) -> Views:
+    """Keep what patches are compared by: one channel, saturated where one of three is."""
+    clipped = views.images.amax(dim=1, keepdim=True)
+    gray = views.images.mean(dim=1, keepdim=True)
+    return views.replace(images=torch.where(clipped >= 1, clipped, gray).detach().cpu())
+
+
+def _renewed(
+    model: SparseModel, found: Sightings, cameras: Cameras, fewest_points: int
+) -> tuple[SparseModel, Bool[Tensor, " renewed"]]:
+    """Replace features by sightings; tell which observations are sightings."""
+    often = torch.bincount(found.point, minlength=len(model.points_world)) >= _FEWEST_SIGHTINGS
+    kept = often[found.point]
+    point, view = found.point[kept], found.view[kept]
+    pixels = _photographed(found.pixels[kept], view, cameras, model)
+    poor = torch.bincount(view, minlength=model.num_views) < fewest_points
+    seen = torch.zeros(len(often), model.num_views, dtype=torch.bool)
+    seen[point, view] = True
+    theirs = model.observation_point, model.observation_view
+    feature = (~often[theirs[0]] | poor[theirs[1]]) & ~seen[theirs]
+    point = torch.cat([point, theirs[0][feature]])
+    view = torch.cat([view, theirs[1][feature]])
+    pixels = torch.cat([pixels, model.observation_pixels[feature]])
+    order = torch.argsort(point * model.num_views + view)
+    renewed = model.replace(
+        observation_point=point[order],
+        observation_view=view[order],
+        observation_pixels=pixels[order],
+    )
+    return renewed, order < int(kept.sum())
+
+
+def _photographed(
+    pixels: Float[Tensor, "sighting 2"],
+    view: Int[Tensor, " sighting"],
+    cameras: Cameras,
+    model: SparseModel,
+) -> Float[Tensor, "sighting 2"]:
+    """Carry pixels of the undistorted photographs to the photographs."""
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
+    found = torch.empty_like(pixels)
+    for index, lens in enumerate(model.lenses):
+        here = view == index
+        rays = torch.linalg.solve(cameras.intrinsics[index], homogeneous[here].mT).mT
+        found[here] = colmap.distort(lens, rays)
+    return found
+
+
+def _adjusted(
+    model: SparseModel, aligned: Bool[Tensor, " observation"], settings: TrackSettings
+) -> SparseModel:
+    """Adjust cameras to what was aligned, then the points that only features know."""
+    tied, leading = _leading(model, aligned, settings.fewest_points)
+    tied = bundle(tied, _FIRST_SCALE_PX, settings.threads)
+    spread = float(observation_errors(tied)[leading].median()) / _MEDIAN_LENGTH
+    scale = min(max(spread, _SCALES_PX[0]), _SCALES_PX[1])
+    tied = bundle(tied, scale, settings.threads)
+    model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
+    model = bundle(model, _FIRST_SCALE_PX, settings.threads, cameras=False)
+    model = bundle(model, scale, settings.threads, cameras=False)
+    limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
+    return model.without(observation_errors(model) > limit)
+
+
+def _leading(
+    model: SparseModel, aligned: Bool[Tensor, " observation"], fewest_points: int
+) -> tuple[SparseModel, Bool[Tensor, " leading"]]:
+    """Keep the points that tell cameras: those aligned, and all in views that show few of them.
+
+    Returns:
+        The model of these points, and which of its observations are aligned.
+    """
+    counts = torch.bincount(model.observation_view[aligned], minlength=model.num_views)
+    leading = aligned | (counts < fewest_points)[model.observation_view]
+    wanted = torch.zeros(len(model.points_world), dtype=torch.bool)
+    wanted[model.observation_point[leading]] = True
+    kept = wanted[model.observation_point]
+    return model.without(~kept), aligned[kept]

@@ -1,0 +1,317 @@
+r"""Points found again in photographs, to a small fraction of a pixel, whatever the light.
+
+What a view shows round a point is the reference view's patch, moved along the plane by a few
+numbers. Of the logarithm of the radiance, light that changes from view to view adds a constant
+and, over a patch, about a slope; both are projected out of patch and template alike, a common
+factor (contrast) is fitted. What remains is aligned by Gauss-Newton on the template's slopes,
+which are computed once for all views (inverse compositional).
+
+Source: Baker & Matthews, Lucas-Kanade 20 years on, IJCV 2004; that points of structure from motion
+deserve it, Lindenberger et al., Pixel-perfect structure-from-motion, ICCV 2021, with learned
+features in the place of the logarithm.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import grid_sample, pad
+
+from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.progress import track
+from pimper_torch.radiometry import SATURATED
+from pimper_torch.records import Cameras, Record, Views
+from pimper_torch.sfm.tangents import Tangents, plane_homographies
+
+# Share of the median radiance below which the logarithm fades: darker is noise.
+_DARK = 0.02
+
+_ITERATIONS = 10
+
+# Curvature of a template's match along its worst direction over that along its best, at least:
+# below, it is a stripe, and noise tells its place.
+_LEAST_ROUNDNESS = 0.01
+
+# Steps of the plane, about pixels of the reference: the longest at once; the one that ends.
+_LONGEST_STEP, _CONVERGED = 1.5, 0.02
+
+# After so many iterations a patch that is nowhere near is given up.
+_TRIAL, _HOPELESS = 4, 0.4
+
+# Bounds of the contrast against the template's.
+_CONTRAST = (0.3, 3.0)
+
+# Share of a patch that a view may lack: padding, masked, saturated.
+_MOST_LACKING = 0.1
+
+_AT_ONCE = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SightingSettings:
+    """When a point counts as found.
+
+    Attributes:
+        radius_px: Half the side of the patch.
+        min_correlation: With the template, light taken out.
+        max_shift_px: From where the cameras put the point.
+        max_deviation_px: Standard deviation of the place along its worst direction.
+    """
+
+    radius_px: int = 8
+    min_correlation: float = 0.8
+    max_shift_px: float = 3.0
+    max_deviation_px: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Sightings(Record):
+    """Where views show points.
+
+    Attributes:
+        point: Which.
+        view: In which.
+        pixels: Where, in the undistorted photograph.
+    """
+
+    point: Int[Tensor, " sighting"]
+    view: Int[Tensor, " sighting"]
+    pixels: Float[Tensor, "sighting 2"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Templates(Record):
+    """What the reference views show.
+
+    Attributes:
+        values: Light taken out; the window's square root is in them.
+        slopes: By a step along the plane.
+        inverse: Of the slopes' normal equations.
+        usable: True where the reference shows nearly all of the patch, with texture.
+    """
+
+    values: Float[Tensor, "point sample"]
+    slopes: Float[Tensor, "point sample 2"]
+    inverse: Float[Tensor, "point 2 2"]
+    usable: Bool[Tensor, " point"]
+
+    def take(self, some: Int[Tensor, " chosen"]) -> "_Templates":
+        return _Templates(
+            values=self.values[some],
+            slopes=self.slopes[some],
+            inverse=self.inverse[some],
+            usable=self.usable[some],
+        )
+
+
+class _Window:
+    """The raster of a patch in steps of the plane, its weights, and what light may change."""
+
+    def __init__(self, radius: int, like: Tensor) -> None:
+        side = torch.arange(-radius, radius + 1).to(like)
+        v, u = torch.meshgrid(side, side, indexing="ij")
+        self.side = 2 * radius + 1
+        self.places = torch.stack([u.flatten(), v.flatten(), torch.ones_like(u).flatten()])
+        weight = torch.exp(-(u.square() + v.square()).flatten() * 1.5 / radius**2)
+        self.root, self.total = weight.sqrt(), float(weight.sum())
+        light = (self.places * self.root).mT
+        self.light = torch.linalg.qr(light).Q
+
+    def freed(self, patches: Float[Tensor, "*batch sample"]) -> Float[Tensor, "*batch sample"]:
+        """Weigh patches, and project constant and slope out."""
+        heavy = patches * self.root
+        return heavy - heavy @ self.light @ self.light.mT
+
+
+def sight(
+    views: Views, cameras: Cameras, tangents: Tangents, settings: SightingSettings
+) -> Sightings:
+    """Find points in all views that may show them.
+
+    A point's place in its reference view is where the cameras put it: there the template is
+    taken. In the other views it is where the same patch is found.
+
+    Args:
+        views: Undistorted.
+        cameras: Theirs, float64.
+        tangents: Of the points.
+        settings: When a point counts as found.
+
+    Returns:
+        Sorted by point, then view; the reference's own is there where another view found
+        the point. A constant to autograd.
+    """
+    with torch.no_grad():
+        pictures = _log_pictures(views)
+        window = _Window(settings.radius_px, like=pictures)
+        templates = _templates(pictures, cameras, tangents, window)
+        parts = []
+        for view in track(range(views.num_views)):
+            wanted = tangents.candidates[:, view] & templates.usable
+            for some in torch.split(torch.nonzero(wanted)[:, 0], _AT_ONCE):
+                homographies = plane_homographies(tangents, cameras, view, some)
+                kept, pixels = _aligned(
+                    pictures[view], homographies, templates.take(some), window, settings
+                )
+                parts.append((some[kept], torch.full_like(some[kept], view), pixels[kept]))
+        if not parts:
+            parts.append(
+                (tangents.reference[:0], tangents.reference[:0], _own(tangents, cameras)[:0])
+            )
+        point, view_, pixels = (torch.cat(part) for part in zip(*parts, strict=True))
+        found = torch.zeros_like(templates.usable)
+        found[point] = True
+        (own,) = torch.nonzero(found, as_tuple=True)
+        point = torch.cat([point, own])
+        view_ = torch.cat([view_, tangents.reference[own]])
+        pixels = torch.cat([pixels, _own(tangents, cameras)[own]])
+        order = torch.argsort(point * views.num_views + view_)
+        return Sightings(point=point[order], view=view_[order], pixels=pixels[order])
+
+
+def _log_pictures(views: Views) -> Float[Tensor, "view 2 height width"]:
+    """Give logarithms of the gray radiance, and 1 where a pixel cannot be used."""
+    finite = views.images.isfinite().all(dim=1)
+    usable = views.inside & finite & (views.images.amax(dim=1) < SATURATED)
+    if views.masks is not None:
+        usable = usable & views.masks
+    gray = torch.where(usable, views.images.mean(dim=1), 0).float()
+    floor = _DARK * gray[usable].median() if bool(usable.any()) else torch.ones(())
+    return torch.stack([(gray + floor.clamp_min(1e-6)).log(), (~usable).float()], dim=1)
+
+
+def _templates(
+    pictures: Float[Tensor, "view 2 height width"],
+    cameras: Cameras,
+    tangents: Tangents,
+    window: _Window,
+) -> _Templates:
+    count = len(tangents.points_world)
+    patches = pictures.new_zeros(count, window.places.shape[1])
+    whole = torch.zeros(count, dtype=torch.bool, device=pictures.device)
+    for view in range(len(pictures)):
+        (some,) = torch.nonzero(tangents.reference == view, as_tuple=True)
+        if len(some) == 0:
+            continue
+        homographies = plane_homographies(tangents, cameras, view, some)
+        patches[some] = _look_up(pictures[view, 0], homographies, window)
+        whole[some] = _complete(pictures[view, 1], homographies, window)
+    square = patches.reshape(count, window.side, window.side)
+    down, right = torch.gradient(square, dim=(1, 2))
+    slopes = torch.stack([window.freed(right.flatten(1)), window.freed(down.flatten(1))], dim=-1)
+    normal = slopes.mT @ slopes
+    worst, best = torch.linalg.eigvalsh(normal).unbind(dim=1)
+    told = (best > 1e-9) & (worst > _LEAST_ROUNDNESS * best)
+    safe = torch.where(told[:, None, None], normal, torch.eye(2).to(normal))
+    return _Templates(
+        values=window.freed(patches),
+        slopes=slopes,
+        inverse=torch.linalg.inv(safe),
+        usable=whole & told,
+    )
+
+
+def _aligned(
+    picture: Float[Tensor, "2 height width"],
+    homographies: Float[Tensor, "point 3 3"],
+    templates: _Templates,
+    window: _Window,
+    settings: SightingSettings,
+) -> tuple[Bool[Tensor, " point"], Float[Tensor, "point 2"]]:
+    """Align one view's patches; tell which were found, and where."""
+    count = len(homographies)
+    shift = homographies.new_zeros(count, 2)
+    deviation = homographies.new_full((count,), torch.inf)
+    correlation = homographies.new_zeros(count)
+    active = torch.arange(count, device=shift.device)
+    for iteration in range(_ITERATIONS):
+        if len(active) == 0:
+            break
+        some = templates.take(active)
+        patches = window.freed(
+            _look_up(picture[0], _shifted(homographies[active], shift[active]), window)
+        )
+        power = some.values.square().sum(dim=1).clamp_min(1e-12)
+        common = (patches * some.values).sum(dim=1)
+        left = patches / (common / power).clamp(*_CONTRAST)[:, None] - some.values
+        step = -(some.inverse @ (some.slopes.mT @ left[..., None]))[..., 0].double()
+        length = step.norm(dim=1)
+        shift[active] += step * (_LONGEST_STEP / length.clamp_min(_LONGEST_STEP))[:, None]
+        variance = left.square().sum(dim=1) / window.total
+        spread = torch.linalg.eigvalsh(some.inverse)[:, -1]
+        deviation[active] = (variance * spread).sqrt().double()
+        alike = common / (patches.norm(dim=1) * power.sqrt()).clamp_min(1e-12)
+        correlation[active] = alike.double()
+        lost = shift[active].norm(dim=1) > settings.max_shift_px
+        if iteration >= _TRIAL:
+            lost |= alike < _HOPELESS
+        shift[active[lost]] = torch.inf
+        active = active[~lost & (length > _CONVERGED)]
+    arrived = torch.ones(count, dtype=torch.bool, device=shift.device)
+    arrived[active] = False
+    arrived &= shift.isfinite().all(dim=1)
+    final = _shifted(homographies, torch.where(arrived[:, None], shift, 0))
+    found = arrived & (correlation >= settings.min_correlation)
+    found &= deviation <= settings.max_deviation_px
+    found &= _complete(picture[1], final, window)
+    return found, final[:, :2, 2] / final[:, 2:, 2]
+
+
+def _shifted(
+    homographies: Float[Tensor, "point 3 3"], shift: Float[Tensor, "point 2"]
+) -> Float[Tensor, "point 3 3"]:
+    """Begin the plane's steps elsewhere."""
+    middle = homographies[:, :, 2] + (homographies[:, :, :2] @ shift[..., None])[..., 0]
+    return torch.cat([homographies[:, :, :2], middle[..., None]], dim=2)
+
+
+def _own(tangents: Tangents, cameras: Cameras) -> Float[Tensor, "point 2"]:
+    """Give the points' pixels in their reference views."""
+    frames = cameras.cam_from_world[tangents.reference]
+    points = (frames[:, :3, :3] @ tangents.points_world[..., None])[..., 0] + frames[:, :3, 3]
+    homogeneous = (cameras.intrinsics[tangents.reference] @ points[..., None])[..., 0]
+    return homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+def _complete(
+    unusable: Float[Tensor, "height width"],
+    homographies: Float[Tensor, "point 3 3"],
+    window: _Window,
+) -> Bool[Tensor, " point"]:
+    """Tell whose patches a view shows nearly all of."""
+    lacking = _look_up(unusable, homographies, window, mode="nearest", outside=1.0)
+    share = (lacking * window.root.square()).sum(dim=1) / window.total
+    return share <= _MOST_LACKING
+
+
+def _look_up(
+    picture: Float[Tensor, "height width"],
+    homographies: Float[Tensor, "point 3 3"],
+    window: _Window,
+    mode: str = "bilinear",
+    outside: float | None = None,
+) -> Float[Tensor, "point sample"]:
+    """Look patches up: as many batches as threads, each is one thread's on the CPU.
+
+    Bilinear: torch's cubic kernel displaces patches by a twentieth of a pixel, this by a hundredth.
+    """
+    height, width = picture.shape
+    homogeneous = homographies @ window.places.to(homographies)
+    ahead = homogeneous[:, 2] > 0
+    pixels = homogeneous[:, :2] / torch.where(ahead, homogeneous[:, 2], torch.inf)[:, None]
+    grid = grid_from_pixels(pixels.mT, width, height).to(picture)
+    flat = grid.clamp(-3, 3).reshape(-1, 2)
+    threads = torch.get_num_threads()
+    filled = pad(flat, (0, 0, 0, -len(flat) % threads)).reshape(threads, 1, -1, 2)
+    found = grid_sample(
+        picture.expand(threads, 1, -1, -1),
+        filled,
+        mode=mode,
+        padding_mode="border",
+        align_corners=False,
+    ).flatten()[: len(flat)]
+    found = found.reshape(grid.shape[:-1])
+    if outside is None:
+        return found
+    return torch.where((grid.abs() <= 1).all(dim=-1) & ahead, found, outside)

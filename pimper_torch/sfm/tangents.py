@@ -1,0 +1,113 @@
+"""What surrounds each point of a sparse cloud: a little plane, and who looks at it."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Cameras, Record
+
+# Points round one that tell its normal.
+_NEIGHBOURS = 16
+
+# Cosine to the mean of the rays at which a normal is no longer believed.
+_LEAST_FACING = 0.5
+
+# Cosine between normal and ray down to which a view is worth asking.
+_LEAST_COSINE = 0.35
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Tangents(Record):
+    """Planes through points, float64.
+
+    Attributes:
+        points_world: Their middles.
+        steps_world: Two vectors along the plane, right-angled and equally long: about a pixel of
+            the reference view each.
+        reference: The view that shows the plane best among those that see the point.
+        candidates: Views in front of the plane that have the point in their image; not the
+            reference.
+    """
+
+    points_world: Float[Tensor, "point 3"]
+    steps_world: Float[Tensor, "point 2 3"]
+    reference: Int[Tensor, " point"]
+    candidates: Bool[Tensor, "point view"]
+
+
+def tangents(
+    points_world: Float[Tensor, "point 3"], observed: Bool[Tensor, "point view"], cameras: Cameras
+) -> Tangents:
+    """Lay a plane through every point and choose the views to look for it in.
+
+    Args:
+        points_world: The cloud.
+        observed: Which views see which points, every point in one at least.
+        cameras: In float64, like the points.
+    """
+    rays = cameras.centers_world - points_world[:, None]
+    distance = rays.norm(dim=-1)
+    rays = normalize(rays, dim=-1)
+    towards = normalize((rays * observed[..., None]).sum(dim=1), dim=-1)
+    normals = plane_normals(points_world, towards)
+    cosine = (rays * normals[:, None]).sum(dim=-1)
+    focals = cameras.intrinsics[:, 0, 0]
+    sharpness = torch.where(observed, cosine.clamp_min(1e-3) * focals / distance, 0)
+    reference = sharpness.argmax(dim=1)
+    here = reference[:, None]
+    pixel = (distance / focals).gather(1, here)
+    # Foreshortened along one axis, a pixel covers more of the plane.
+    pixel = pixel / cosine.gather(1, here).clamp(_LEAST_COSINE, 1).sqrt()
+    pixels, depth = project(points_world, cameras.cam_from_world, cameras.intrinsics)
+    sizes = cameras.sizes_px[:, None].to(pixels)
+    inside = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
+    candidates = inside.mT & (cosine > _LEAST_COSINE)
+    return Tangents(
+        points_world=points_world,
+        steps_world=pixel[:, None] * _along(normals),
+        reference=reference,
+        candidates=candidates.scatter(1, here, value=False),
+    )
+
+
+def plane_normals(
+    points: Float[Tensor, "point 3"], towards: Float[Tensor, "point 3"]
+) -> Float[Tensor, "point 3"]:
+    """Give the unit normals of the planes that points and their nearest ones lie on.
+
+    Args:
+        points: At least one.
+        towards: Unit; what a normal points to, and what it is where neighbours say otherwise.
+    """
+    places = points.detach().cpu().numpy()
+    count = min(_NEIGHBOURS, len(places))
+    _, nearest = cKDTree(places).query(places, k=list(range(1, count + 1)))
+    around = points[torch.from_numpy(nearest).to(points.device)]
+    steps = around - around.median(dim=1, keepdim=True).values  # a stray neighbour shifts no median
+    axes = torch.linalg.eigh(steps.mT @ steps).eigenvectors
+    across = axes[:, :, 0]
+    facing = (across * towards).sum(dim=-1, keepdim=True)
+    return torch.where(facing.abs() > _LEAST_FACING, across * facing.sign(), towards)
+
+
+def plane_homographies(
+    tangent: Tangents, cameras: Cameras, view: int, some: Int[Tensor, " chosen"]
+) -> Float[Tensor, "chosen 3 3"]:
+    """Give the homographies from planes, in steps from the middle, to a view's pixels."""
+    steps = tangent.steps_world[some]
+    middle = transform(cameras.cam_from_world[view], tangent.points_world[some])
+    turned = steps @ cameras.cam_from_world[view, :3, :3].mT
+    return cameras.intrinsics[view] @ torch.cat([turned, middle[:, None]], dim=1).mT
+
+
+def _along(normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point 2 3"]:
+    """Give two unit vectors at right angles to each normal and to one another."""
+    axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
+    first = normalize(torch.linalg.cross(normals, axis), dim=-1)
+    return torch.stack([first, torch.linalg.cross(normals, first)], dim=1)

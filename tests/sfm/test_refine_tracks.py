@@ -1,0 +1,131 @@
+import dataclasses
+
+import torch
+
+from pimper_torch.geometry.frames import rigid, transform
+from pimper_torch.geometry.projection import project
+from pimper_torch.metrics.similarity import similarity_between_points
+from pimper_torch.sfm.bundling import bundle
+from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
+from pimper_torch.sfm.reprojection import observation_errors
+from pimper_torch.sfm.sightings import SightingSettings
+from tests.sfm import ball
+
+SETTINGS = TrackSettings(
+    rounds=1, fewest_points=30, threads=1, sightings=SightingSettings(radius_px=8)
+)
+
+
+def shape_error(points, truth):
+    carried = transform(similarity_between_points(points, truth), points)
+    return (carried - truth).norm(dim=1).median()
+
+
+def camera_error(model, points):
+    """Bend space as the model's cameras do: where they see exact pixels come from."""
+    truth = ball.cameras_on_an_arc()
+    pixels, _ = project(points, truth.cam_from_world, truth.intrinsics)
+    each = torch.cartesian_prod(torch.arange(len(points)), torch.arange(6))
+    exact = model.replace(
+        points_world=points,
+        observation_point=each[:, 0],
+        observation_view=each[:, 1],
+        observation_pixels=pixels[each[:, 1], each[:, 0]],
+    )
+    return shape_error(bundle(exact, 0.5, 1, cameras=False).points_world, points)
+
+
+def found_by_features(generator, noise_px=0.5, share=0.6):
+    """Adjust the truth to noisy features: what structure from motion would give."""
+    cameras = ball.cameras_on_an_arc()
+    points = ball.points_on_the_ball(200, generator)
+    model = ball.model_of(cameras, points, generator, noise_px, share)
+    return cameras, points, bundle(model, 1.0, 1)
+
+
+def test_cameras_come_five_times_nearer_to_the_truth_under_changing_light(generator):
+    cameras, points, model = found_by_features(generator)
+    better = refine_tracks(ball.photographs(cameras), model, SETTINGS)
+    assert camera_error(better, points) < camera_error(model, points) / 5
+
+
+def test_focal_length_comes_nearer_to_the_truth(generator):
+    cameras, _, model = found_by_features(generator, noise_px=0.8)
+    better = refine_tracks(
+        ball.photographs(cameras), model, dataclasses.replace(SETTINGS, rounds=2)
+    )
+    before, after = (abs(one.lenses[0].params[0] / ball.FOCAL - 1) for one in (model, better))
+    assert after < before / 2
+
+
+def test_views_that_missed_a_point_are_found_to_show_it(generator):
+    cameras, _, model = found_by_features(generator, share=0.3)
+    better = refine_tracks(ball.photographs(cameras), model, SETTINGS)
+    assert len(better.observation_point) > 1.3 * len(model.observation_point)
+    assert better.names == model.names
+    assert observation_errors(better).median() < 0.15
+
+
+def test_a_view_that_shows_nothing_of_the_others_keeps_its_features_and_place(generator):
+    cameras, _, model = found_by_features(generator)
+    views = ball.photographs(cameras)
+    images = views.images.clone()
+    images[4] = 0.2  # blank: no patch is found in it
+    better = refine_tracks(views.replace(images=images), model, SETTINGS)
+    assert (better.observation_view == 4).sum() > 60
+    others = [0, 1, 2, 3, 5]
+    before, after = (torch.linalg.inv(one.cam_from_world)[:, :3, 3] for one in (model, better))
+    carried = transform(similarity_between_points(after[others], before[others]), after)
+    assert (carried[4] - before[4]).norm() < 0.1
+
+
+def test_without_texture_everything_stays_as_it_was(generator):
+    cameras, _, model = found_by_features(generator)
+    views = ball.photographs(cameras)
+    plain = views.replace(images=torch.full_like(views.images, 0.3))
+    assert refine_tracks(plain, model, SETTINGS) is model
+
+
+def test_no_rounds_leave_the_model_alone(generator):
+    cameras, _, model = found_by_features(generator)
+    same = refine_tracks(ball.photographs(cameras), model, dataclasses.replace(SETTINGS, rounds=0))
+    assert same is model
+
+
+def test_bundling_leads_exact_observations_back_to_the_truth(generator):
+    cameras = ball.cameras_on_an_arc()
+    points = ball.points_on_the_ball(100, generator)
+    exact = ball.model_of(cameras, points, generator, noise_px=0.0)
+    turns = 0.01 * torch.randn(6, 3, 3, generator=generator, dtype=torch.float64)
+    off = rigid(torch.linalg.matrix_exp(turns - turns.mT), torch.full((6, 3), 0.02).double())
+    moved = exact.replace(
+        cam_from_world=off @ exact.cam_from_world,
+        points_world=points + 0.02 * torch.randn(points.shape, generator=generator).double(),
+    )
+    found = bundle(moved, 0.5, 1)
+    assert observation_errors(found).max() < 1e-3
+    assert shape_error(found.points_world, points) < 1e-4
+
+
+def test_bundling_of_points_alone_leaves_cameras_where_they_are(generator):
+    cameras = ball.cameras_on_an_arc()
+    points = ball.points_on_the_ball(100, generator)
+    exact = ball.model_of(cameras, points, generator, noise_px=0.0)
+    moved = exact.replace(points_world=points + 0.02)
+    found = bundle(moved, 0.5, 1, cameras=False)
+    torch.testing.assert_close(found.cam_from_world, exact.cam_from_world, rtol=0, atol=1e-12)
+    assert found.lenses == exact.lenses
+    torch.testing.assert_close(found.points_world, points, rtol=0, atol=1e-5)
+
+
+def test_without_observations_their_points_go_and_the_rest_keeps_its_order(generator):
+    model = ball.model_of(
+        ball.cameras_on_an_arc(), ball.points_on_the_ball(20, generator), generator, 0.0
+    )
+    lonely = (model.observation_point == 7) & (model.observation_view > 0)
+    fewer = model.without(lonely)
+    assert len(fewer.points_world) == 19
+    assert torch.equal(fewer.points_world[:7], model.points_world[:7])
+    assert torch.equal(fewer.points_world[7:], model.points_world[8:])
+    assert len(fewer.observation_point) == 19 * 6
+    assert fewer.observed.all()

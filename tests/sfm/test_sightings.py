@@ -1,0 +1,105 @@
+import pytest
+import torch
+
+from pimper_torch.geometry.projection import project
+from pimper_torch.sfm.sightings import SightingSettings, sight
+from pimper_torch.sfm.tangents import tangents
+from tests.sfm import ball
+
+SETTINGS = SightingSettings(radius_px=8)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    generator = torch.Generator().manual_seed(3)
+    cameras = ball.cameras_on_an_arc()
+    points = ball.points_on_the_wall(150, generator)
+    planes = tangents(points, torch.ones(len(points), 6, dtype=torch.bool), cameras)
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    return cameras, planes, pixels
+
+
+def errors(found, pixels):
+    return (found.pixels - pixels[found.view, found.point]).norm(dim=1)
+
+
+@pytest.mark.parametrize("lit", [False, True], ids=["one light", "another light each"])
+def test_points_are_found_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
+    cameras, planes, pixels = scene
+    found = sight(ball.photographs(cameras, lit=lit, wall=True), cameras, planes, SETTINGS)
+    assert len(found.point) > 0.85 * 6 * 150
+    assert errors(found, pixels).median() < (0.05 if lit else 0.02)
+
+
+def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
+    cameras, planes, _ = scene
+    turned = cameras.cam_from_world.clone()
+    turned[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels
+    wrong = cameras.replace(cam_from_world=turned)
+    found = sight(ball.photographs(cameras, lit=False, wall=True), wrong, planes, SETTINGS)
+    mine = (found.view == 3) & (planes.reference[found.point] != 3)
+    # The reference's pixel is where the wrong camera has it, so its own points are left out.
+    right, _ = project(planes.points_world, cameras.cam_from_world[3], cameras.intrinsics[3])
+    assert mine.sum() > 60
+    assert (found.pixels[mine] - right[found.point[mine]]).norm(dim=1).median() < 0.05
+
+
+def test_what_stands_before_the_point_is_not_taken_for_it(scene):
+    cameras, planes, _ = scene
+    views = ball.photographs(cameras, wall=True)
+    images = views.images.clone()
+    images[2] = 0.2 * torch.rand(1, ball.HEIGHT, ball.WIDTH).double()
+    found = sight(views.replace(images=images), cameras, planes, SETTINGS)
+    other = planes.reference[found.point] != 2
+    assert not (found.view[other] == 2).any()
+
+
+@pytest.mark.parametrize("how", ["masked", "saturated", "not finite"])
+def test_patches_that_a_view_does_not_have_are_not_found(scene, how):
+    cameras, planes, pixels = scene
+    views = ball.photographs(cameras, wall=True)
+    left = torch.zeros(6, ball.HEIGHT, ball.WIDTH, dtype=torch.bool)
+    left[1, :, : ball.WIDTH // 2] = True
+    if how == "masked":
+        views = views.replace(masks=~left)
+    else:
+        value = 1.0 if how == "saturated" else torch.nan
+        views = views.replace(images=torch.where(left[:, None], value, views.images))
+    found = sight(views, cameras, planes, SETTINGS)
+    here = found.view == 1
+    assert here.any()
+    assert (found.pixels[here, 0] > ball.WIDTH / 2 - 8).all()
+    assert errors(found, pixels)[here].median() < 0.05
+
+
+def test_where_nothing_has_texture_nothing_is_found(scene):
+    cameras, planes, _ = scene
+    views = ball.photographs(cameras, wall=True)
+    plain = views.replace(images=torch.full_like(views.images, 0.3))
+    assert len(sight(plain, cameras, planes, SETTINGS).point) == 0
+
+
+def test_a_stripe_tells_no_place_along_itself(scene):
+    cameras, planes, _ = scene
+    views = ball.photographs(cameras, wall=True)
+    stripes = torch.sin(torch.arange(ball.WIDTH) / 2.5).double().expand(ball.HEIGHT, -1)
+    noise = torch.Generator().manual_seed(1)
+    images = (
+        0.3
+        + 0.2 * stripes
+        + 0.02 * torch.rand(6, 1, ball.HEIGHT, ball.WIDTH, generator=noise, dtype=torch.float64)
+    )
+    found = sight(views.replace(images=images), cameras, planes, SETTINGS)
+    assert len(found.point) < 0.05 * 6 * 150
+
+
+def test_sightings_are_sorted_and_the_reference_sees_what_others_found(scene):
+    cameras, planes, pixels = scene
+    found = sight(ball.photographs(cameras, wall=True), cameras, planes, SETTINGS)
+    key = found.point * 6 + found.view
+    assert (key.diff() > 0).all()
+    own = found.view == planes.reference[found.point]
+    assert set(found.point[own].tolist()) == set(found.point.tolist())
+    torch.testing.assert_close(
+        found.pixels[own], pixels[found.view[own], found.point[own]], rtol=0, atol=1e-9
+    )
