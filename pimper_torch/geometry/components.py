@@ -6,7 +6,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import face_pairs
+from pimper_torch.geometry.surfaces import face_edges, face_pairs
 
 
 def vertex_components(
@@ -50,6 +50,36 @@ def vertex_fans(
     order = old.argsort(stable=True)
     rank = torch.empty_like(order).scatter(0, order, torch.arange(len(order)).to(order))
     return old[order], rank[label].reshape(-1, 3)
+
+
+def boundary_loops(
+    faces: Int[Tensor, "face 3"],
+) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, " edge"]]:
+    """Follow the border of a surface: every opening, and every rim, is one loop.
+
+    Loops that touch in a vertex are two. An edge of three faces or more is border of them all.
+
+    Returns:
+        The border's edges, and the loop each is part of, counted from 0.
+
+    >>> cone = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1]])
+    >>> boundary_loops(cone)
+    (tensor([[1, 2],
+            [1, 3],
+            [2, 3]]), tensor([0, 0, 0]))
+    """
+    edges, index = face_edges(faces)
+    open_ends = edges[torch.bincount(index.flatten(), minlength=len(edges)) != 2]
+    if len(open_ends) == 0:
+        return open_ends, open_ends[:, 0]
+    on_border = torch.zeros(int(faces.max()) + 1, dtype=torch.bool, device=faces.device)
+    on_border[open_ends.flatten()] = True
+    source, parted = vertex_fans(faces[on_border[faces].any(dim=1)])
+    edges, index = face_edges(parted)
+    alone = torch.bincount(index.flatten(), minlength=len(edges)) == 1
+    border = edges[alone & on_border[source[edges]].all(dim=1)]
+    label = graph_components(border, len(source))[border[:, 0]]
+    return source[border], torch.unique(label, return_inverse=True)[1]
 
 
 def graph_components(links: Int[Tensor, "link 2"], count: int) -> Int[Tensor, " node"]:

@@ -83,10 +83,10 @@ def boundary_vertices(
     faces: Int[Tensor, "face 3"], num_vertices: int
 ) -> Bool[Tensor, " {num_vertices}"]:
     """Mark vertices on an edge that only one face has."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
-    unique, counts = torch.unique(edges, dim=0, return_counts=True)
+    edges, index = face_edges(faces)
+    alone = torch.bincount(index.flatten(), minlength=len(edges)) == 1
     marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
-    marked[unique[counts == 1].reshape(-1)] = True
+    marked[edges[alone].reshape(-1)] = True
     return marked
 
 

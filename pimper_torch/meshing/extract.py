@@ -9,8 +9,11 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.components import face_components, vertex_components, vertex_fans
-from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.components import face_components, vertex_fans
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.meshing.faults import Folds, overturned, stretched
+from pimper_torch.meshing.groups import small_groups
+from pimper_torch.meshing.mend import mend
 from pimper_torch.records import Mesh, Surface
 
 
@@ -27,6 +30,10 @@ class ExtractConfig:
             longer ones are spikes or cliffs. Infinite keeps all.
         drop_overturned: Leave out faces turned more than 90 degrees from the mean of
             their facet.
+        max_mend: Spikes and folds that other faces enclose are mended in place of being left
+            out, when they extend over no more than this share of the surface's extent: their
+            vertices move to where the surface bends least, and lose their confidence. A face
+            then counts as overturned only where a fold bounds it. 0 leaves all out.
         min_piece: Share of the largest connected piece's area that another one needs to be
             kept; 1 keeps the largest only.
     """
@@ -35,12 +42,14 @@ class ExtractConfig:
     max_hole: float = 1.0
     max_stretch: float = 10.0
     drop_overturned: bool = True
+    max_mend: float = 0.1
     min_piece: float = 0.01
 
     def __post_init__(self) -> None:
         require(0 <= self.min_confidence < 1, "min_confidence", self.min_confidence, "in [0, 1)")
         require(self.max_hole >= 0, "max_hole", self.max_hole, "0 or more")
         require(self.max_stretch > 1, "max_stretch", self.max_stretch, "above 1")
+        require(self.max_mend >= 0, "max_mend", self.max_mend, "0 or more")
         require(0 <= self.min_piece <= 1, "min_piece", self.min_piece, "in [0, 1]")
 
 
@@ -73,11 +82,11 @@ class Extract(nn.Module):
         supported = confidence > self.config.min_confidence
         if not bool((confidence > 0).any()):  # nowhere better than elsewhere
             supported = supported.new_ones(supported.shape)
-        filled = small_holes(vertices, surface.faces, supported, self.config.max_hole)
+        filled = small_groups(vertices, surface.faces, ~supported, self.config.max_hole)
         keep = (supported | filled)[surface.faces].all(dim=1)
         with_support = int(keep.sum())
-        keep = keep & ~self._spikes(surface)
-        faces = surface.faces[keep]
+        surface, spikes = self._spikes(surface, keep)
+        faces = surface.faces[keep][~spikes]
         if len(faces) == 0:
             raise ReconstructionError(
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
@@ -86,6 +95,7 @@ class Extract(nn.Module):
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the share "
                 "of missing data that the report gives."
             )
+        vertices = surface.vertices_world.detach()
         faces = faces[large_pieces(vertices, faces, self.config.min_piece)]
         source, faces = vertex_fans(faces)
         return Mesh(
@@ -96,57 +106,39 @@ class Extract(nn.Module):
             confidence=surface.confidence[source],
         )
 
-    def _spikes(self, surface: Surface) -> Bool[Tensor, " face"]:
-        vertices = surface.vertices_world.detach()
-        corners = vertices[surface.faces]
-        longest = side_lengths(corners)
-        spikes = longest.amax(dim=1) > self.config.max_stretch * longest.median()
-        if self.config.drop_overturned:
-            spikes = spikes | overturned(vertices, surface.faces, surface.facet)
-        return spikes
+    def _spikes(
+        self, surface: Surface, keep: Bool[Tensor, " face"]
+    ) -> tuple[Surface, Bool[Tensor, " kept"]]:
+        """Mend what can be mended, and mark which of the faces kept cannot."""
+        config, faces = self.config, surface.faces
+        if config.max_mend == 0:
+            vertices = surface.vertices_world.detach()
+            spikes = stretched(vertices, faces, config.max_stretch)
+            if config.drop_overturned:
+                spikes = spikes | overturned(vertices, faces, surface.facet)
+            return surface, spikes[keep]
+        faces = faces[keep]
+        folds = Folds(faces, surface.facet)
 
+        def broken(vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+            long = stretched(vertices, faces, config.max_stretch)
+            return long | folds.at(vertices) if config.drop_overturned else long
 
-def small_holes(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    supported: Bool[Tensor, " vertex"],
-    max_extent: float,
-) -> Bool[Tensor, " vertex"]:
-    """Mark vertices without support that lie in a small connected group of their kind.
-
-    Args:
-        vertices: World.
-        faces: Of the surface.
-        supported: The others are grouped along edges.
-        max_extent: Diagonal of a group's bounding box, as a share of that of all vertices.
-    """
-    label = vertex_components(faces, ~supported)
-    count = int(label.max()) + 1 if len(label) else 0
-    index = label[:, None].expand_as(vertices)
-    like = vertices.new_zeros(count, 3)
-    high = like.scatter_reduce(0, index, vertices, "amax", include_self=False)
-    low = like.scatter_reduce(0, index, vertices, "amin", include_self=False)
-    whole = (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()
-    small = (high - low).norm(dim=-1) <= max_extent * whole
-    return ~supported & small[label]
-
-
-def overturned(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    facet: Int[Tensor, " vertex"],
-) -> Bool[Tensor, " face"]:
-    """Mark faces that look more than 90 degrees away from the mean of their facet.
-
-    Args:
-        vertices: World.
-        faces: Of the surface.
-        facet: Of each vertex; a face belongs to the facet that most of its vertices name.
-    """
-    normals = face_normals(vertices, faces)
-    owner = facet[faces].mode(dim=1).values
-    total = normals.new_zeros(int(facet.max()) + 1, 3).index_add(0, owner, normals)
-    return (normals * total[owner]).sum(dim=-1) < 0
+        vertices, moved = mend(surface.vertices_world, faces, broken, config.max_mend)
+        touched = torch.zeros_like(moved)
+        touched[faces[moved[faces].any(dim=1)].flatten()] = True
+        mended = surface.replace(
+            vertices_world=vertices,
+            normals_world=torch.where(
+                touched[:, None], vertex_normals(vertices, faces), surface.normals_world
+            ),
+            confidence=torch.where(moved, 0, surface.confidence),
+        )
+        places = vertices.detach()
+        spikes = stretched(places, faces, config.max_stretch)
+        if config.drop_overturned:
+            spikes = spikes | (folds.at(places) & folds.overturned(places))
+        return mended, spikes
 
 
 def large_pieces(

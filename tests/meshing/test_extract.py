@@ -4,7 +4,8 @@ import trimesh
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, ReconstructionError
-from pimper_torch.meshing.extract import Extract, ExtractConfig, small_holes
+from pimper_torch.meshing.extract import Extract, ExtractConfig
+from pimper_torch.meshing.groups import small_groups
 from pimper_torch.records import Convergence, Surface
 
 SIDE = 21
@@ -72,10 +73,10 @@ def test_small_holes_stay_filled_and_large_ones_open():
 def test_unsupported_groups_are_measured_one_by_one():
     surface = sheet()
     supported = (columns(surface) + surface.vertices_world[:, 1]) % 4 != 0
-    marked = small_holes(surface.vertices_world, surface.faces, supported, 0.1)
+    marked = small_groups(surface.vertices_world, surface.faces, ~supported, 0.1)
     assert torch.equal(marked, ~supported)  # scattered singles, however far apart
     band = columns(surface) > 1
-    marked = small_holes(surface.vertices_world, surface.faces, band, 0.5)
+    marked = small_groups(surface.vertices_world, surface.faces, ~band, 0.5)
     assert not marked.any()
 
 
@@ -116,12 +117,12 @@ def test_spikes_and_overturned_faces_go():
     vertices[spike, 2] = -30
     vertices[folded, 0] += 2.5  # over its neighbours: some faces look away
     bent = surface.replace(vertices_world=vertices)
-    mesh = Extract(ExtractConfig())(bent)
+    mesh = Extract(ExtractConfig(max_mend=0.0))(bent)
     assert mesh.vertices_world[:, 2].min() > -1
     assert len(mesh.vertices_world) == SIDE**2 - 1  # the folded vertex keeps its good faces
     gone = len(surface.faces) - len(mesh.faces)
     assert 6 < gone <= 12
-    kept = Extract(ExtractConfig(drop_overturned=False, max_stretch=torch.inf))(bent)
+    kept = Extract(ExtractConfig(drop_overturned=False, max_stretch=torch.inf, max_mend=0.0))(bent)
     assert len(kept.faces) == len(surface.faces)
 
 

@@ -1,0 +1,31 @@
+"""Groups of vertices that hang together, and how far each extends."""
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.geometry.components import vertex_components
+
+
+def small_groups(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    among: Bool[Tensor, " vertex"],
+    max_extent: float,
+) -> Bool[Tensor, " vertex"]:
+    """Mark those of some vertices that lie in a small connected group of their kind.
+
+    Args:
+        vertices: World.
+        faces: Of the surface.
+        among: Grouped along edges.
+        max_extent: Diagonal of a group's bounding box, as a share of that of all vertices.
+    """
+    label = vertex_components(faces, among)
+    count = int(label.max()) + 1 if len(label) else 0
+    index = label[:, None].expand_as(vertices)
+    like = vertices.new_zeros(count, 3)
+    high = like.scatter_reduce(0, index, vertices, "amax", include_self=False)
+    low = like.scatter_reduce(0, index, vertices, "amin", include_self=False)
+    whole = (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()
+    small = (high - low).norm(dim=-1) <= max_extent * whole
+    return among & small[label]

@@ -1,0 +1,98 @@
+"""Whether a surface is closed: its openings, its edges that are none of a surface's, its folds."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.components import boundary_loops, face_components
+from pimper_torch.geometry.surfaces import face_edges, face_normals, face_pairs
+from pimper_torch.records import Mesh, Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Closedness(Record):
+    """What keeps a mesh from being the skin of a body.
+
+    Attributes:
+        loops: Length of every loop of the border, the longest first, scene units.
+        edges: How many edges each has.
+        crowded: Edges that three faces share, or more.
+        twisted: Edges whose two faces disagree about which side is out.
+        folds: Edges where the surface turns by more than the angle that was asked for.
+        pieces: Of faces that hang together by edges.
+        euler: Vertices less edges plus faces; 2 for a sphere, 1 for a disc.
+        diagonal: Of the bounding box, scene units.
+    """
+
+    loops: Float[Tensor, " loop"]
+    edges: Int[Tensor, " loop"]
+    crowded: int
+    twisted: int
+    folds: int
+    pieces: int
+    euler: int
+    diagonal: float
+
+    @property
+    def closed(self) -> bool:
+        """Whether it bounds a body: no border, and two faces, agreeing, at every edge."""
+        return len(self.loops) == 0 and self.crowded == 0 and self.twisted == 0
+
+    @property
+    def border_percent(self) -> float:
+        """Length of the whole border, in per cent of the diagonal."""
+        return 100 * float(self.loops.sum()) / self.diagonal
+
+    @property
+    def handles(self) -> int:
+        """How many handles the pieces have together; of a mesh with crowded edges, no telling."""
+        return (2 * self.pieces - self.euler - len(self.loops)) // 2
+
+
+def closedness(mesh: Mesh, *, fold_deg: float = 90.0) -> Closedness:
+    """Look for what keeps a mesh from being closed.
+
+    Args:
+        mesh: Any; vertices without faces do not count. Vertices that lie in one place without
+            being one are a border.
+        fold_deg: Angle between the normals of neighbouring faces, above which it is folded
+            there. Faces without area have none.
+
+    Raises:
+        InputError: A mesh without faces.
+    """
+    vertices, faces = mesh.vertices_world.detach().double(), mesh.faces
+    if len(faces) == 0:
+        raise InputError(
+            f"closedness: a mesh of {len(vertices)} vertices without faces; needed: a surface. "
+            "Look at what the mesh's file holds."
+        )
+    ends, index = face_edges(faces)
+    sharing = torch.bincount(index.flatten(), minlength=len(ends))
+    # A face runs along an edge upwards or downwards in number; its neighbour the other way.
+    upwards = (faces.roll(-2, dims=1) > faces.roll(-1, dims=1)).long() * 2 - 1
+    balance = torch.zeros_like(sharing).index_add(0, index.flatten(), upwards.flatten())
+    pairs, _ = face_pairs(faces)
+    normals = normalize(face_normals(vertices, faces), dim=1)
+    turn = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(dim=1)
+    border, loop = boundary_loops(faces)
+    steps = (vertices[border[:, 0]] - vertices[border[:, 1]]).norm(dim=1)
+    lengths = steps.new_zeros(int(loop.max()) + 1 if len(loop) else 0).index_add(0, loop, steps)
+    order = lengths.argsort(descending=True)
+    used = torch.unique(faces)
+    corners = vertices[used]
+    return Closedness(
+        loops=lengths[order],
+        edges=torch.bincount(loop, minlength=len(lengths))[order],
+        crowded=int((sharing > 2).sum()),
+        twisted=int(((sharing == 2) & (balance != 0)).sum()),
+        folds=int((turn < math.cos(math.radians(fold_deg))).sum()),
+        pieces=int(face_components(faces).max()) + 1,
+        euler=len(used) - len(ends) + len(faces),
+        diagonal=float((corners.amax(dim=0) - corners.amin(dim=0)).norm()),
+    )
