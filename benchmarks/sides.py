@@ -5,7 +5,8 @@
 RESULT is a folder that ``pimper reconstruct`` wrote, PHOTOS the photographs it was made of. The
 first side is the reference view, each further one the view that looks from furthest away from
 those before. What lies beyond a photograph's border is black. The surface is grey matte stuff
-under a lamp from the upper left: what looks like relief is relief.
+under a lamp from the upper left: what looks like relief is relief. Printed is whether the surface
+is closed, and what keeps it from that.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.io.estimates import read_estimate
+from pimper_torch.metrics.closedness import Closedness, closedness
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viz.render import bounding_box, crop, shade
 
@@ -48,6 +50,18 @@ def main() -> None:
         surface = drawn(found.mesh, crop(camera, low, high, options.width))
         columns.append(np.concatenate([np.asarray(picture), surface]))
     Image.fromarray(np.concatenate(columns, axis=1)).save(options.out, quality=85)
+    tell(closedness(found.mesh))
+
+
+def tell(skin: Closedness) -> None:
+    """Print what keeps a surface from being closed."""
+    state = "closed" if skin.closed else "open"
+    print(  # noqa: T201
+        f"{state}: {len(skin.loops)} openings, {skin.border_percent:.2f} % of the diagonal round "
+        f"(the longest {skin.edges[:5].tolist()} edges); {skin.crowded} edges of more than two "
+        f"faces, {skin.twisted} of two that disagree; {skin.folds} where it turns by more than a "
+        f"right angle; {skin.pieces} pieces, Euler characteristic {skin.euler}"
+    )
 
 
 def far_apart(

@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
+from pimper_torch.geometry.components import boundary_loops
 from pimper_torch.patches.warp import missing_share
 from pimper_torch.progress import listening
 from pimper_torch.records import (
@@ -175,7 +176,12 @@ def _(surface: Surface) -> dict[str, int | float]:
 
 @figures.register
 def _(mesh: Mesh) -> dict[str, int | float]:
-    return {"vertices": len(mesh.vertices_world), "faces": len(mesh.faces)}
+    _, loop = boundary_loops(mesh.faces)
+    return {
+        "vertices": len(mesh.vertices_world),
+        "faces": len(mesh.faces),
+        "openings": int(loop.max()) + 1 if len(loop) else 0,
+    }
 
 
 def _mean(values: Tensor) -> float:

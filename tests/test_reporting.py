@@ -47,7 +47,7 @@ def test_stages_are_reported_in_the_order_they_run_with_their_figures():
         chain.second()
         chain.first()
     assert [entry.name for entry in reports] == ["second", "first"]
-    assert reports[0].figures == {"vertices": 4, "faces": 4}
+    assert reports[0].figures == {"vertices": 4, "faces": 4, "openings": 0}
     assert all(entry.seconds >= 0 and entry.peak_memory_mb > 10 for entry in reports)
     assert listener.heard[:3] == ["started second", "1/1", "finished second"]
 

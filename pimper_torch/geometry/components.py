@@ -57,7 +57,8 @@ def boundary_loops(
 ) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, " edge"]]:
     """Follow the border of a surface: every opening, and every rim, is one loop.
 
-    Loops that touch in a vertex are two. An edge of three faces or more is border of them all.
+    Openings that meet in a vertex are one, as nothing holds the surface together there. An edge
+    of three faces or more is border of them all.
 
     Returns:
         The border's edges, and the loop each is part of, counted from 0.

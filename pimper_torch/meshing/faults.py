@@ -10,9 +10,9 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.components import graph_components
 from pimper_torch.geometry.surfaces import face_normals, face_pairs, side_lengths
 
-# Neighbouring faces turned further apart lie on each other. The sharpest rims of facets that
-# are right, such as those of thin bones, turn by about a right angle.
-_FOLD_DEG = 120.0
+# Neighbouring faces turned further apart lie on each other. Edges of a box, and the rims of thin
+# bones, turn by a right angle, give or take the noise of small faces.
+_FOLD_DEG = 110.0
 
 
 def stretched(

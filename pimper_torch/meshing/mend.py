@@ -35,27 +35,27 @@ def mend(
         vertices: World.
         faces: Of the surface. Edges without two of them are its border.
         broken: Marks faces, for vertices anywhere.
-        max_extent: Diagonal of a group's bounding box, as a share of that of all vertices.
+        max_extent: Diagonal of a group's bounding box, once it is placed, as a share of that of
+            all vertices.
 
     Returns:
         The vertices, and which of them were moved.
 
     Differentiable in the vertices that stay; which these are is a constant.
     """
-    before = vertices.detach()
-    border = _border(faces, len(vertices))
-    free = _corners(faces, broken(before), len(vertices))
-    free = free & ~_together(faces, free, border)
+    before, count = vertices.detach(), len(vertices)
+    held = _border(faces, count)
+    free = _corners(faces, broken(before), count)
+    free = _anchored(faces, free & ~_together(faces, free, held))
     for ring in range(_RINGS + 1):
-        free = _anchored(faces, small_groups(before, faces, free, max_extent))
-        if not bool(free.any()):
-            return vertices, free
         places = least_bent(before, faces, free)
-        still = _together(faces, free, _corners(faces, broken(places), len(vertices)))
+        held = held | (free & ~small_groups(places, faces, free, max_extent))
+        free = free & ~held
+        still = _together(faces, free, _corners(faces, broken(places), count))
         if not bool(still.any()):
             break
-        grown = _corners(faces, still[faces].any(dim=1), len(vertices)) & ~border
-        free = free & ~still if ring == _RINGS else free | grown
+        wider = _corners(faces, still[faces].any(dim=1), count) & ~held
+        free = free & ~still if ring == _RINGS else _anchored(faces, free | wider)
     return least_bent(vertices, faces, free), free
 
 

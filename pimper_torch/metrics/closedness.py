@@ -50,7 +50,10 @@ class Closedness(Record):
 
     @property
     def handles(self) -> int:
-        """How many handles the pieces have together; of a mesh with crowded edges, no telling."""
+        """How many handles the pieces have together.
+
+        No telling where edges are crowded, or pieces or openings meet in a vertex.
+        """
         return (2 * self.pieces - self.euler - len(self.loops)) // 2
 
 

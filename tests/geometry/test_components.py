@@ -1,6 +1,11 @@
 import torch
 
-from pimper_torch.geometry.components import face_components, vertex_components, vertex_fans
+from pimper_torch.geometry.components import (
+    boundary_loops,
+    face_components,
+    vertex_components,
+    vertex_fans,
+)
 
 
 def test_faces_that_share_only_a_vertex_do_not_hang_together():
@@ -38,3 +43,20 @@ def test_vertices_are_grouped_through_their_kind_only():
     label = vertex_components(faces, among).tolist()
     assert label[3] == label[4]
     assert len(set(label)) == 5
+
+
+def test_the_border_is_followed_loop_by_loop():
+    tube = torch.tensor([[a, b, 3 + a] for a, b in ((0, 1), (1, 2), (2, 0))])
+    tube = torch.cat([tube, torch.tensor([[1, 4, 3], [2, 5, 4], [0, 3, 5]])])
+    ends, loop = boundary_loops(tube)
+    rims = {frozenset(ends[loop == number].flatten().tolist()) for number in loop.unique()}
+    assert rims == {frozenset({0, 1, 2}), frozenset({3, 4, 5})}
+    assert len(ends) == 6
+    capped = torch.cat([tube, torch.tensor([[0, 2, 1], [3, 4, 5]])])
+    assert len(boundary_loops(capped)[0]) == 0
+
+
+def test_an_edge_of_three_faces_is_border_of_each():
+    ends, loop = boundary_loops(torch.tensor([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
+    assert len(ends) == 9
+    assert torch.bincount(loop).tolist() == [3, 3, 3]
