@@ -11,9 +11,9 @@ from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.components import face_components, vertex_fans
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.meshing.faults import Folds, overturned, stretched
-from pimper_torch.meshing.groups import small_groups
-from pimper_torch.meshing.mend import mend
+from pimper_torch.meshing.faults import faults, overturned, stretched
+from pimper_torch.meshing.groups import diagonal, small_groups
+from pimper_torch.meshing.mend import mend, surroundings
 from pimper_torch.records import Mesh, Surface
 
 
@@ -82,11 +82,16 @@ class Extract(nn.Module):
         supported = confidence > self.config.min_confidence
         if not bool((confidence > 0).any()):  # nowhere better than elsewhere
             supported = supported.new_ones(supported.shape)
-        filled = small_groups(vertices, surface.faces, ~supported, self.config.max_hole)
+        max_hole = self.config.max_hole * diagonal(vertices)
+        filled = small_groups(vertices, surface.faces, ~supported, max_hole)
         keep = (supported | filled)[surface.faces].all(dim=1)
         with_support = int(keep.sum())
-        surface, spikes = self._spikes(surface, keep)
-        faces = surface.faces[keep][~spikes]
+        faces = surface.faces[keep]
+        if self.config.max_mend > 0 and with_support:
+            surface, spikes = self._mended(surface, faces)
+        else:
+            spikes = self._spikes(surface)[keep]
+        faces = faces[~spikes]
         if len(faces) == 0:
             raise ReconstructionError(
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
@@ -106,38 +111,39 @@ class Extract(nn.Module):
             confidence=surface.confidence[source],
         )
 
-    def _spikes(
-        self, surface: Surface, keep: Bool[Tensor, " face"]
-    ) -> tuple[Surface, Bool[Tensor, " kept"]]:
-        """Mend what can be mended, and mark which of the faces kept cannot."""
-        config, faces = self.config, surface.faces
-        if config.max_mend == 0:
-            vertices = surface.vertices_world.detach()
-            spikes = stretched(vertices, faces, config.max_stretch)
-            if config.drop_overturned:
-                spikes = spikes | overturned(vertices, faces, surface.facet)
-            return surface, spikes[keep]
-        faces = faces[keep]
-        folds = Folds(faces, surface.facet)
+    def _spikes(self, surface: Surface) -> Bool[Tensor, " face"]:
+        vertices = surface.vertices_world.detach()
+        spikes = stretched(vertices, surface.faces, self.config.max_stretch)
+        if self.config.drop_overturned:
+            spikes = spikes | overturned(vertices, surface.faces, surface.facet)
+        return spikes
 
-        def broken(vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
-            long = stretched(vertices, faces, config.max_stretch)
-            return long | folds.at(vertices) if config.drop_overturned else long
-
-        vertices, moved = mend(surface.vertices_world, faces, broken, config.max_mend)
-        touched = torch.zeros_like(moved)
-        touched[faces[moved[faces].any(dim=1)].flatten()] = True
+    def _mended(
+        self, surface: Surface, faces: Int[Tensor, "face 3"]
+    ) -> tuple[Surface, Bool[Tensor, " face"]]:
+        """Mend what can be mended of some faces, and mark those that cannot."""
+        config, vertices = self.config, surface.vertices_world
+        before = vertices.detach()
+        found = faults(
+            before, faces, surface.facet, config.max_stretch, folds=config.drop_overturned
+        )
+        near = surroundings(faces, found.broken(before), len(vertices))
+        part, used = found.part(near)
+        farthest = config.max_mend * diagonal(before)
+        placed, moving = mend(vertices[used], part.faces, part.broken, farthest)
+        spikes = near.index_put((near,), part.worst(placed.detach()))
+        vertices = vertices.index_copy(0, used, placed)
+        moved = torch.zeros_like(surface.facet, dtype=torch.bool).index_put((used,), moving)
+        beside = torch.zeros_like(moved)
+        beside[faces[moved[faces].any(dim=1)].flatten()] = True
+        normals = torch.where(
+            beside[:, None], vertex_normals(vertices, faces), surface.normals_world
+        )
         mended = surface.replace(
             vertices_world=vertices,
-            normals_world=torch.where(
-                touched[:, None], vertex_normals(vertices, faces), surface.normals_world
-            ),
+            normals_world=normals,
             confidence=torch.where(moved, 0, surface.confidence),
         )
-        places = vertices.detach()
-        spikes = stretched(places, faces, config.max_stretch)
-        if config.drop_overturned:
-            spikes = spikes | (folds.at(places) & folds.overturned(places))
         return mended, spikes
 
 

@@ -1,6 +1,7 @@
 """Faces that no surface has: drawn out, turned over, folded."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,43 +36,104 @@ def overturned(
         faces: Of the surface.
         facet: Of each vertex; a face belongs to the facet that most of its vertices name.
     """
-    normals = face_normals(vertices, faces)
-    owner = facet[faces].mode(dim=1).values
-    total = normals.new_zeros(int(facet.max()) + 1, 3).index_add(0, owner, normals)
-    return (normals * total[owner]).sum(dim=-1) < 0
+    means = facet_means(vertices, faces, facet)
+    return (face_normals(vertices, faces) * means).sum(dim=-1) < 0
 
 
-class Folds:
-    """Where a surface lies on itself, however its vertices are moved.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Faults:
+    """What is broken of a surface, wherever its vertices are moved.
 
     Beside a fold a surface turns round within one edge; where it bends, however far in all, it
     takes several. An overturned face without a fold round its like is on a facet that bends far.
 
-    Args:
+    Attributes:
         faces: Of the surface.
-        facet: Of each vertex.
+        along: The way each was meant to look.
+        longest: Side that a face may have, scene units.
+        folds: Whether these are looked for.
+        pairs: Faces that share an edge.
     """
 
-    def __init__(self, faces: Int[Tensor, "face 3"], facet: Int[Tensor, " vertex"]) -> None:
-        self.faces, self.facet = faces, facet
-        self._pairs, _ = face_pairs(faces)
+    faces: Int[Tensor, "face 3"]
+    along: Float[Tensor, "face 3"]
+    longest: Float[Tensor, ""]
+    folds: bool
+    pairs: Int[Tensor, "pair 2"]
 
-    def at(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
-        """Mark the faces on both sides of a fold, and those overturned that it bounds."""
+    def broken(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        """Mark faces drawn out, on both sides of a fold, or overturned where a fold bounds them."""
+        drawn = self._drawn(vertices)
+        return drawn | self._folded(vertices) if self.folds else drawn
+
+    def worst(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        """Mark faces drawn out, or overturned where a fold bounds them."""
+        drawn = self._drawn(vertices)
+        return drawn | self._folded(vertices) & self._turned(vertices) if self.folds else drawn
+
+    def part(self, chosen: Bool[Tensor, " face"]) -> tuple["Faults", Int[Tensor, " used"]]:
+        """Look at some of the faces alone; their vertices, which have new numbers, come with it."""
+        used, corners = torch.unique(self.faces[chosen], return_inverse=True)
+        pairs, _ = face_pairs(corners)
+        along, longest = self.along[chosen], self.longest
+        part = Faults(faces=corners, along=along, longest=longest, folds=self.folds, pairs=pairs)
+        return part, used
+
+    def _drawn(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        return side_lengths(vertices[self.faces]).amax(dim=1) > self.longest
+
+    def _turned(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        return (face_normals(vertices, self.faces) * self.along).sum(dim=1) < 0
+
+    def _folded(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
         normals = normalize(face_normals(vertices, self.faces), dim=1)
-        one, other = self._pairs.unbind(dim=1)
-        folded = (normals[one] * normals[other]).sum(dim=1) < math.cos(math.radians(_FOLD_DEG))
-        beside = torch.zeros_like(normals[:, 0], dtype=torch.bool)
-        beside[self._pairs[folded].flatten()] = True
-        turned = self.overturned(vertices)
+        one, other = self.pairs.unbind(dim=1)
+        fold = (normals[one] * normals[other]).sum(dim=1) < math.cos(math.radians(_FOLD_DEG))
+        found = torch.zeros_like(normals[:, 0], dtype=torch.bool)
+        found[self.pairs[fold].flatten()] = True
+        turned = self._turned(vertices)
         (places,) = torch.nonzero(turned, as_tuple=True)
         rank = turned.cumsum(dim=0) - 1
-        group = graph_components(rank[self._pairs[turned[self._pairs].all(dim=1)]], len(places))
+        group = graph_components(rank[self.pairs[turned[self.pairs].all(dim=1)]], len(places))
         bounded = torch.zeros_like(places, dtype=torch.bool)
-        bounded[group[beside[places]]] = True
-        beside[places[bounded[group]]] = True
-        return beside
+        bounded[group[found[places]]] = True
+        found[places[bounded[group]]] = True
+        return found
 
-    def overturned(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
-        """Mark faces that look more than 90 degrees away from the mean of their facet."""
-        return overturned(vertices, self.faces, self.facet)
+
+def faults(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    facet: Int[Tensor, " vertex"],
+    max_stretch: float,
+    *,
+    folds: bool,
+) -> Faults:
+    """Learn from a surface as it is what to call broken.
+
+    Args:
+        vertices: World.
+        faces: Of the surface.
+        facet: Of each vertex. The mean of its faces says which way a face was meant to look.
+        max_stretch: Longest side, in multiples of the median.
+        folds: Whether these are looked for.
+    """
+    pairs, _ = face_pairs(faces)
+    return Faults(
+        faces=faces,
+        along=facet_means(vertices, faces, facet),
+        longest=max_stretch * side_lengths(vertices[faces]).median(),
+        folds=folds,
+        pairs=pairs,
+    )
+
+
+def facet_means(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    facet: Int[Tensor, " vertex"],
+) -> Float[Tensor, "face 3"]:
+    """Give each face the mean normal of its facet, by area, of any length."""
+    owner = facet[faces].mode(dim=1).values
+    normals = face_normals(vertices, faces)
+    return normals.new_zeros(int(facet.max()) + 1, 3).index_add(0, owner, normals)[owner]

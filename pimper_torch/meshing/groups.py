@@ -1,4 +1,4 @@
-"""Groups of vertices that hang together, and how far each extends."""
+"""Groups of vertices that hang together, and how far they extend."""
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -10,7 +10,7 @@ def small_groups(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     among: Bool[Tensor, " vertex"],
-    max_extent: float,
+    max_extent: Float[Tensor, ""],
 ) -> Bool[Tensor, " vertex"]:
     """Mark those of some vertices that lie in a small connected group of their kind.
 
@@ -18,7 +18,7 @@ def small_groups(
         vertices: World.
         faces: Of the surface.
         among: Grouped along edges.
-        max_extent: Diagonal of a group's bounding box, as a share of that of all vertices.
+        max_extent: Diagonal of a group's bounding box.
     """
     label = vertex_components(faces, among)
     count = int(label.max()) + 1 if len(label) else 0
@@ -26,6 +26,10 @@ def small_groups(
     like = vertices.new_zeros(count, 3)
     high = like.scatter_reduce(0, index, vertices, "amax", include_self=False)
     low = like.scatter_reduce(0, index, vertices, "amin", include_self=False)
-    whole = (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()
-    small = (high - low).norm(dim=-1) <= max_extent * whole
+    small = (high - low).norm(dim=-1) <= max_extent
     return among & small[label]
+
+
+def diagonal(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
+    """Measure the bounding box of some points."""
+    return (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()

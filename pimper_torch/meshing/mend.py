@@ -23,7 +23,7 @@ def mend(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     broken: Callable[[Float[Tensor, "vertex 3"]], Bool[Tensor, " face"]],
-    max_extent: float,
+    max_extent: Float[Tensor, ""],
 ) -> tuple[Float[Tensor, "vertex 3"], Bool[Tensor, " vertex"]]:
     """Move the vertices of broken faces that sound ones enclose, until none is broken.
 
@@ -35,8 +35,7 @@ def mend(
         vertices: World.
         faces: Of the surface. Edges without two of them are its border.
         broken: Marks faces, for vertices anywhere.
-        max_extent: Diagonal of a group's bounding box, once it is placed, as a share of that of
-            all vertices.
+        max_extent: Diagonal of a group's bounding box, once it is placed.
 
     Returns:
         The vertices, and which of them were moved.
@@ -57,6 +56,16 @@ def mend(
         wider = _corners(faces, still[faces].any(dim=1), count) & ~held
         free = free & ~still if ring == _RINGS else _anchored(faces, free | wider)
     return least_bent(vertices, faces, free), free
+
+
+def surroundings(
+    faces: Int[Tensor, "face 3"], broken: Bool[Tensor, " face"], num_vertices: int
+) -> Bool[Tensor, " face"]:
+    """Mark the faces round broken ones that :func:`mend` may look at: it needs no others."""
+    near = broken
+    for _ in range(_RINGS + 3):  # the plate is clamped by two rings, and one tells the border
+        near = _corners(faces, near, num_vertices)[faces].any(dim=1)
+    return near
 
 
 def least_bent(

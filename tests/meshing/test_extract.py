@@ -5,7 +5,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, ReconstructionError
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.meshing.groups import small_groups
+from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.records import Convergence, Surface
 
 SIDE = 21
@@ -73,10 +73,11 @@ def test_small_holes_stay_filled_and_large_ones_open():
 def test_unsupported_groups_are_measured_one_by_one():
     surface = sheet()
     supported = (columns(surface) + surface.vertices_world[:, 1]) % 4 != 0
-    marked = small_groups(surface.vertices_world, surface.faces, ~supported, 0.1)
+    whole = diagonal(surface.vertices_world)
+    marked = small_groups(surface.vertices_world, surface.faces, ~supported, 0.1 * whole)
     assert torch.equal(marked, ~supported)  # scattered singles, however far apart
     band = columns(surface) > 1
-    marked = small_groups(surface.vertices_world, surface.faces, ~band, 0.5)
+    marked = small_groups(surface.vertices_world, surface.faces, ~band, 0.5 * whole)
     assert not marked.any()
 
 

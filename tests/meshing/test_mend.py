@@ -8,8 +8,8 @@ from torch.testing import assert_close
 from pimper_torch.geometry.components import boundary_loops, vertex_components
 from pimper_torch.geometry.surfaces import boundary_vertices, face_edges, vertex_normals
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.meshing.faults import Folds, overturned
-from pimper_torch.meshing.mend import least_bent, mend
+from pimper_torch.meshing.faults import faults, overturned
+from pimper_torch.meshing.mend import least_bent, mend, surroundings
 from pimper_torch.metrics.closedness import closedness
 from pimper_torch.records import Convergence, Surface
 from pimper_torch.scenes.meshes import icosphere
@@ -110,6 +110,18 @@ def test_without_mending_exactly_the_overturned_faces_go():
     assert set(mesh.confidence.tolist()) == {1.0}
 
 
+def test_looking_only_round_the_folds_changes_nothing():
+    _, surface = folded_sphere()
+    vertices = surface.vertices_world
+    found = faults(vertices, surface.faces, surface.facet, 10.0, folds=True)
+    farthest = torch.tensor(0.1 * 2 * 3**0.5).double()
+    whole, moved = mend(vertices, surface.faces, found.broken, farthest)
+    assert moved.any()
+    near = surroundings(surface.faces, found.broken(vertices), len(vertices))
+    assert near.sum() < 0.7 * len(near)
+    assert_close(Extract()(surface).vertices_world, whole)
+
+
 def test_a_genuine_opening_stays_as_it_is():
     _, surface = folded_sphere()
     below = (surface.vertices_world[:, 2] > -0.3) & (surface.vertices_world[:, 0] > -0.9)
@@ -129,15 +141,17 @@ def test_a_genuine_opening_stays_as_it_is():
 
 def test_a_fold_at_the_border_goes_as_before():
     _, surface = folded_sphere()
-    fold = Folds(surface.faces, surface.facet).at(surface.vertices_world)
+    fold = faults(
+        surface.vertices_world, surface.faces, surface.facet, torch.inf, folds=True
+    ).broken(surface.vertices_world)
     through = torch.zeros_like(surface.facet, dtype=torch.bool)
     group = vertex_components(surface.faces[fold], torch.ones_like(through))
     dragged = (surface.vertices_world.norm(dim=1) - 1).abs() > 1e-3
     for label in torch.unique(group[dragged]).tolist():
         through[((group == label) & dragged).nonzero()[0]] = True
     cut = surface.replace(faces=surface.faces[~through[surface.faces].any(dim=1)])
-    folds = Folds(cut.faces, cut.facet)
-    gone = folds.at(cut.vertices_world) & folds.overturned(cut.vertices_world)
+    folds = faults(cut.vertices_world, cut.faces, cut.facet, torch.inf, folds=True)
+    gone = folds.worst(cut.vertices_world)
     assert gone.sum() > 6
     mesh = Extract()(cut)
     assert (mesh.confidence == 1).all()
@@ -227,7 +241,7 @@ def test_what_no_placing_heals_is_left_where_it_was():
     def never(places):
         return torch.arange(len(faces)) == 7
 
-    places, moved = mend(vertices, faces, never, 10.0)
+    places, moved = mend(vertices, faces, never, torch.tensor(10.0).double())
     assert torch.equal(places, vertices)
     assert not moved.any()
 
@@ -240,7 +254,7 @@ def test_a_piece_that_is_broken_all_over_is_left_where_it_was():
     def one_piece(places):
         return (torch.arange(len(faces)) < len(faces) // 2) & (places[0, 0] == both[0, 0])
 
-    places, moved = mend(both, faces, one_piece, 10.0)
+    places, moved = mend(both, faces, one_piece, torch.tensor(10.0).double())
     assert torch.equal(places, both)
     assert not moved.any()
 
@@ -255,6 +269,6 @@ def test_the_border_is_never_moved():
         marked[upper.eq(int(upper[0, 0])).any(dim=1).nonzero()[0]] = True
         return marked & ((places != surface.vertices_world).any(dim=1).sum() < 60)
 
-    places, moved = mend(surface.vertices_world, upper, growing, 10.0)
+    places, moved = mend(surface.vertices_world, upper, growing, torch.tensor(10.0).double())
     assert moved.sum() >= 60
     assert torch.equal(places[rim], surface.vertices_world[rim])
