@@ -56,12 +56,14 @@ class ExtractConfig:
 class Extract(nn.Module):
     """Keep what the photographs support, as one connected manifold mesh.
 
-    Faces without support and spikes go; of what remains, the large pieces stay, and where
-    two fans of faces touched in one vertex only, each gets its own copy. Orientation is the
-    coarse mesh's: counter-clockwise from outside.
+    Faces without support go. Spikes and folds inside of what remains are mended
+    (:mod:`~pimper_torch.meshing.mend`), so that a closed surface stays closed; those at its
+    border go. Of the rest the large pieces stay, and where two fans of faces touched in one
+    vertex only, each gets its own copy. Orientation is the coarse mesh's: counter-clockwise
+    from outside.
 
     Differentiable: what is kept is decided without gradient, and the kept vertices, normals,
-    albedo and confidence carry theirs.
+    albedo and confidence carry theirs; mended vertices carry that of the vertices round them.
     """
 
     def __init__(self, config: ExtractConfig | None = None) -> None:
