@@ -36,8 +36,9 @@ class BenchConfig:
             runs default, smoothed and global-stereo; full also paper, lim, pmvs, openmvs and
             colmap-dense.
         masks: Give the methods the true masks of the object; without, they see the table too.
-        cameras: found by structure from motion, once a scene and the same for all methods; or
-            the true ones with a true cloud.
+        cameras: found by structure from motion, once a scene and the same for all methods; by
+            its features alone (``reconstruct.track_rounds: 0``); or the true ones with a true
+            cloud.
         seed: Of scenes and samples.
         samples: On each surface, for distances between surfaces.
         processes: That render at the same time.
@@ -47,7 +48,7 @@ class BenchConfig:
     scenes: tuple[str, ...] = SCENES
     methods: tuple[str, ...] | None = None
     masks: bool = False
-    cameras: Literal["found", "true"] = "found"
+    cameras: Literal["found", "features", "true"] = "found"
     seed: int = 0
     samples: int = 50_000
     processes: int = 2

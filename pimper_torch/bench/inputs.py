@@ -13,7 +13,7 @@ from pimper_torch.metrics.evaluate import prepared_surface
 from pimper_torch.metrics.similarity import pair_views
 from pimper_torch.records import Capture, CoarseMesh, Record, SparseScene
 from pimper_torch.scenes.write import render_scene
-from pimper_torch.sfm.reconstruct import Reconstruct
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -63,7 +63,8 @@ def prepare(folder: Path, config: BenchConfig) -> Inputs:
     views = load_views(folder / "photos", masks=folder / "masks" if config.masks else None)
     model = folder / "truth" / "sparse" if config.cameras == "true" else None
     began = time.perf_counter()
-    scene = Reconstruct()(views, model)
+    settings = ReconstructConfig(track_rounds=0) if config.cameras == "features" else None
+    scene = Reconstruct(settings)(views, model)
     seconds = 0.0 if model else time.perf_counter() - began
     coarse = Triangulate()(scene)
     capture = read_rendered(folder, maps=False, photographs=False)

@@ -1,10 +1,11 @@
-"""The pinhole: points to pixels, pixels to rays."""
+"""The pinhole: points to pixels, pixels to rays, rays to points."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.geometry.frames import transform
+from pimper_torch.records import Cameras
 
 
 def project(
@@ -43,3 +44,24 @@ def rays_through(
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
     rays_cam = torch.linalg.solve(intrinsics, homogeneous.mT).mT
     return rays_cam @ cam_from_world[..., :3, :3]
+
+
+def triangulate_rays(
+    cameras: Cameras,
+    pixels: Float[Tensor, "point view 2"],
+    seen: Bool[Tensor, "point view"],
+) -> Float[Tensor, "point 3"]:
+    """Find the points nearest to their rays in the least-squares sense.
+
+    Args:
+        cameras: Of the views.
+        pixels: Where each view shows each point.
+        seen: True where it does; by two views each point, from two places.
+    """
+    rays = rays_through(pixels.movedim(0, 1), cameras.cam_from_world, cameras.intrinsics)
+    rays = (rays / rays.norm(dim=-1, keepdim=True)).movedim(0, 1)
+    across = torch.eye(3).to(rays) - rays[..., :, None] * rays[..., None, :]
+    across = across * seen[..., None, None]
+    matrix = across.sum(dim=1)
+    right = (across @ cameras.centers_world[..., None]).sum(dim=1)
+    return torch.linalg.solve(matrix, right)[..., 0]

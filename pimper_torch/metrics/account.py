@@ -184,6 +184,13 @@ def _camera_rows(cameras: CameraFigures) -> Iterator[Row]:
         value=f"{_number(cameras.mean_focal_percent)} %",
         meaning="mean of the absolute differences of the focal length",
     )
+    if not math.isnan(cameras.mean_place_percent):
+        yield Row(
+            name="places",
+            value=f"{cameras.mean_place_percent:.4f} %; {cameras.mean_bend_percent:.4f} %",
+            meaning="of the diagonal, that exact rays put points off: after the similarity on "
+            "cameras; after the best one",
+        )
 
 
 def _dtu_rows(dtu: DtuFigures) -> Iterator[Row]:

@@ -33,6 +33,9 @@ from pimper_torch.metrics.similarity import (
 )
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Record
 
+# Points of the true surface, about, that tell where cameras put things.
+_PLACES = 2000
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluateConfig:
@@ -191,12 +194,13 @@ def _cameras(estimate: Estimate, capture: Capture) -> CameraFigures | None:
     if pairs is None or pairs[0].num_views < 2:
         return None
     ours, truth = pairs
-    middle, diagonal = None, None
+    middle, diagonal, points = None, None, None
     if capture.truth.mesh is not None or capture.truth.points_world is not None:
         surface = true_surface(capture)
         corners = surface.vertices_world.double()
         middle = (corners.amin(dim=0) + corners.amax(dim=0)) / 2
         diagonal = bounding_diagonal(surface)
+        points = corners[:: max(1, len(corners) // _PLACES)]
     return compare_cameras(
         ours,
         truth,
@@ -204,4 +208,5 @@ def _cameras(estimate: Estimate, capture: Capture) -> CameraFigures | None:
         views=capture.views.num_views,
         middle=middle,
         diagonal=diagonal,
+        points_true=points,
     )

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.records import Cameras, SparseScene
 from pimper_torch.scenes.rendered import RenderedScene
 from pimper_torch.scenes.tracks import pinhole_lenses
@@ -74,21 +74,6 @@ def sparse_scene(
         observation_pixels=pixels[seen].to(dtype),
         lenses=pinhole_lenses(cameras),
     )
-
-
-def triangulate_rays(
-    cameras: Cameras,
-    pixels: Float[Tensor, "point view 2"],
-    seen: Bool[Tensor, "point view"],
-) -> Float[Tensor, "point 3"]:
-    """Find the points nearest to their rays in the least-squares sense."""
-    rays = rays_through(pixels.movedim(0, 1), cameras.cam_from_world, cameras.intrinsics)
-    rays = (rays / rays.norm(dim=-1, keepdim=True)).movedim(0, 1)
-    across = torch.eye(3).to(rays) - rays[..., :, None] * rays[..., None, :]
-    across = across * seen[..., None, None]
-    matrix = across.sum(dim=1)
-    right = (across @ cameras.centers_world[..., None]).sum(dim=1)
-    return torch.linalg.solve(matrix, right)[..., 0]
 
 
 def _pick(

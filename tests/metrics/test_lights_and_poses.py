@@ -84,3 +84,35 @@ def test_cameras_in_another_frame_and_half_the_size_are_right_after_alignment(ma
     assert found.mean_center < 1e-8
     assert found.mean_focal_percent < 1e-8
     assert found.mean_center_percent != found.mean_center_percent  # nobody told the middle
+
+
+def test_places_are_off_by_the_similarity_and_bend_only_where_cameras_differ(make, generator):
+    truth = make.cameras()
+    points = torch.rand(60, 3, generator=generator, dtype=torch.float64) - 0.5
+    shift = torch.eye(4).double()
+    shift[0, 3] = 0.02
+    found = compare_cameras(truth, truth, shift, views=5, diagonal=2.0, points_true=points)
+    assert found.mean_place_percent == pytest.approx(1.0)
+    assert found.mean_bend_percent < 1e-9
+    longer = truth.replace(
+        intrinsics=truth.intrinsics * truth.intrinsics.new_tensor([1.05, 1.05, 1])[:, None]
+    )
+    found = compare_cameras(longer, truth, IDENTITY, views=5, diagonal=2.0, points_true=points)
+    assert found.mean_bend_percent > 0.01
+    assert found.mean_place_percent > found.mean_bend_percent
+
+
+def test_places_of_resized_photographs_are_compared_in_their_own_pixels(make, generator):
+    truth = make.cameras()
+    points = torch.rand(60, 3, generator=generator, dtype=torch.float64) - 0.5
+    half = truth.replace(
+        intrinsics=truth.intrinsics * truth.intrinsics.new_tensor([0.5, 0.5, 1])[:, None],
+        sizes_px=truth.sizes_px // 2,
+    )
+    found = compare_cameras(half, truth, IDENTITY, views=5, diagonal=2.0, points_true=points)
+    assert found.mean_place_percent < 1e-9
+
+
+def test_nobody_knows_places_without_an_object(make):
+    found = compare_cameras(make.cameras(), make.cameras(), IDENTITY, views=5)
+    assert found.mean_place_percent != found.mean_place_percent

@@ -3,12 +3,12 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.projection import project, triangulate_rays
 from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.noise import random_speckle
 from pimper_torch.scenes.render import render_shape
 from pimper_torch.scenes.shapes import Plane, Sphere
-from pimper_torch.scenes.sparse import sparse_scene, triangulate_rays
+from pimper_torch.scenes.sparse import sparse_scene
 
 
 def exact_cloud(*inputs, **settings):
