@@ -2,7 +2,9 @@
 
 Run as ``python benchmarks/sfm.py PHOTOS [PHOTOS ...]``; prints Markdown tables. With
 ``--reference MODEL``, a COLMAP model whose images have the photographs' names, each view's
-rotation is compared with the model's; a view more than 2 degrees off counts as wrong.
+rotation is compared with the model's; a view more than 2 degrees off counts as wrong. With
+``--truth FOLDER``, as ``pimper render`` writes it, focal lengths and the places of the object's
+points are compared: where exact rays put them, after the similarity on cameras and after the best.
 """
 
 import argparse
@@ -16,9 +18,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from pimper_torch.datasets import read_rendered
 from pimper_torch.errors import PimperError, PimperWarning
 from pimper_torch.io.photographs import load_views
-from pimper_torch.records import SparseScene, Views
+from pimper_torch.metrics.evaluate import camera_figures
+from pimper_torch.records import Capture, Estimate, Mesh, SparseScene, Views
 from pimper_torch.sfm.colmap import read_model
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 
@@ -43,6 +47,9 @@ COLUMNS = (
     "error px",
     "wrong views",
     "median rotation error °",
+    "focal %",
+    "places %",
+    "bend %",
     "wall s",
     "CPU s",
 )
@@ -76,10 +83,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("photos", nargs="+", type=Path, help="folders of photographs")
     parser.add_argument("--reference", type=Path, help="COLMAP model to compare poses with")
+    parser.add_argument("--truth", type=Path, help="folder of a rendered scene to compare with")
     parser.add_argument("--max-size", type=int, default=0, help="longest side in pixels")
     parser.add_argument("--only", nargs="*", default=[], help="parts of the variants' names")
     options = parser.parse_args()
     warnings.simplefilter("ignore", PimperWarning)
+    truth = None
+    if options.truth is not None:
+        truth = read_rendered(options.truth, maps=False, photographs=False)
     for folder in options.photos:
         views = load_views(folder, max_size_px=options.max_size)
         width, height = views.sizes_px.amax(dim=0).tolist()
@@ -88,7 +99,7 @@ def main() -> None:
         say("|---|" + "--:|" * (len(COLUMNS) - 1))
         for name, config in variants().items():
             if not options.only or any(part in name for part in options.only):
-                say(f"| {name} | {row(views, config, options.reference)} |")
+                say(f"| {name} | {row(views, config, options.reference, truth)} |")
 
 
 def say(line: str) -> None:
@@ -97,25 +108,36 @@ def say(line: str) -> None:
     sys.stdout.flush()
 
 
-def row(views: Views, config: ReconstructConfig, reference: Path | None) -> str:
+def row(
+    views: Views, config: ReconstructConfig, reference: Path | None, truth: Capture | None
+) -> str:
     """Run structure from motion once and give its figures as cells."""
     wall, processor = time.perf_counter(), cpu_seconds()
     try:
         scene = Reconstruct(config)(views)
-        cells = figures(scene, reference)
+        cells = figures(scene, reference, truth)
     except PimperError as error:
-        cells = [f"{type(error).__name__}: {str(error).split('.')[0]}", *[""] * 6]
+        cells = [f"{type(error).__name__}: {str(error).split('.')[0]}", *[""] * 9]
     wall, processor = time.perf_counter() - wall, cpu_seconds() - processor
     return " | ".join([*cells, f"{wall:.0f}", f"{processor:.0f}"])
 
 
-def figures(scene: SparseScene, reference: Path | None) -> list[str]:
-    """Count what was found, and compare poses with the reference if there is one."""
+def figures(scene: SparseScene, reference: Path | None, truth: Capture | None) -> list[str]:
+    """Count what was found, and compare cameras with the reference and the truth if any."""
     length = torch.bincount(scene.observation_point)
     wrong, median = "", ""
     if reference is not None:
         angles = rotation_errors_deg(scene, reference)
         wrong, median = str(int((angles > 2).sum())), f"{angles.median():.2f}"
+    against = ["", "", ""]
+    if truth is not None:
+        found = camera_figures(estimate_of(scene), truth)
+        if found is not None:
+            against = [
+                f"{found.mean_focal_percent:.2f}",
+                f"{found.mean_place_percent:.3f}",
+                f"{found.mean_bend_percent:.4f}",
+            ]
     return [
         f"{scene.views.num_views} of {scene.views.num_views + len(scene.unregistered)}",
         str(len(length)),
@@ -124,7 +146,16 @@ def figures(scene: SparseScene, reference: Path | None) -> list[str]:
         f"{scene.reprojection_errors_px.mean():.2f}",
         wrong,
         median,
+        *against,
     ]
+
+
+def estimate_of(scene: SparseScene) -> Estimate:
+    """Take the cloud for the surface: nothing but cameras is compared."""
+    cloud = Mesh(
+        vertices_world=scene.points_world.double(), faces=torch.zeros(0, 3, dtype=torch.long)
+    )
+    return Estimate(mesh=cloud, names=scene.views.names, cameras=scene.cameras)
 
 
 def rotation_errors_deg(scene: SparseScene, reference: Path) -> Tensor:

@@ -135,7 +135,7 @@ def evaluate(
         surface=surface.compare(moved, config.thresholds_percent) if surface else None,
         views=tuple(view for view in compared if view is not None),
         lights=_lights(estimate, capture, alignment.truth_from_world),
-        cameras=_cameras(estimate, capture),
+        cameras=camera_figures(estimate, capture),
         dtu=figures,
     )
 
@@ -189,7 +189,8 @@ def _lights(
     return compare_lights(lights[ours], truth[theirs], split_similarity(truth_from_world)[1])
 
 
-def _cameras(estimate: Estimate, capture: Capture) -> CameraFigures | None:
+def camera_figures(estimate: Estimate, capture: Capture) -> CameraFigures | None:
+    """Compare the cameras of the views that both have; ``None`` for fewer than two."""
     pairs = paired_cameras(estimate, capture)
     if pairs is None or pairs[0].num_views < 2:
         return None
