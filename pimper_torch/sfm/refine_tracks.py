@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
@@ -81,9 +82,9 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
 
 def _gray(views: Views) -> Views:
     """Keep what patches are compared by: one channel, saturated where one of three is."""
-    clipped = views.images.amax(dim=1, keepdim=True)
-    gray = views.images.mean(dim=1, keepdim=True)
-    return views.replace(images=torch.where(clipped >= 1, clipped, gray).detach().cpu())
+    clipped = views.images.detach().amax(dim=1, keepdim=True)
+    gray = views.images.detach().mean(dim=1, keepdim=True)
+    return views.replace(images=torch.where(clipped >= SATURATED, clipped, gray)).to("cpu")
 
 
 def _renewed(

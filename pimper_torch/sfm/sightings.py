@@ -27,6 +27,9 @@ from pimper_torch.sfm.tangents import Tangents, plane_homographies
 # Share of the median radiance below which the logarithm fades: darker is noise.
 _DARK = 0.02
 
+# Pixels from one to the next of those whose median is taken.
+_MEDIAN_STRIDE = 4
+
 _ITERATIONS = 10
 
 # Curvature of a template's match along its worst direction over that along its best, at least:
@@ -177,7 +180,9 @@ def _log_pictures(views: Views) -> Float[Tensor, "view 2 height width"]:
     if views.masks is not None:
         usable = usable & views.masks
     gray = torch.where(usable, views.images.mean(dim=1), 0).float()
-    floor = _DARK * gray[usable].median() if bool(usable.any()) else torch.ones(())
+    some = gray[:, ::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE]
+    some = some[some > 0]
+    floor = _DARK * some.median() if len(some) else torch.ones(())
     return torch.stack([(gray + floor.clamp_min(1e-6)).log(), (~usable).float()], dim=1)
 
 
