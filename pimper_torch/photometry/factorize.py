@@ -132,7 +132,7 @@ class FactorizeConfig:
     light_coupling: float = 0.0
     geometry_weight: float = 0.1
     loss: Literal["squares", "cauchy", "geman-mcclure"] = "cauchy"
-    loss_scale: float = 1.0
+    loss_scale: float = 2.385  # 95 % efficient on Gaussian noise
     shadows: bool = True
     min_views: int = 4
     min_light_variation: float = 0.02
