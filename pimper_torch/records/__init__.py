@@ -19,7 +19,14 @@ from pimper_torch.records.patches import (
 )
 from pimper_torch.records.reconstruction import Reconstruction, StageReport
 from pimper_torch.records.record import Record
-from pimper_torch.records.scene import CoarseMesh, FacetPoints, Lens, Mesh, SparseScene
+from pimper_torch.records.scene import (
+    CoarseMesh,
+    FacetPoints,
+    Lens,
+    Mesh,
+    SparseScene,
+    pairs_table,
+)
 from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
 from pimper_torch.records.views import Cameras, Views
 
@@ -53,4 +60,5 @@ __all__ = [
     "Templates",
     "Truth",
     "Views",
+    "pairs_table",
 ]

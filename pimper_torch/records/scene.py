@@ -58,14 +58,17 @@ class SparseScene(Record):
     @property
     def observed(self) -> Bool[Tensor, "point view"]:
         """True where a view sees a point."""
-        table = torch.zeros(
-            len(self.points_world),
-            self.cameras.num_views,
-            dtype=torch.bool,
-            device=self.points_world.device,
-        )
-        table[self.observation_point, self.observation_view] = True
-        return table
+        shape = len(self.points_world), self.cameras.num_views
+        return pairs_table(self.observation_point, self.observation_view, shape)
+
+
+def pairs_table(
+    point: Int[Tensor, " observation"], view: Int[Tensor, " observation"], shape: tuple[int, int]
+) -> Bool[Tensor, "point view"]:
+    """Mark the pairs of point and view that are observations."""
+    table = torch.zeros(shape, dtype=torch.bool, device=point.device)
+    table[point, view] = True
+    return table
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

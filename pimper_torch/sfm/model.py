@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.records import Lens, Record
+from pimper_torch.records import Lens, Record, pairs_table
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -42,9 +42,8 @@ class SparseModel(Record):
     @property
     def observed(self) -> Bool[Tensor, "point view"]:
         """True where a view sees a point."""
-        table = torch.zeros(len(self.points_world), self.num_views, dtype=torch.bool)
-        table[self.observation_point, self.observation_view] = True
-        return table
+        shape = len(self.points_world), self.num_views
+        return pairs_table(self.observation_point, self.observation_view, shape)
 
     def without(self, observations: Bool[Tensor, " observation"]) -> "SparseModel":
         """Leave observations out, and points that fewer than two views see then."""
@@ -69,8 +68,8 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
     new_view = torch.full((model.num_views,), -1)
     new_view[torch.tensor(chosen, dtype=torch.long)] = torch.arange(len(chosen))
     view = new_view[model.observation_view]
-    seen = torch.zeros(len(model.points_world), len(chosen), dtype=torch.bool)
-    seen[model.observation_point[view >= 0], view[view >= 0]] = True
+    shape = len(model.points_world), len(chosen)
+    seen = pairs_table(model.observation_point[view >= 0], view[view >= 0], shape)
     tied = seen.sum(dim=1) >= 2
     new_point = torch.cumsum(tied, dim=0) - 1
     kept = torch.nonzero((view >= 0) & tied[model.observation_point])[:, 0]

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.radiometry import SATURATED
-from pimper_torch.records import Cameras, Views
+from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
 from pimper_torch.sfm.model import SparseModel
@@ -96,8 +96,7 @@ def _renewed(
     point, view = found.point[kept], found.view[kept]
     pixels = _photographed(found.pixels[kept], view, cameras, model)
     poor = torch.bincount(view, minlength=model.num_views) < fewest_points
-    seen = torch.zeros(len(often), model.num_views, dtype=torch.bool)
-    seen[point, view] = True
+    seen = pairs_table(point, view, (len(often), model.num_views))
     theirs = model.observation_point, model.observation_view
     feature = (~often[theirs[0]] | poor[theirs[1]]) & ~seen[theirs]
     point = torch.cat([point, theirs[0][feature]])
