@@ -1,20 +1,27 @@
-"""What normals of a whole facet are off by: light is fitted facet by facet, and errs so.
+"""What evidence of a whole facet is off by: light is fitted facet by facet, and errs so.
 
 Normals know the fine detail, and positions the coarse shape. The mean difference of the two on
-every facet, blended between facets, is taken out of the normals.
+every facet, blended between facets, is taken out of the normals. Swept heights are found in the
+same light: what they are off by in the mean is not taken out, but told.
 
 Source: Nehab, Rusinkiewicz, Davis, Ramamoorthi: Efficiently combining positions and normals for
 precise 3D geometry, SIGGRAPH 2005, for the idea; facets in place of a smoothing kernel are ours.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.fusion.estimate import MEDIAN_SQUARE
+from pimper_torch.fusion.evidence import Common, Evidence
 from pimper_torch.geometry.lattice import Lattice
 from pimper_torch.records import Record
+
+# Of the squared length of a vector of two numbers of unit Gaussian noise.
+MEDIAN_OF_TILT = 2 * math.log(2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -30,6 +37,11 @@ class Drift(Record):
     tilt: Float[Tensor, "facet 3"]
     count: Float[Tensor, " facet"]
     known: Bool[Tensor, " facet"]
+
+    def common(self, lattice: Lattice) -> Common:
+        """Give the variance of a tilt, robustly, for normals that still have theirs."""
+        square = self.tilt[self.known].square().sum(dim=-1)
+        return Common(variance=square.median() / MEDIAN_OF_TILT, count=self.count[lattice.facet])
 
     def at(self, lattice: Lattice, facets: Int[Tensor, "facet 3"]) -> Float[Tensor, "vertex 3"]:
         """Blend the tilts over the lattice, continuous across facets."""
@@ -68,3 +80,30 @@ def drift(
     count = held.new_zeros(len(facets)).index_add(0, lattice.facet, held)
     summed = apart.new_zeros(len(facets), 3).index_add(0, lattice.facet, apart)
     return Drift(tilt=summed / count.clamp_min(1)[:, None], count=count, known=count > 0)
+
+
+def common_height(
+    found: Evidence,
+    heights: Float[Tensor, " vertex"],
+    facet: Int[Tensor, " vertex"],
+    held: Int[Tensor, " place"],
+) -> Common:
+    """Tell what swept heights of one facet are too high by together.
+
+    Args:
+        found: The heights; one equation has one unknown.
+        heights: Of the surface. The less part they had in it, the better it judges them.
+        facet: Of each vertex.
+        held: Facets where that surface is known otherwise; elsewhere it cannot judge.
+    """
+    vertex = found.unknowns[:, 0]
+    size = int(facet.max()) + 1
+    off = found.residual(heights).detach()
+    weight = found.information.to(off)
+    total = off.new_zeros(size).index_add(0, facet[vertex], weight)
+    mean = off.new_zeros(size).index_add(0, facet[vertex], weight * off)
+    judged = torch.zeros_like(total, dtype=torch.bool).index_fill(0, held, True) & (total > 0)
+    square = (mean[judged] / total[judged]).square()
+    count = torch.bincount(facet[vertex], minlength=size)[facet].to(off)
+    variance = square.median() / MEDIAN_SQUARE if len(square) > 0 else off.new_zeros(())
+    return Common(variance=variance, count=count)

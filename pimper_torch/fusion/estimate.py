@@ -29,7 +29,7 @@ _CAUCHY = 2.385
 _ACCURACY = 1e-8
 
 # Of the square of unit Gaussian noise.
-_MEDIAN_SQUARE = 0.4549
+MEDIAN_SQUARE = 0.4549
 
 # No source is more than twice too modest: where one kind is followed blindly its residuals
 # vanish, and would make it surer still.
@@ -110,7 +110,7 @@ def noise_factor(square: Float[Tensor, " equation"]) -> float:
     >>> abs(noise_factor(4 * noise.double().square()) - 4) < 0.2
     True
     """
-    return max(float(square.median()) / _MEDIAN_SQUARE, _LEAST_FACTOR)
+    return max(float(square.median()) / MEDIAN_SQUARE, _LEAST_FACTOR)
 
 
 def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:

@@ -21,6 +21,23 @@ _LEAST_FACING = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Common(Record):
+    """An error that neighbours make alike, as their light and albedo were found together.
+
+    It does not average out. Neighbours that have it agree with each other, and would outvote
+    what is right; ``count`` times its variance, added to that of each, makes all of them
+    together count for what they know.
+
+    Attributes:
+        variance: Of the error.
+        count: Of the neighbours that make it together, for each vertex.
+    """
+
+    variance: Float[Tensor, ""]
+    count: Float[Tensor, " vertex"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Evidence(Record):
     """Equations of one kind.
 
@@ -60,7 +77,7 @@ def slopes(
     directions: Float[Tensor, "vertex 3"],
     normals: Float[Tensor, "vertex 3"],
     variance: Float[Tensor, " vertex"],
-    shared: Float[Tensor, " vertex"] | None = None,
+    common: Common | None = None,
 ) -> Evidence:
     r"""Say that edges are at right angles to the normals at their ends.
 
@@ -73,14 +90,16 @@ def slopes(
         directions: ``d``, unit.
         normals: Unit, outward.
         variance: Of the normals, squared radians.
-        shared: Of what neighbours err by alike, times their number: added to the variance, it
-            makes all of them together count for what they know.
+        common: What neighbours' normals are turned by alike.
     """
     one, other = edges.unbind(dim=1)
     middle = normalize(normals[one] + normals[other], dim=-1)
     step = flat[other] - flat[one]
     own = (variance[one] + variance[other]) / 2
-    added = torch.zeros_like(own) if shared is None else (shared[one] + shared[other]) / 2
+    each, together = own, own
+    if common is not None:
+        each = own + common.variance
+        together = own + common.variance * (common.count[one] + common.count[other]) / 2
     leaning = torch.stack(
         [-(middle * directions[one]).sum(dim=-1), (middle * directions[other]).sum(dim=-1)], dim=1
     )
@@ -88,8 +107,8 @@ def slopes(
         unknowns=edges,
         coefficients=leaning,
         targets=-(middle * step).sum(dim=-1),
-        information=1 / ((own + added) * step.square().sum(dim=-1)),
-        correlated=(own + added) / own,
+        information=1 / (together * step.square().sum(dim=-1)),
+        correlated=together / each,
     )
 
 
@@ -124,6 +143,7 @@ def swept_heights(
     information: Float[Tensor, " vertex"],
     facing: Float[Tensor, " vertex"],
     correlated: float,
+    common: Common | None = None,
 ) -> Evidence:
     """Say where the sweep has the surface.
 
@@ -132,16 +152,22 @@ def swept_heights(
         offsets: Along its normals.
         information: Of the offsets, each vertex's own share; one without says nothing.
         facing: Cosine between normals and directions.
-        correlated: Vertices in a window, which have a common offset.
+        correlated: Vertices in a window, which have one offset.
+        common: What neighbours are too high by alike, in windows of their own.
     """
     known = ((information > 0) & (facing > _LEAST_FACING)).nonzero()[:, 0]
     steep = facing[known]
+    together = 1 / (information[known] * steep.square())
+    each = together / correlated
+    if common is not None:
+        each = each + common.variance
+        together = together + common.variance * common.count[known]
     return Evidence(
         unknowns=known[:, None],
         coefficients=torch.ones_like(steep)[:, None],
         targets=carried[known] + offsets[known] / steep,
-        information=information[known] * steep.square(),
-        correlated=torch.full_like(steep, correlated),
+        information=1 / together,
+        correlated=together / each,
     )
 
 

@@ -9,9 +9,10 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
-from pimper_torch.fusion.drift import drift
+from pimper_torch.fusion.drift import MEDIAN_OF_TILT, common_height, drift
 from pimper_torch.fusion.estimate import Fused, fuse_evidence
 from pimper_torch.fusion.evidence import (
+    Common,
     Evidence,
     cloud_points,
     edges_of,
@@ -43,9 +44,6 @@ _REACH = 20.0
 # Between its vertices the surface is flat: points tell no more than this share of a spacing.
 _FINEST = 0.03
 
-# The squared length of a two-dimensional Gaussian vector has this median, in variances.
-_MEDIAN_OF_TILT = 2 * math.log(2)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FuseConfig:
@@ -57,8 +55,9 @@ class FuseConfig:
         slopes: Whether normals take part.
         heights: Whether swept heights do.
         points: Whether the cloud's points do.
-        drift_rounds: How often the tilt that all normals of a facet share is estimated, and
-            taken out of them; 0 trusts them at all wavelengths.
+        drift_rounds: How often the tilt that all normals of a facet share, and the height that
+            all swept heights of a facet are off by, are estimated, and the tilt taken out; 0
+            trusts both at all wavelengths.
         noise_rounds: Solves in which the noise of each kind of evidence is estimated and
             outliers lose weight, for each estimate of the tilt and after them.
         outlier_samples: How far, in samples, a patch may lie from the others before they
@@ -118,8 +117,9 @@ class Fuse(nn.Module):
     surface keeps the slopes it has. Each kind comes with the variances that its source claims;
     what these must be multiplied by is estimated from the residuals
     (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet err alike, as they were found
-    under one light: the tilt they share is estimated from the positions and taken out
-    (:mod:`~pimper_torch.fusion.drift`).
+    under one light: the tilt they share is estimated from the positions and taken out. So do
+    swept heights: what they are off by together is estimated from the other kinds, and they
+    count for no more than that lets them know (:mod:`~pimper_torch.fusion.drift`).
 
     The surface's normals are its own. Differentiable in what the templates carry, normals,
     albedo and swept offsets, through the last solve; its weights, the tilts, and the confidence
@@ -156,7 +156,7 @@ class Fuse(nn.Module):
             spacing=float(spacing.median()),
             correlated=swept.averaged / config.samples_per_vertex**2,
         )
-        fused, solves = self._solved(task, self._positions(task, swept))
+        fused, solves = self._solved(task, self._points(task, swept))
         heights = fused.heights.to(union.heights)
         vertices = lattice.points + heights[:, None] * directions
         moved = (heights - union.heights).detach()
@@ -175,33 +175,33 @@ class Fuse(nn.Module):
             ),
         )
 
-    def _positions(self, task: _Task, swept: SweptPatches) -> list[Evidence]:
-        """List what is known of places: heights and points."""
-        found = []
-        union, lattice = task.union, task.lattice
-        if self.config.heights:
-            facing = (task.shape * task.directions).sum(dim=-1).detach()
-            found.append(
-                swept_heights(
-                    union.heights, union.offsets, union.information, facing, task.correlated
-                )
-            )
-        cloud = swept.patches.coarse.points
-        if self.config.points and cloud is not None:
-            found.append(
-                cloud_points(
-                    cloud,
-                    task.places,
-                    lattice.faces,
-                    union.heights,
-                    task.directions,
-                    _REACH * task.spacing,
-                    _FINEST * task.spacing,
-                )
-            )
-        return found
+    def _heights(self, task: _Task, common: Common | None = None) -> list[Evidence]:
+        """List what the sweep knows."""
+        if not self.config.heights:
+            return []
+        union = task.union
+        facing = (task.shape * task.directions).sum(dim=-1).detach()
+        told = union.heights, union.offsets, union.information, facing
+        return [swept_heights(*told, task.correlated, common)]
 
-    def _solved(self, task: _Task, positions: list[Evidence]) -> tuple[Fused, int]:
+    def _points(self, task: _Task, swept: SweptPatches) -> list[Evidence]:
+        """List what the cloud knows."""
+        cloud = swept.patches.coarse.points
+        if not self.config.points or cloud is None:
+            return []
+        return [
+            cloud_points(
+                cloud,
+                task.places,
+                task.lattice.faces,
+                task.union.heights,
+                task.directions,
+                _REACH * task.spacing,
+                _FINEST * task.spacing,
+            )
+        ]
+
+    def _solved(self, task: _Task, points: list[Evidence]) -> tuple[Fused, int]:
         config, union = self.config, task.union
         variance = _variance(union.confidence)
         known = union.seen & (union.confidence > 0)
@@ -215,31 +215,49 @@ class Fuse(nn.Module):
         )
         hold = torch.full_like(union.heights, _HOLD / task.spacing**2)
 
-        def solve(found: Evidence) -> Fused:
+        def solve(
+            normals: Float[Tensor, "vertex 3"], positions: list[Evidence], common: Common | None
+        ) -> Fused:
+            found = slopes(straight, flat, along, normals, variance, common)
             kinds = [kept, *positions, found]
             return fuse_evidence(kinds, union.heights, hold, config.noise_rounds)
 
-        shape, normals, solves = task.shape, union.normals_world, config.noise_rounds
-        for _ in range(config.drift_rounds if positions and bool(both.any()) else 0):
-            with torch.no_grad():
+        normals, solves = union.normals_world, config.noise_rounds
+        heights = self._heights(task)
+        if config.drift_rounds == 0 or not bool(both.any()) or not (heights or points):
+            return solve(normals, [*points, *heights], None), solves
+        shape = task.shape
+        with torch.no_grad():
+            # Heights are judged by the others first, which they would draw along.
+            positions = points or heights
+            for _ in range(config.drift_rounds):
                 apart = drift(task.lattice, task.facets, normals, shape, known)
-                typical = apart.tilt.norm(dim=-1)[apart.known].square().median()
-                shared = typical / _MEDIAN_OF_TILT * apart.count[task.lattice.facet]
-                fused = solve(slopes(straight, flat, along, normals, variance, shared))
-                heights = fused.heights.to(flat)
-                shape = vertex_normals(flat + heights[:, None] * along, task.lattice.faces)
+                fused = solve(normals, positions, apart.common(task.lattice))
+                moved = fused.heights.to(flat)
+                shape = vertex_normals(flat + moved[:, None] * along, task.lattice.faces)
                 solves += config.noise_rounds
-        if solves > config.noise_rounds:
-            apart = drift(task.lattice, task.facets, normals, shape, known)
-            normals = normalize(normals + apart.at(task.lattice, task.facets), dim=-1)
-        return solve(slopes(straight, flat, along, normals, variance)), solves
+                if points and heights:
+                    positions = [*points, *self._judged(task, heights, points, fused)]
+        apart = drift(task.lattice, task.facets, normals, shape, known)
+        normals = normalize(normals + apart.at(task.lattice, task.facets), dim=-1)
+        left = drift(task.lattice, task.facets, normals, shape, known)
+        return solve(normals, positions, left.common(task.lattice)), solves
+
+    def _judged(
+        self, task: _Task, heights: list[Evidence], points: list[Evidence], fused: Fused
+    ) -> list[Evidence]:
+        """List what the sweep knows, knowing what its heights are off by together."""
+        facet = task.lattice.facet
+        held = facet[torch.cat([kind.unknowns[:, 0] for kind in points])]
+        common = common_height(heights[0], fused.heights, facet, held)
+        return self._heights(task, common)
 
     def _doubt(self, task: _Task, known: Bool[Tensor, " vertex"]) -> float:
         """Estimate the variance of the slopes that the surface has already, from the others."""
         if not bool(known.any()):
             return math.radians(HALF_CONFIDENCE_DEG) ** 2
         apart = (task.union.normals_world - task.shape)[known].detach().norm(dim=-1)
-        return max(float(apart.square().median()) / _MEDIAN_OF_TILT, 1e-6)
+        return max(float(apart.square().median()) / MEDIAN_OF_TILT, 1e-6)
 
 
 def carried_reliefs(swept: SweptPatches) -> DepthPatches:

@@ -4,6 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.fusion.evidence import (
+    Common,
     cloud_points,
     edges_of,
     kept_slopes,
@@ -62,9 +63,11 @@ def test_an_angles_error_moves_an_edges_end_by_its_length(lattice):
     found = slopes(edges, lattice.points, along, along, variance)
     length = (lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]]).norm(dim=1)
     assert_close(1 / found.information, 4e-4 * length.square())
-    shared = slopes(edges, lattice.points, along, along, variance, 3 * variance)
-    assert_close(shared.information, found.information / 4)
-    assert_close(shared.correlated, torch.full_like(length, 4.0))
+    common = Common(variance=variance[0] / 2, count=torch.full_like(variance, 6.0))
+    together = slopes(edges, lattice.points, along, along, variance, common)
+    assert_close(together.information, found.information / 4)
+    # Each edge errs by its own variance and the common one: 1.5 of the 4.
+    assert_close(together.correlated, torch.full_like(length, 4.0 / 1.5))
 
 
 def test_kept_slopes_are_those_of_the_surface_there_is(lattice, generator):
@@ -86,6 +89,20 @@ def test_offsets_along_slanting_normals_are_longer_along_the_direction():
     assert found.unknowns.flatten().tolist() == [0, 1]
     assert_close(found.targets, torch.tensor([1.1, 1.2], dtype=torch.float64))
     assert_close(found.information, torch.tensor([4.0, 1.0], dtype=torch.float64))
+
+
+def test_heights_that_err_alike_know_no_more_together_than_their_common_error_lets_them():
+    count = 1000
+    nothing = torch.zeros(count, dtype=torch.float64)
+    own = torch.full_like(nothing, 25.0)
+    common = Common(variance=torch.tensor(0.01).double(), count=torch.full_like(own, count))
+    alone = swept_heights(nothing, nothing, own, torch.ones_like(own), 4.0)
+    found = swept_heights(nothing, nothing, own, torch.ones_like(own), 4.0, common)
+    assert_close(alone.information.sum(), own.sum())
+    # The mean has the variance of the mean of what each has for itself, and the common one.
+    assert_close(1 / found.information.sum(), 1 / own.sum() + common.variance)
+    # One alone errs by what its window leaves of its own, and the common one.
+    assert_close(1 / (found.information * found.correlated), 1 / (4 * own) + common.variance)
 
 
 def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice, generator):

@@ -4,6 +4,7 @@ import torch
 from pimper_torch.coarse.adapt import Adapt
 from pimper_torch.errors import ConfigError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.records import FacetPoints
 from pimper_torch.sweep.sweep import Sweep
 
 
@@ -62,6 +63,32 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
     trusting = off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(tilted))
     assert kept.std() < 0.1
     assert kept.std() < 0.5 * trusting.std()
+
+
+def test_heights_that_err_alike_do_not_outvote_points(swept):
+    lifted, given = swept(0.5)
+    generator = torch.Generator().manual_seed(75)
+    xy = torch.tensor([0.5, 0.4]) * (torch.rand(24, 2, generator=generator) - 0.5)
+    xy, normal = xy.double(), lifted.normal
+    points = torch.cat([xy, -(xy @ normal[:2, None]) / normal[2]], dim=1)
+    spacing = float(given.patches.buckets[0].spacing[0])
+    noise = 0.1 * spacing * torch.randn(points.shape, generator=generator).double()
+    cloud = FacetPoints(
+        points_world=points + noise,
+        covariance_world=(0.1 * spacing) ** 2 * torch.eye(3).double().expand(24, 3, 3),
+        facet=(xy[:, 1] > xy[:, 0]).long(),
+    )
+    coarse = given.patches.coarse.replace(points=cloud)
+    known = given.photometric.replace(patches=given.patches.replace(coarse=coarse))
+    # A shading that is wrong all over moves what views seem to agree on all over.
+    wrong = tuple(b.replace(offset=b.offset + 1.5 * spacing) for b in given.buckets)
+    misled = given.replace(photometric=known, buckets=wrong)
+    off = off_plane(lifted, Fuse()(misled))
+    assert off.abs().quantile(0.9) < 0.1
+    assert off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(misled)).median() > 0.5
+    # Heights that are right still help: they know more than a few points.
+    off = off_plane(lifted, Fuse()(given.replace(photometric=known)))
+    assert off.abs().quantile(0.9) < 0.05
 
 
 def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
