@@ -240,8 +240,8 @@ class Fuse(nn.Module):
                     positions = [*points, *self._judged(task, heights, points, fused)]
         apart = drift(task.lattice, task.facets, normals, shape, known)
         normals = normalize(normals + apart.at(task.lattice, task.facets), dim=-1)
-        left = drift(task.lattice, task.facets, normals, shape, known)
-        return solve(normals, positions, left.common(task.lattice)), solves
+        # Untilted, they are trusted singly again: weaker ones would let points raise pimples.
+        return solve(normals, positions, None), solves
 
     def _judged(
         self, task: _Task, heights: list[Evidence], points: list[Evidence], fused: Fused
