@@ -3,6 +3,7 @@ import torch
 
 from pimper_torch.coarse.adapt import Adapt
 from pimper_torch.errors import ConfigError
+from pimper_torch.fusion.evidence import edges_of
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.records import FacetPoints
 from pimper_torch.sweep.sweep import Sweep
@@ -65,30 +66,57 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
     assert kept.std() < 0.5 * trusting.std()
 
 
-def test_heights_that_err_alike_do_not_outvote_points(swept):
-    lifted, given = swept(0.5)
+def with_points(given, points, claimed: float):
+    """Give the coarse mesh points of a cloud, each said to be so many scene units off."""
+    covariance = claimed**2 * torch.eye(3).double().expand(len(points), 3, 3)
+    facet = (points[:, 1] > points[:, 0]).long()
+    cloud = FacetPoints(points_world=points, covariance_world=covariance, facet=facet)
+    patches = given.patches
+    patches = patches.replace(coarse=patches.coarse.replace(points=cloud))
+    return given.replace(photometric=given.photometric.replace(patches=patches))
+
+
+def near_plane(lifted, noise: float, count: int = 24) -> torch.Tensor:
+    """Points so many scene units off the plane."""
     generator = torch.Generator().manual_seed(75)
-    xy = torch.tensor([0.5, 0.4]) * (torch.rand(24, 2, generator=generator) - 0.5)
+    xy = torch.tensor([0.5, 0.4]) * (torch.rand(count, 2, generator=generator) - 0.5)
     xy, normal = xy.double(), lifted.normal
     points = torch.cat([xy, -(xy @ normal[:2, None]) / normal[2]], dim=1)
+    return points + noise * torch.randn(points.shape, generator=generator).double()
+
+
+def test_heights_that_err_alike_do_not_outvote_points(swept):
+    lifted, given = swept(0.5)
     spacing = float(given.patches.buckets[0].spacing[0])
-    noise = 0.1 * spacing * torch.randn(points.shape, generator=generator).double()
-    cloud = FacetPoints(
-        points_world=points + noise,
-        covariance_world=(0.1 * spacing) ** 2 * torch.eye(3).double().expand(24, 3, 3),
-        facet=(xy[:, 1] > xy[:, 0]).long(),
-    )
-    coarse = given.patches.coarse.replace(points=cloud)
-    known = given.photometric.replace(patches=given.patches.replace(coarse=coarse))
+    known = with_points(given, near_plane(lifted, 0.1 * spacing), 0.1 * spacing)
     # A shading that is wrong all over moves what views seem to agree on all over.
     wrong = tuple(b.replace(offset=b.offset + 1.5 * spacing) for b in given.buckets)
-    misled = given.replace(photometric=known, buckets=wrong)
+    misled = known.replace(buckets=wrong)
     off = off_plane(lifted, Fuse()(misled))
     assert off.abs().quantile(0.9) < 0.1
     assert off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(misled)).median() > 0.5
     # Heights that are right still help: they know more than a few points.
-    off = off_plane(lifted, Fuse()(given.replace(photometric=known)))
-    assert off.abs().quantile(0.9) < 0.05
+    assert off_plane(lifted, Fuse()(known)).abs().quantile(0.9) < 0.05
+
+
+def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
+    lifted, given = swept(0.5)
+    spacing = float(given.patches.buckets[0].spacing[0])
+    # Facets tilted against each other: what cannot be blended must not cost the detail.
+    buckets = []
+    for found, templates in zip(given.photometric.buckets, given.patches.buckets, strict=True):
+        lean = 0.1 * (1 - 2 * templates.facet.double())[:, None, None]
+        wrong = found.normals_patch + torch.stack([lean, 0 * lean, 0 * lean], dim=-1)
+        buckets.append(found.replace(normals_patch=torch.nn.functional.normalize(wrong, dim=-1)))
+    tilted = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
+    points = near_plane(lifted, 0.3 * spacing, count=60)
+    surface = Fuse()(with_points(tilted, points, 0.02 * spacing))
+    off = off_plane(lifted, surface)
+    edges = edges_of(surface.faces)
+    edges = torch.cat([edges, edges.flip(1)])
+    around = torch.zeros_like(off).index_add(0, edges[:, 0], off[edges[:, 1]])
+    pimple = off - around / torch.bincount(edges[:, 0])
+    assert pimple.abs().max() < 0.1
 
 
 def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
