@@ -38,6 +38,7 @@ class Row(Record):
         median_normal_deg: The same.
         mean_shape_normal_deg: Error of the normals of the surface's own shape.
         median_shape_normal_deg: The same.
+        pitted_percent: Rays where these are far further off than around: pimples and pits.
         chamfer: Mean of accuracy and completeness of what three views or more see.
         accuracy: Mean distance from the surface to the truth.
         completeness: Mean distance from the truth to the surface.
@@ -63,6 +64,7 @@ class Row(Record):
     median_normal_deg: float | None = None
     mean_shape_normal_deg: float | None = None
     median_shape_normal_deg: float | None = None
+    pitted_percent: float | None = None
     chamfer: float | None = None
     accuracy: float | None = None
     completeness: float | None = None

@@ -205,6 +205,7 @@ def row_of(
         median_shape_normal_deg=(
             view.shape_normals.median_deg if view and view.shape_normals else None
         ),
+        pitted_percent=view.shape_normals.pitted_percent if view and view.shape_normals else None,
         chamfer=seen.chamfer_mean_percent if seen else None,
         accuracy=surface.accuracy.mean_percent if surface and surface.accuracy else None,
         completeness=surface.whole.completeness.mean_percent if surface and surface.whole else None,

@@ -55,6 +55,7 @@ _RAYS = (
         value=lambda row: row.median_shape_normal_deg,
         decimals=2,
     ),
+    Column(heading="pitted, %", value=lambda row: row.pitted_percent, decimals=2),
 )
 _SURFACE = (
     Column(heading="Chamfer, %", value=lambda row: row.chamfer, decimals=3),

@@ -128,11 +128,13 @@ def _view_rows(view: ViewFigures) -> Iterator[Row]:
         meaning=f"of {view.pixels} true pixels are met by the result",
     )
     for name, angles, meaning in (
-        ("shape_normals", view.shape_normals, "normals of the mesh's shape: mean; median"),
-        ("carried_normals", view.carried_normals, "normals the mesh carries: mean; median"),
+        ("shape_normals", view.shape_normals, "normals of the mesh's shape: mean; median; pitted"),
+        ("carried_normals", view.carried_normals, "normals the mesh carries: mean; median; pitted"),
     ):
         if angles is not None:
-            value = f"{angles.mean_deg:.2f}°; {angles.median_deg:.2f}°"
+            value = (
+                f"{angles.mean_deg:.2f}°; {angles.median_deg:.2f}°; {angles.pitted_percent:.2f} %"
+            )
             yield Row(name=name, value=value, meaning=meaning)
     if view.albedo is not None:
         yield Row(

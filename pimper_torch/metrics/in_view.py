@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -9,6 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import cast_view
+from pimper_torch.metrics.pits import pitted_percent
 from pimper_torch.metrics.reflectance import AlbedoFigures, compare_albedo
 from pimper_torch.metrics.relative import Meeting, angles_deg, meet_in_view, relative_error
 from pimper_torch.metrics.visible import joined
@@ -17,10 +19,17 @@ from pimper_torch.records import Capture, Mesh, Record
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AngleFigures(Record):
-    """Angles between normals over the rays that meet both, in degrees."""
+    """Angles between normals over the rays that meet both, in degrees.
+
+    Attributes:
+        mean_deg: Over the rays.
+        median_deg: Over the rays.
+        pitted_percent: See :func:`pimper_torch.metrics.pits.pitted_percent`.
+    """
 
     mean_deg: float
     median_deg: float
+    pitted_percent: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,4 +145,12 @@ def _angles(
     if not bool(known.any()):
         return None
     angles = angles_deg(normalize(ours[known], dim=1), normalize(truth[known], dim=1))
-    return AngleFigures(mean_deg=float(angles.mean()), median_deg=float(angles.median()))
+    where = met.both.clone()
+    where[met.both] = known
+    spread = torch.zeros(where.shape, dtype=angles.dtype, device=angles.device)
+    spread[where] = angles
+    return AngleFigures(
+        mean_deg=float(angles.mean()),
+        median_deg=float(angles.median()),
+        pitted_percent=pitted_percent(spread, where),
+    )

@@ -44,6 +44,7 @@ FULL = Row(
     median_normal_deg=1.75,
     mean_shape_normal_deg=3.5,
     median_shape_normal_deg=2.25,
+    pitted_percent=0.5,
     chamfer=0.125,
     accuracy=0.1,
     completeness=0.15,
@@ -87,7 +88,7 @@ def test_what_is_missing_is_a_dash_in_every_column():
     full, empty = cells(markdown(table(FULL, EMPTY)))
     assert set(full) == set(empty)
     figures = [name for name in empty if name not in ("scene", "method", "note")]
-    assert len(figures) == 18
+    assert len(figures) == 19
     assert all(empty[name] == MISSING for name in figures)
     assert not any(full[name] == MISSING for name in figures)
     assert empty["note"] == "not installed: pmvs2"
@@ -111,6 +112,7 @@ def test_every_figure_stands_in_its_own_column():
         "median, °": "1.75",
         "shape, °": "3.50",
         "shape median, °": "2.25",
+        "pitted, %": "0.50",
         "Chamfer, %": "0.125",
         "accuracy, %": "0.100",
         "complete, %": "0.140",
@@ -124,7 +126,7 @@ def test_markdown_lines_are_of_one_width_and_numbers_stand_to_the_right():
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert len({len(line) for line in lines}) == 1
     rule = lines[1].split("|")[1:-1]
-    assert [word.strip().endswith(":") for word in rule] == [False] * 2 + [True] * 18 + [False]
+    assert [word.strip().endswith(":") for word in rule] == [False] * 2 + [True] * 19 + [False]
     points = [line.index(".", line.index("mug")) for line in (lines[2], lines[4])]
     assert points[0] == points[1]  # decimal points of one column stand under one another
 
@@ -132,7 +134,7 @@ def test_markdown_lines_are_of_one_width_and_numbers_stand_to_the_right():
 def test_columns_that_no_row_fills_are_left_out():
     bare = FULL.replace(f_scores=(), chamfer=None, relative_error=math.nan)
     parts = columns([bare, EMPTY])
-    assert [len(part) for part in parts.values()] == [7, 5, 2]
+    assert [len(part) for part in parts.values()] == [7, 6, 2]
     headings = [column.heading for part in parts.values() for column in part]
     assert "Chamfer, %" not in headings
     assert "3D error, %" not in headings
