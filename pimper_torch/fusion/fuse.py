@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
+from pimper_torch.fusion.bands import coarse_part
 from pimper_torch.fusion.drift import MEDIAN_OF_TILT, common_height, drift
 from pimper_torch.fusion.estimate import Fused, fuse_evidence
 from pimper_torch.fusion.evidence import (
@@ -119,11 +120,13 @@ class Fuse(nn.Module):
     (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet err alike, as they were found
     under one light: the tilt they share is estimated from the positions and taken out. So do
     swept heights: what they are off by together is estimated from the other kinds, and they
-    count for no more than that lets them know (:mod:`~pimper_torch.fusion.drift`).
+    count for no more than that lets them know (:mod:`~pimper_torch.fusion.drift`). Detail is
+    that of normals trusted singly, the coarse shape that of normals known to err alike
+    (:mod:`~pimper_torch.fusion.bands`).
 
     The surface's normals are its own. Differentiable in what the templates carry, normals,
-    albedo and swept offsets, through the last solve; its weights, the tilts, and the confidence
-    are constants.
+    albedo and swept offsets, through the last solve; its weights, the tilts, the coarse
+    shape's difference, and the confidence are constants.
     """
 
     def __init__(self, config: FuseConfig | None = None) -> None:
@@ -240,8 +243,12 @@ class Fuse(nn.Module):
                     positions = [*points, *self._judged(task, heights, points, fused)]
         apart = drift(task.lattice, task.facets, normals, shape, known)
         normals = normalize(normals + apart.at(task.lattice, task.facets), dim=-1)
-        # Untilted, they are trusted singly again: weaker ones would let points raise pimples.
-        return solve(normals, positions, None), solves
+        fine = solve(normals, positions, None)
+        with torch.no_grad():
+            left = drift(task.lattice, task.facets, normals, shape, known)
+            coarse = solve(normals, positions, left.common(task.lattice))
+            shift = coarse_part(coarse.heights - fine.heights, task.lattice, task.facets)
+        return fine.replace(heights=fine.heights + shift), solves + config.noise_rounds
 
     def _judged(
         self, task: _Task, heights: list[Evidence], points: list[Evidence], fused: Fused
