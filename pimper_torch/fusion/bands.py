@@ -17,7 +17,7 @@ from pimper_torch.geometry.lattice import Lattice
 from pimper_torch.linalg.equations import normal_equations
 from pimper_torch.linalg.systems import solutions
 
-# Weight that a corner is held to zero by, where a vertex of the lattice has one: it decides
+# Weight that a corner is held to zero by, beside 1 for every vertex of the lattice: it decides
 # nothing.
 _HOLD = 1e-3
 
@@ -47,4 +47,4 @@ def coarse_part(
         right,
         what="the fusion's coarse shape",
     )
-    return (share * at[corner]).sum(dim=1).to(values)
+    return lattice.interpolate(at[:, None], facets)[:, 0].to(values)
