@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.fusion.bands import coarse_part
+from pimper_torch.fusion.continuation import continued
 from pimper_torch.fusion.drift import MEDIAN_OF_TILT, common_height, drift
 from pimper_torch.fusion.estimate import Fused, fuse_evidence
 from pimper_torch.fusion.evidence import (
@@ -124,9 +125,10 @@ class Fuse(nn.Module):
     that of normals trusted singly, the coarse shape that of normals known to err alike
     (:mod:`~pimper_torch.fusion.bands`).
 
-    The surface's normals are its own. Differentiable in what the templates carry, normals,
-    albedo and swept offsets, through the last solve; its weights, the tilts, the coarse
-    shape's difference, and the confidence are constants.
+    The surface's normals are its own; its albedo is continued over what no light tells
+    (:mod:`~pimper_torch.fusion.continuation`), without confidence. Differentiable in what the
+    templates carry, normals, albedo and swept offsets, through the last solve; its weights, the
+    tilts, the coarse shape's difference, and the confidence are constants.
     """
 
     def __init__(self, config: FuseConfig | None = None) -> None:
@@ -169,7 +171,7 @@ class Fuse(nn.Module):
             facet=lattice.facet,
             barycentric=lattice.barycentric,
             normals_world=vertex_normals(vertices, lattice.faces),
-            albedo=union.albedo,
+            albedo=continued(union.albedo, union.seen, lattice.faces),
             confidence=union.confidence,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=moved.device),

@@ -298,7 +298,7 @@ class Surface(Record):
         facet: A facet each vertex lies in; a shared vertex names one of its facets.
         barycentric: Where in that facet.
         normals_world: Unit, outward; photometric where valid, else of the mesh.
-        albedo: Linear, up to one scale.
+        albedo: Linear, up to one scale; continued from round about where no light tells it.
         confidence: In [0, 1]; 0 where no view determined the vertex.
         convergence: Of the refinement, one entry.
     """

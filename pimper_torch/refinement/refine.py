@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
+from pimper_torch.fusion.continuation import continued
 from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
@@ -119,7 +120,7 @@ class Refine(nn.Module):
             facet=lattice.facet,
             barycentric=lattice.barycentric,
             normals_world=_normals(union, vertices, lattice),
-            albedo=_filled_albedo(union, lattice),
+            albedo=continued(union.albedo, union.seen, lattice.faces),
             confidence=union.confidence,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=points.device),
@@ -186,15 +187,3 @@ def _normals(
     own = normalize(vertex_normals(vertices, lattice.faces), dim=-1)
     photometric = union.seen & (union.normals_world.detach().norm(dim=-1) > 0.5)
     return torch.where(photometric[:, None], union.normals_world, own)
-
-
-def _filled_albedo(union: Union, lattice: Lattice) -> Float[Tensor, "vertex channel"]:
-    """Give vertices without albedo their facet's mean, or the mean of all."""
-    count = int(lattice.facet.max()) + 1
-    known = union.seen.to(union.albedo)
-    total = known.new_zeros(count).index_add(0, lattice.facet, known)
-    summed = union.albedo.new_zeros(count, union.albedo.shape[1])
-    summed = summed.index_add(0, lattice.facet, union.albedo * known[:, None])
-    overall = summed.sum(dim=0) / total.sum().clamp_min(1)
-    mean = torch.where((total > 0)[:, None], summed / total.clamp_min(1)[:, None], overall)
-    return torch.where(union.seen[:, None], union.albedo, mean[lattice.facet])

@@ -138,6 +138,24 @@ def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
     assert (surface.confidence == 0).all()
 
 
+def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
+    _, given = swept(0.8)
+    buckets = []
+    for found in given.photometric.buckets:
+        valid = found.valid.clone()
+        middle = valid.shape[-1] // 2
+        valid[:, middle - 4 : middle + 4, middle - 4 : middle + 4] = False
+        dark = found.confidence * valid
+        buckets.append(found.replace(valid=valid, confidence=dark))
+    photometric = given.photometric.replace(buckets=tuple(buckets))
+    whole, holed = Fuse()(given), Fuse()(given.replace(photometric=photometric))
+    dark = holed.confidence == 0
+    assert dark.any()
+    off = (holed.albedo - whole.albedo)[dark].abs()
+    assert off.median() < 0.1 * whole.albedo.mean()
+    assert off.max() < 0.5 * whole.albedo.mean()
+
+
 def test_facets_that_views_see_stay_though_light_tells_nothing_of_them(swept):
     _, given = swept(0.8)
     surface = Fuse()(given)
