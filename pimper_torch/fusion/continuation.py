@@ -1,18 +1,20 @@
 r"""What is known of some vertices, continued onto the others.
 
-Values vary from vertex to vertex like a random walk about their mean, so that the most likely
-ones of the others minimize
+Values vary from vertex to vertex like a random walk, and are known, badly, from elsewhere, so
+that the most likely ones of the others minimize
 
-.. math:: \sum_{ab} |v_a - v_b|^2 / \tau^2 + \sum_u |v_u - \bar v|^2 / \sigma^2
+.. math:: \sum_{ab} |v_a - v_b|^2 + \sum_u h_u |v_u - w_u|^2
 
-over edges that end in one of them, and over them. Both variances are those of the known values.
+over edges that end in one of them, and over them; ``h`` is the variance of a step over that of
+what is known from elsewhere.
 """
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.geometry.components import vertex_components
+from pimper_torch.geometry.surfaces import boundary_vertices, face_edges
 from pimper_torch.linalg.systems import solutions
 
 # The mean counts as much as this share of a neighbour at least, so that every vertex has a value.
@@ -23,53 +25,88 @@ def continued(
     values: Float[Tensor, "vertex channel"],
     known: Bool[Tensor, " vertex"],
     faces: Int[Tensor, "face 3"],
+    otherwise: Float[Tensor, "vertex channel"],
+    hold: Float[Tensor, " vertex"],
 ) -> Float[Tensor, "vertex channel"]:
-    """Continue values from where they are known: smoothly near by, to their mean further away.
+    """Continue values smoothly from where they are known.
 
     Args:
         values: Of the vertices; anything where they are not known.
-        known: Where they are. If nowhere, ``values`` are returned.
+        known: Where they are.
         faces: Whose edges have neighbours for ends.
+        otherwise: What the others are taken for, far from what is known.
+        hold: How many neighbours that counts as, above 0.
 
-    Differentiable in the values that are known.
+    Differentiable in the values that are known, and in the others' ``otherwise``.
 
     >>> strip = torch.tensor([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
     >>> known = torch.tensor([True, True, False, True, True])
-    >>> continued(torch.tensor([[1.0], [1.0], [9.0], [1.0], [1.0]]), known, strip).flatten()
-    tensor([1., 1., 1., 1., 1.])
+    >>> values = torch.tensor([[1.0], [2.0], [9.0], [2.0], [3.0]])
+    >>> continued(values, known, strip, 0 * values, torch.full((5,), 1e-9))[2]
+    tensor([2.])
     """
     (unknown,) = torch.nonzero(~known, as_tuple=True)
-    if len(unknown) == 0 or len(unknown) == len(known):
+    if len(unknown) == 0:
         return values
-    edges, _ = face_edges(faces)
-    given = values[known].double()
-    mean, hold = given.mean(dim=0), _hold(values.detach().double(), known, edges)
     each = torch.arange(len(unknown), device=known.device)
     number = known.long().index_copy(0, unknown, each)
+    edges, _ = face_edges(faces)
     both = torch.cat([edges, edges.flip(1)])
     own, beside = both[~known[both[:, 0]]].unbind(dim=1)
     row, fixed = number[own], known[beside]
-    side = (hold * mean).expand(len(unknown), -1)
+    held = hold[unknown].double()
+    side = held[:, None] * otherwise[unknown].double()
     side = side.index_add(0, row[fixed], values[beside[fixed]].double())
-    around = torch.bincount(row, minlength=len(unknown)).to(side)
+    around = torch.bincount(row, minlength=len(unknown)).to(held)
     (found,) = solutions(
         torch.cat([each, row[~fixed]]),
         torch.cat([each, number[beside[~fixed]]]),
-        torch.cat([around + hold, around.new_full((int((~fixed).sum()),), -1.0)]),
+        torch.cat([around + held, around.new_full((int((~fixed).sum()),), -1.0)]),
         side,
         what="the continuation of what is known of some vertices",
     )
     return values.index_copy(0, unknown, found.to(values))
 
 
-def _hold(
+def about_mean(
     values: Float[Tensor, "vertex channel"],
     known: Bool[Tensor, " vertex"],
-    edges: Int[Tensor, "edge 2"],
-) -> float:
-    """Give the variance of a step over that of the values."""
-    one, other = values[edges[known[edges].all(dim=1)]].unbind(dim=1)
-    step = float((one - other).square().sum(dim=1).mean()) if len(one) else 0.0
+    faces: Int[Tensor, "face 3"],
+) -> Float[Tensor, "vertex channel"]:
+    """Continue values from where they are known; far from there, they are the mean of these.
+
+    Both variances are those of the known values. If none is known, ``values`` are returned.
+    """
+    if not bool(known.any()):
+        return values
     given = values[known]
-    spread = float((given - given.mean(dim=0)).square().sum(dim=1).mean())
-    return max(step / spread if spread > 0 else 0.0, _LEAST_HOLD)
+    mean = given.mean(dim=0)
+    spread = float((given - mean).detach().double().square().sum(dim=1).mean())
+    edges, _ = face_edges(faces)
+    one, other = values.detach().double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
+    step = float((one - other).square().sum(dim=1).mean()) if len(one) else 0.0
+    hold = max(step / spread if spread > 0 else 0.0, _LEAST_HOLD)
+    return continued(
+        values, known, faces, mean.expand_as(values), torch.full_like(values[:, 0], hold)
+    )
+
+
+def enclosed(
+    known: Bool[Tensor, " vertex"], faces: Int[Tensor, "face 3"]
+) -> Bool[Tensor, " vertex"]:
+    """Mark what known vertices enclose: groups of others that do not reach the border.
+
+    A group without any known vertex beside it is not enclosed.
+
+    >>> fan = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1]])
+    >>> enclosed(torch.tensor([False, True, True, True]), fan)
+    tensor([ True, False, False, False])
+    """
+    label = vertex_components(faces, ~known)
+    reaches = torch.zeros(len(known), dtype=torch.bool, device=known.device)
+    reaches[label[boundary_vertices(faces, len(known)) & ~known]] = True
+    corner = known[faces]
+    ends = faces[corner.any(dim=1)[:, None] & ~corner]
+    beside = torch.zeros_like(reaches)
+    beside[label[ends]] = True
+    return ~known & beside[label] & ~reaches[label]

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.fusion.bands import coarse_part
-from pimper_torch.fusion.continuation import continued
+from pimper_torch.fusion.continuation import about_mean, continued, enclosed
 from pimper_torch.fusion.drift import MEDIAN_OF_TILT, common_height, drift
 from pimper_torch.fusion.estimate import Fused, fuse_evidence
 from pimper_torch.fusion.evidence import (
@@ -42,6 +42,9 @@ _HOLD = 1e-4
 
 # Points of the cloud further off the surface than this, in its spacings, are not of it.
 _REACH = 20.0
+
+# Squared turn from vertex to vertex that even flat facets are said to have, radians.
+_LEAST_TURN = 1e-8
 
 # Between its vertices the surface is flat: points tell no more than this share of a spacing.
 _FINEST = 0.03
@@ -116,8 +119,9 @@ class Fuse(nn.Module):
     Unknown is the height of every lattice vertex along the coarse mesh's smoothed normal.
     Evidence is linear in it: edges are at right angles to photometric normals, the sweep knows
     heights, the cloud's points lie on the surface, and where no light tells anything the
-    surface keeps the slopes it has. Each kind comes with the variances that its source claims;
-    what these must be multiplied by is estimated from the residuals
+    surface keeps the slopes it has, or continues those of lit ground that encloses it
+    (:mod:`~pimper_torch.fusion.continuation`). Each kind comes with the variances that its source
+    claims; what these must be multiplied by is estimated from the residuals
     (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet err alike, as they were found
     under one light: the tilt they share is estimated from the positions and taken out. So do
     swept heights: what they are off by together is estimated from the other kinds, and they
@@ -125,10 +129,10 @@ class Fuse(nn.Module):
     that of normals trusted singly, the coarse shape that of normals known to err alike
     (:mod:`~pimper_torch.fusion.bands`).
 
-    The surface's normals are its own; its albedo is continued over what no light tells
-    (:mod:`~pimper_torch.fusion.continuation`), without confidence. Differentiable in what the
-    templates carry, normals, albedo and swept offsets, through the last solve; its weights, the
-    tilts, the coarse shape's difference, and the confidence are constants.
+    The surface's normals are its own; its albedo is continued over what no light tells,
+    without confidence. Differentiable in what the templates carry, normals, albedo and swept
+    offsets, through the last solve; its weights, the tilts, the coarse shape's difference, and
+    the confidence are constants.
     """
 
     def __init__(self, config: FuseConfig | None = None) -> None:
@@ -171,7 +175,7 @@ class Fuse(nn.Module):
             facet=lattice.facet,
             barycentric=lattice.barycentric,
             normals_world=vertex_normals(vertices, lattice.faces),
-            albedo=continued(union.albedo, union.seen, lattice.faces),
+            albedo=about_mean(union.albedo, union.seen, lattice.faces),
             confidence=union.confidence,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=moved.device),
@@ -215,16 +219,14 @@ class Fuse(nn.Module):
         both = known[task.edges].all(dim=1)
         straight = task.edges[both]
         flat, along = task.lattice.points, task.directions
-        kept = kept_slopes(
-            task.edges[~both], flat, along, task.shape, union.heights, self._doubt(task, known)
-        )
+        unlit = self._unlit(task, known)
         hold = torch.full_like(union.heights, _HOLD / task.spacing**2)
 
         def solve(
             normals: Float[Tensor, "vertex 3"], positions: list[Evidence], common: Common | None
         ) -> Fused:
             found = slopes(straight, flat, along, normals, variance, common)
-            kinds = [kept, *positions, found]
+            kinds = [*unlit, *positions, found]
             return fuse_evidence(kinds, union.heights, hold, config.noise_rounds)
 
         normals, solves = union.normals_world, config.noise_rounds
@@ -261,6 +263,29 @@ class Fuse(nn.Module):
         common = common_height(heights[0], fused.heights, facet, held)
         return self._heights(task, common)
 
+    def _unlit(self, task: _Task, known: Bool[Tensor, " vertex"]) -> list[Evidence]:
+        """List the slopes where light tells nothing; no residual tells their variances.
+
+        Where lit ground encloses it, its normals are continued: the shape there is what the
+        facets started with, since no round knew it. Elsewhere the shape is kept.
+        """
+        faces, flat, along = task.lattice.faces, task.lattice.points, task.directions
+        doubt, lit = self._doubt(task, known), known[task.edges].all(dim=1)
+        island = enclosed(known, faces)
+        normals = task.union.normals_world
+        if bool(island.any()):
+            # A facet's slopes are off alike: together they tell as much as one of them.
+            alike = torch.bincount(task.lattice.facet)[task.lattice.facet].to(task.shape)
+            hold = _turn(task.shape, task.edges[lit]) / (doubt * alike)
+            normals = normalize(continued(normals, ~island, faces, task.shape, hold), dim=-1)
+        over = island[task.edges].any(dim=1)
+        kept = kept_slopes(
+            task.edges[~lit & ~over], flat, along, task.shape, task.union.heights, doubt
+        )
+        variance = torch.full_like(task.union.heights, doubt)
+        across = slopes(task.edges[over], flat, along, normals, variance)
+        return [kept, across.replace(judged=False)]
+
     def _doubt(self, task: _Task, known: Bool[Tensor, " vertex"]) -> float:
         """Estimate the variance of the slopes that the surface has already, from the others."""
         if not bool(known.any()):
@@ -282,6 +307,13 @@ def carried_reliefs(swept: SweptPatches) -> DepthPatches:
             for templates in swept.patches.buckets
         ),
     )
+
+
+def _turn(normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]) -> float:
+    """Give the variance of the turn of normals along edges, robustly; squared radians."""
+    one, other = normals[edges].detach().unbind(dim=1)
+    median = (one - other).square().sum(dim=1).median() if len(edges) else 0.0
+    return max(float(median) / MEDIAN_OF_TILT, _LEAST_TURN)
 
 
 def _variance(confidence: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:

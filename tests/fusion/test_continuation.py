@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.fusion.continuation import continued
+from pimper_torch.fusion.continuation import about_mean, continued, enclosed
 from pimper_torch.geometry.lattice import subdivide
 
 WORLD = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
@@ -20,12 +20,44 @@ def ramp(points):
     return torch.stack([points[:, 0], 2 - points[:, 1]], dim=1)
 
 
+def test_the_walk_is_drawn_to_what_is_known_otherwise(square):
+    points, faces = square
+    known = points[:, 0] < 0.5
+    far = points[:, 0] > 0.9
+    near = ~known & (points[:, 0] < 0.55)
+    ones, none = torch.ones(len(points), 1).double(), torch.zeros(len(points), 1).double()
+
+    def drawn(by):
+        return continued(ones, known, faces, none, torch.full((len(points),), by).double())
+
+    assert drawn(1e-5)[~known].min() > 0.98
+    between = drawn(0.1)
+    assert between[near].min() > 0.5
+    assert between[far].max() < 0.5 * between[near].min()
+    tight = drawn(1e2)
+    assert tight[~known].max() < 0.1
+    assert torch.equal(tight[known], ones[known])
+
+
+def test_only_what_known_vertices_surround_is_enclosed(square):
+    points, faces = square
+    hole = (points[:, :2] - torch.tensor([0.3, 0.3])).norm(dim=1) < 0.15
+    bay = (points[:, :2] - torch.tensor([1.0, 0.7])).norm(dim=1) < 0.2
+    assert torch.equal(enclosed(~(hole | bay), faces), hole)
+    joined = hole | bay | ((points[:, 1] - 0.5 - 0.3 * (points[:, 0] - 0.6)).abs() < 0.3)
+    assert not enclosed(~joined, faces).any()
+    # Nothing encloses what is dark all over, not even a surface without border.
+    ball = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    assert not enclosed(torch.zeros(4, dtype=torch.bool), ball).any()
+    assert enclosed(torch.tensor([True, False, False, False]), ball).sum() == 3
+
+
 def test_an_island_takes_what_lies_round_it_and_the_rest_is_kept(square):
     points, faces = square
     truth = ramp(points)
     island = (points[:, :2] - 0.5).norm(dim=1) < 0.25
     given = torch.where(island[:, None], 100.0, truth)
-    found = continued(given, ~island, faces)
+    found = about_mean(given, ~island, faces)
     assert torch.equal(found[~island], truth[~island])
     assert (found - truth)[island].abs().max() < 0.02
     # The mean would be off by a quarter at the island's edge.
@@ -39,8 +71,8 @@ def test_what_varies_much_from_step_to_step_is_not_carried_far(square):
     noise = torch.randn(len(points), 1, generator=generator).double()
     steady = torch.where(known, 1 - points[:, 1], 0)[:, None]
     far = points[:, 0] > 0.95
-    of_noise = continued(noise, known, faces)[far] - noise[known].mean()
-    of_ramp = continued(steady, known, faces)[far] - steady[known].mean()
+    of_noise = about_mean(noise, known, faces)[far] - noise[known].mean()
+    of_ramp = about_mean(steady, known, faces)[far] - steady[known].mean()
     assert of_noise.abs().max() < 0.01 * noise[known].std()
     assert of_ramp.abs().max() > 0.2 * steady[known].std()
 
@@ -50,7 +82,7 @@ def test_parts_without_anything_known_take_the_mean(square):
     apart = torch.cat([faces, faces + len(points)])
     values = torch.cat([ramp(points), torch.full_like(ramp(points), 100.0)])
     known = torch.arange(2 * len(points)) < len(points)
-    found = continued(values, known, apart)
+    found = about_mean(values, known, apart)
     mean = ramp(points).mean(dim=0).expand(len(points), 2)
     assert_close(found[len(points) :], mean, atol=1e-6, rtol=0)
 
@@ -59,21 +91,21 @@ def test_parts_without_anything_known_take_the_mean(square):
 def test_with_everything_or_nothing_known_nothing_is_changed(square, everywhere):
     points, faces = square
     known = torch.full((len(points),), everywhere)
-    assert torch.equal(continued(ramp(points), known, faces), ramp(points))
+    assert torch.equal(about_mean(ramp(points), known, faces), ramp(points))
 
 
-def test_values_that_are_all_alike_are_continued(square):
+def test_values_that_are_all_alike_are_about_mean(square):
     points, faces = square
     known = points[:, 0] < 0.3
     alike = torch.where(known, 0.25, 7.0)[:, None].float()
-    assert_close(continued(alike, known, faces), torch.full_like(alike, 0.25))
+    assert_close(about_mean(alike, known, faces), torch.full_like(alike, 0.25))
 
 
 def test_gradients_are_those_of_what_is_known(square):
     points, faces = square
     known = (points[:, :2] - 0.5).norm(dim=1) > 0.25
     values = ramp(points).requires_grad_()
-    continued(values, known, faces)[~known].sum().backward()
+    about_mean(values, known, faces)[~known].sum().backward()
     assert (values.grad[~known] == 0).all()
     # Shares of those round it and of the mean: they add up to one for each unknown value.
     assert_close(values.grad.sum(), torch.tensor(2.0 * int((~known).sum())).double())

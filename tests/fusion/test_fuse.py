@@ -138,15 +138,19 @@ def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
     assert (surface.confidence == 0).all()
 
 
+def in_the_middle_of_each(found, spoiled):
+    """Make a square in the middle of every template dark, and something else of its relief."""
+    valid = found.valid.clone()
+    middle = valid.shape[-1] // 2
+    square = (slice(None), slice(middle - 4, middle + 4), slice(middle - 4, middle + 4))
+    valid[square] = False
+    spoiled(square)
+    return found.replace(valid=valid, confidence=found.confidence * valid)
+
+
 def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
     _, given = swept(0.8)
-    buckets = []
-    for found in given.photometric.buckets:
-        valid = found.valid.clone()
-        middle = valid.shape[-1] // 2
-        valid[:, middle - 4 : middle + 4, middle - 4 : middle + 4] = False
-        dark = found.confidence * valid
-        buckets.append(found.replace(valid=valid, confidence=dark))
+    buckets = [in_the_middle_of_each(b, lambda square: None) for b in given.photometric.buckets]
     photometric = given.photometric.replace(buckets=tuple(buckets))
     whole, holed = Fuse()(given), Fuse()(given.replace(photometric=photometric))
     dark = holed.confidence == 0
@@ -154,6 +158,29 @@ def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
     off = (holed.albedo - whole.albedo)[dark].abs()
     assert off.median() < 0.1 * whole.albedo.mean()
     assert off.max() < 0.5 * whole.albedo.mean()
+
+
+def test_a_dent_that_no_light_tells_of_is_bridged(swept):
+    lifted, given = swept(0.0)
+    spacing = float(given.patches.buckets[0].spacing[0])
+    templates, found, heights = [], [], []
+    buckets = zip(given.patches.buckets, given.photometric.buckets, given.buckets, strict=True)
+    for template, photometry, swept_there in buckets:
+        depth, told = template.depth.clone(), swept_there.information.clone()
+
+        def dent(square, depth=depth, told=told):
+            depth[square] += 5 * spacing
+            told[square] = 0
+
+        found.append(in_the_middle_of_each(photometry, dent))
+        templates.append(template.replace(depth=depth))
+        heights.append(swept_there.replace(information=told))
+    patches = given.patches.replace(buckets=tuple(templates))
+    photometric = given.photometric.replace(buckets=tuple(found), patches=patches)
+    dented = given.replace(photometric=photometric, buckets=tuple(heights))
+    surface = Fuse()(dented)
+    assert (surface.confidence == 0).any()
+    assert off_plane(lifted, surface).abs().max() < 0.5
 
 
 def test_facets_that_views_see_stay_though_light_tells_nothing_of_them(swept):
