@@ -43,6 +43,9 @@ _HOLD = 1e-4
 # Points of the cloud further off the surface than this, in its spacings, are not of it.
 _REACH = 20.0
 
+# A turn from vertex to vertex that is larger, in radians, is a fold's.
+_FOLD = 0.25
+
 # Squared turn from vertex to vertex that even flat facets are said to have, radians.
 _LEAST_TURN = 1e-8
 
@@ -310,10 +313,10 @@ def carried_reliefs(swept: SweptPatches) -> DepthPatches:
 
 
 def _turn(normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]) -> float:
-    """Give the variance of the turn of normals along edges, robustly; squared radians."""
+    """Give the mean squared turn of normals along edges, folds cut; squared radians."""
     one, other = normals[edges].detach().unbind(dim=1)
-    median = (one - other).square().sum(dim=1).median() if len(edges) else 0.0
-    return max(float(median) / MEDIAN_OF_TILT, _LEAST_TURN)
+    square = (one - other).square().sum(dim=1).clamp_max(_FOLD**2)
+    return max(float(square.mean()) if len(edges) else 0.0, _LEAST_TURN)
 
 
 def _variance(confidence: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
