@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.geometry.components import vertex_components
-from pimper_torch.geometry.surfaces import boundary_vertices, face_edges
+from pimper_torch.geometry.surfaces import boundary_vertices
 from pimper_torch.linalg.systems import solutions
 
 # The mean counts as much as this share of a neighbour at least, so that every vertex has a value.
@@ -24,7 +24,7 @@ _LEAST_HOLD = 1e-6
 def continued(
     values: Float[Tensor, "vertex channel"],
     known: Bool[Tensor, " vertex"],
-    faces: Int[Tensor, "face 3"],
+    edges: Int[Tensor, "edge 2"],
     otherwise: Float[Tensor, "vertex channel"],
     hold: Float[Tensor, " vertex"],
 ) -> Float[Tensor, "vertex channel"]:
@@ -33,16 +33,16 @@ def continued(
     Args:
         values: Of the vertices; anything where they are not known.
         known: Where they are.
-        faces: Whose edges have neighbours for ends.
+        edges: Between neighbours, each once.
         otherwise: What the others are taken for, far from what is known.
         hold: How many neighbours that counts as, above 0.
 
     Differentiable in the values that are known, and in the others' ``otherwise``.
 
-    >>> strip = torch.tensor([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
+    >>> chain = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4]])
     >>> known = torch.tensor([True, True, False, True, True])
     >>> values = torch.tensor([[1.0], [2.0], [9.0], [2.0], [3.0]])
-    >>> continued(values, known, strip, 0 * values, torch.full((5,), 1e-9))[2]
+    >>> continued(values, known, chain, 0 * values, torch.full((5,), 1e-9))[2]
     tensor([2.])
     """
     (unknown,) = torch.nonzero(~known, as_tuple=True)
@@ -50,7 +50,6 @@ def continued(
         return values
     each = torch.arange(len(unknown), device=known.device)
     number = known.long().index_copy(0, unknown, each)
-    edges, _ = face_edges(faces)
     both = torch.cat([edges, edges.flip(1)])
     own, beside = both[~known[both[:, 0]]].unbind(dim=1)
     row, fixed = number[own], known[beside]
@@ -71,7 +70,7 @@ def continued(
 def about_mean(
     values: Float[Tensor, "vertex channel"],
     known: Bool[Tensor, " vertex"],
-    faces: Int[Tensor, "face 3"],
+    edges: Int[Tensor, "edge 2"],
 ) -> Float[Tensor, "vertex channel"]:
     """Continue values from where they are known; far from there, they are the mean of these.
 
@@ -82,12 +81,11 @@ def about_mean(
     given = values[known]
     mean = given.mean(dim=0)
     spread = float((given - mean).detach().double().square().sum(dim=1).mean())
-    edges, _ = face_edges(faces)
     one, other = values.detach().double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
     step = float((one - other).square().sum(dim=1).mean()) if len(one) else 0.0
     hold = max(step / spread if spread > 0 else 0.0, _LEAST_HOLD)
     return continued(
-        values, known, faces, mean.expand_as(values), torch.full_like(values[:, 0], hold)
+        values, known, edges, mean.expand_as(values), torch.full_like(values[:, 0], hold)
     )
 
 

@@ -178,7 +178,7 @@ class Fuse(nn.Module):
             facet=lattice.facet,
             barycentric=lattice.barycentric,
             normals_world=vertex_normals(vertices, lattice.faces),
-            albedo=about_mean(union.albedo, union.seen, lattice.faces),
+            albedo=about_mean(union.albedo, union.seen, task.edges),
             confidence=union.confidence,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=moved.device),
@@ -272,15 +272,15 @@ class Fuse(nn.Module):
         Where lit ground encloses it, its normals are continued: the shape there is what the
         facets started with, since no round knew it. Elsewhere the shape is kept.
         """
-        faces, flat, along = task.lattice.faces, task.lattice.points, task.directions
+        flat, along = task.lattice.points, task.directions
         doubt, lit = self._doubt(task, known), known[task.edges].all(dim=1)
-        island = enclosed(known, faces)
+        island = enclosed(known, task.lattice.faces)
         normals = task.union.normals_world
         if bool(island.any()):
             # A facet's slopes are off alike: together they tell as much as one of them.
             alike = torch.bincount(task.lattice.facet)[task.lattice.facet].to(task.shape)
             hold = _turn(task.shape, task.edges[lit]) / (doubt * alike)
-            normals = normalize(continued(normals, ~island, faces, task.shape, hold), dim=-1)
+            normals = normalize(continued(normals, ~island, task.edges, task.shape, hold), dim=-1)
         over = island[task.edges].any(dim=1)
         kept = kept_slopes(
             task.edges[~lit & ~over], flat, along, task.shape, task.union.heights, doubt
