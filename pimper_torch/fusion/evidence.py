@@ -63,14 +63,6 @@ class Evidence(Record):
         return self.targets - (self.coefficients * heights[self.unknowns]).sum(dim=1)
 
 
-def edges_of(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
-    """List the edges of a mesh once each."""
-    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
-    count = int(faces.max()) + 1
-    key = torch.unique(ends[:, 0] * count + ends[:, 1])  # sorting rows takes twenty times as long
-    return torch.stack([key // count, key % count], dim=1)
-
-
 def slopes(
     edges: Int[Tensor, "edge 2"],
     flat: Float[Tensor, "vertex 3"],

@@ -17,14 +17,13 @@ from pimper_torch.fusion.evidence import (
     Common,
     Evidence,
     cloud_points,
-    edges_of,
     kept_slopes,
     slopes,
     swept_heights,
 )
 from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import face_edges, vertex_normals
 from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.records import (
     Convergence,
@@ -164,7 +163,7 @@ class Fuse(nn.Module):
             union=union,
             places=places,
             shape=vertex_normals(places, lattice.faces),
-            edges=edges_of(lattice.faces),
+            edges=face_edges(lattice.faces)[0],
             spacing=float(spacing.median()),
             correlated=swept.averaged / config.samples_per_vertex**2,
         )

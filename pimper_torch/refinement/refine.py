@@ -10,10 +10,9 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.fusion.continuation import about_mean
-from pimper_torch.fusion.evidence import edges_of
 from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import face_edges, vertex_normals
 from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull, trend_deviation
@@ -121,7 +120,7 @@ class Refine(nn.Module):
             facet=lattice.facet,
             barycentric=lattice.barycentric,
             normals_world=_normals(union, vertices, lattice),
-            albedo=about_mean(union.albedo, union.seen, edges_of(lattice.faces)),
+            albedo=about_mean(union.albedo, union.seen, face_edges(lattice.faces)[0]),
             confidence=union.confidence,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=points.device),

@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.fusion.continuation import about_mean, continued, enclosed
-from pimper_torch.fusion.evidence import edges_of
 from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.surfaces import face_edges
 
 WORLD = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
 
@@ -30,7 +30,7 @@ def test_the_walk_is_drawn_to_what_is_known_otherwise(square):
 
     def drawn(by):
         return continued(
-            ones, known, edges_of(faces), none, torch.full((len(points),), by).double()
+            ones, known, face_edges(faces)[0], none, torch.full((len(points),), by).double()
         )
 
     assert drawn(1e-5)[~known].min() > 0.98
@@ -60,7 +60,7 @@ def test_an_island_takes_what_lies_round_it_and_the_rest_is_kept(square):
     truth = ramp(points)
     island = (points[:, :2] - 0.5).norm(dim=1) < 0.25
     given = torch.where(island[:, None], 100.0, truth)
-    found = about_mean(given, ~island, edges_of(faces))
+    found = about_mean(given, ~island, face_edges(faces)[0])
     assert torch.equal(found[~island], truth[~island])
     assert (found - truth)[island].abs().max() < 0.02
     # The mean would be off by a quarter at the island's edge.
@@ -74,8 +74,8 @@ def test_what_varies_much_from_step_to_step_is_not_carried_far(square):
     noise = torch.randn(len(points), 1, generator=generator).double()
     steady = torch.where(known, 1 - points[:, 1], 0)[:, None]
     far = points[:, 0] > 0.95
-    of_noise = about_mean(noise, known, edges_of(faces))[far] - noise[known].mean()
-    of_ramp = about_mean(steady, known, edges_of(faces))[far] - steady[known].mean()
+    of_noise = about_mean(noise, known, face_edges(faces)[0])[far] - noise[known].mean()
+    of_ramp = about_mean(steady, known, face_edges(faces)[0])[far] - steady[known].mean()
     assert of_noise.abs().max() < 0.01 * noise[known].std()
     assert of_ramp.abs().max() > 0.2 * steady[known].std()
 
@@ -85,7 +85,7 @@ def test_parts_without_anything_known_take_the_mean(square):
     apart = torch.cat([faces, faces + len(points)])
     values = torch.cat([ramp(points), torch.full_like(ramp(points), 100.0)])
     known = torch.arange(2 * len(points)) < len(points)
-    found = about_mean(values, known, edges_of(apart))
+    found = about_mean(values, known, face_edges(apart)[0])
     mean = ramp(points).mean(dim=0).expand(len(points), 2)
     assert_close(found[len(points) :], mean, atol=1e-6, rtol=0)
 
@@ -94,21 +94,21 @@ def test_parts_without_anything_known_take_the_mean(square):
 def test_with_everything_or_nothing_known_nothing_is_changed(square, everywhere):
     points, faces = square
     known = torch.full((len(points),), everywhere)
-    assert torch.equal(about_mean(ramp(points), known, edges_of(faces)), ramp(points))
+    assert torch.equal(about_mean(ramp(points), known, face_edges(faces)[0]), ramp(points))
 
 
 def test_values_that_are_all_alike_are_continued(square):
     points, faces = square
     known = points[:, 0] < 0.3
     alike = torch.where(known, 0.25, 7.0)[:, None].float()
-    assert_close(about_mean(alike, known, edges_of(faces)), torch.full_like(alike, 0.25))
+    assert_close(about_mean(alike, known, face_edges(faces)[0]), torch.full_like(alike, 0.25))
 
 
 def test_gradients_are_those_of_what_is_known(square):
     points, faces = square
     known = (points[:, :2] - 0.5).norm(dim=1) > 0.25
     values = ramp(points).requires_grad_()
-    about_mean(values, known, edges_of(faces))[~known].sum().backward()
+    about_mean(values, known, face_edges(faces)[0])[~known].sum().backward()
     assert (values.grad[~known] == 0).all()
     # Shares of those round it and of the mean: they add up to one for each unknown value.
     assert_close(values.grad.sum(), torch.tensor(2.0 * int((~known).sum())).double())

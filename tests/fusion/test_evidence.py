@@ -6,12 +6,12 @@ from torch.testing import assert_close
 from pimper_torch.fusion.evidence import (
     Common,
     cloud_points,
-    edges_of,
     kept_slopes,
     slopes,
     swept_heights,
 )
 from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.records import FacetPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -38,7 +38,7 @@ def paraboloid(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_every_edge_is_listed_once(lattice):
-    edges = edges_of(lattice.faces)
+    edges = face_edges(lattice.faces)[0]
     assert len(torch.unique(edges, dim=0)) == len(edges)
     # Euler's formula for a disc.
     assert len(lattice.points) - len(edges) + len(lattice.faces) == 1
@@ -47,7 +47,7 @@ def test_every_edge_is_listed_once(lattice):
 def test_slopes_of_a_smooth_surface_are_met_by_it_and_by_no_other(lattice):
     height, normals = paraboloid(lattice.points)
     along = UP.expand(len(height), 3)
-    edges = edges_of(lattice.faces)
+    edges = face_edges(lattice.faces)[0]
     ones = torch.ones_like(height)
     found = slopes(edges, lattice.points, along, normalize(normals, dim=1), 1e-4 * ones)
     # The mean of unit normals is that of slopes to third order in the edge's length.
@@ -58,7 +58,7 @@ def test_slopes_of_a_smooth_surface_are_met_by_it_and_by_no_other(lattice):
 
 def test_an_angles_error_moves_an_edges_end_by_its_length(lattice):
     along = UP.expand(len(lattice.points), 3)
-    edges = edges_of(lattice.faces)
+    edges = face_edges(lattice.faces)[0]
     variance = torch.full_like(lattice.points[:, 0], 4e-4)
     found = slopes(edges, lattice.points, along, along, variance)
     length = (lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]]).norm(dim=1)
@@ -73,7 +73,7 @@ def test_an_angles_error_moves_an_edges_end_by_its_length(lattice):
 def test_kept_slopes_are_those_of_the_surface_there_is(lattice, generator):
     height = torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
     along = UP.expand(len(height), 3)
-    edges = edges_of(lattice.faces)
+    edges = face_edges(lattice.faces)[0]
     found = kept_slopes(edges, lattice.points, along, along, height, 0.01)
     assert_close(found.residual(height), torch.zeros(len(edges)).double())
     assert_close(found.residual(height + 3), torch.zeros(len(edges)).double(), rtol=0, atol=1e-12)

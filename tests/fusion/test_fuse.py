@@ -3,8 +3,8 @@ import torch
 
 from pimper_torch.coarse.adapt import Adapt
 from pimper_torch.errors import ConfigError
-from pimper_torch.fusion.evidence import edges_of
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.records import FacetPoints
 from pimper_torch.sweep.sweep import Sweep
 
@@ -112,7 +112,7 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
     points = near_plane(lifted, 0.3 * spacing, count=60)
     surface = Fuse()(with_points(tilted, points, 0.02 * spacing))
     off = off_plane(lifted, surface)
-    edges = edges_of(surface.faces)
+    edges = face_edges(surface.faces)[0]
     edges = torch.cat([edges, edges.flip(1)])
     around = torch.zeros_like(off).index_add(0, edges[:, 0], off[edges[:, 1]])
     pimple = off - around / torch.bincount(edges[:, 0])
