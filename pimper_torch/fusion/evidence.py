@@ -8,7 +8,7 @@ the variance that its source claims.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -18,6 +18,9 @@ from pimper_torch.records import FacetPoints, Record
 
 # A direction that leaves the surface at a flatter angle than this (cosine) tells no height.
 _LEAST_FACING = 0.2
+
+# Heights along a direction cannot follow normals that are further from it than this (cosine).
+_UPRIGHT = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -104,6 +107,20 @@ def slopes(
     )
 
 
+def upright(
+    edges: Int[Tensor, "edge 2"],
+    directions: Float[Tensor, "vertex 3"],
+    normals: Float[Tensor, "vertex 3"],
+) -> Bool[Tensor, " edge"]:
+    """Mark edges whose slope heights can follow.
+
+    Others lie across a contour or a fold as seen along the directions: raising both ends alike
+    would turn the edge. Constant.
+    """
+    middle = normalize(normals[edges].detach().sum(dim=1), dim=-1)
+    return ((middle[:, None] * directions[edges].detach()).sum(dim=-1) > _UPRIGHT).all(dim=1)
+
+
 def kept_slopes(
     edges: Int[Tensor, "edge 2"],
     flat: Float[Tensor, "vertex 3"],
@@ -125,6 +142,32 @@ def kept_slopes(
     found = slopes(edges, flat, directions, shape, torch.full_like(carried, variance))
     return found.replace(
         targets=(found.coefficients * carried[edges]).sum(dim=1),
+        judged=False,
+    )
+
+
+def kept_steps(
+    edges: Int[Tensor, "edge 2"],
+    flat: Float[Tensor, "vertex 3"],
+    carried: Float[Tensor, " vertex"],
+    variance: float,
+) -> Evidence:
+    """Say that heights go on differing as they do, where edges are not upright.
+
+    Args:
+        edges: Those.
+        flat: ``q``.
+        carried: Heights of the surface that there is.
+        variance: Of its slopes, squared radians.
+    """
+    one, other = edges.unbind(dim=1)
+    square = (flat[other] - flat[one]).square().sum(dim=-1)
+    return Evidence(
+        unknowns=edges,
+        coefficients=flat.new_tensor([-1.0, 1.0]).expand(len(edges), 2),
+        targets=carried[other] - carried[one],
+        information=1 / (variance * square),
+        correlated=torch.ones_like(square),
         judged=False,
     )
 

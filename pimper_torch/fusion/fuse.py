@@ -18,8 +18,10 @@ from pimper_torch.fusion.evidence import (
     Evidence,
     cloud_points,
     kept_slopes,
+    kept_steps,
     slopes,
     swept_heights,
+    upright,
 )
 from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide
@@ -120,15 +122,16 @@ class Fuse(nn.Module):
 
     Unknown is the height of every lattice vertex along the coarse mesh's smoothed normal.
     Evidence is linear in it: edges are at right angles to photometric normals, the sweep knows
-    heights, the cloud's points lie on the surface, and where no light tells anything the
-    surface keeps the slopes it has, or continues those of lit ground that encloses it
-    (:mod:`~pimper_torch.fusion.continuation`). Each kind comes with the variances that its source
-    claims; what these must be multiplied by is estimated from the residuals
-    (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet err alike, as they were found
-    under one light: the tilt they share is estimated from the positions and taken out. So do
-    swept heights: what they are off by together is estimated from the other kinds, and they
-    count for no more than that lets them know (:mod:`~pimper_torch.fusion.drift`). Detail is
-    that of normals trusted singly, the coarse shape that of normals known to err alike
+    heights, the cloud's points lie on the surface, and where no light tells anything the surface
+    keeps the slopes it has, or continues those of lit ground that encloses it
+    (:mod:`~pimper_torch.fusion.continuation`). Across contours and folds, as seen along the
+    directions, no normal can be followed, and heights go on differing as they do. Each kind comes
+    with the variances that its source claims; what these must be multiplied by is estimated from
+    the residuals (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet err alike, as they
+    were found under one light: the tilt they share is estimated from the positions and taken out.
+    So do swept heights: what they are off by together is estimated from the other kinds, and they
+    count for no more than that lets them know (:mod:`~pimper_torch.fusion.drift`). Detail is that
+    of normals trusted singly, the coarse shape that of normals known to err alike
     (:mod:`~pimper_torch.fusion.bands`).
 
     The surface's normals are its own; its albedo is continued over what no light tells,
@@ -218,10 +221,10 @@ class Fuse(nn.Module):
         known = union.seen & (union.confidence > 0)
         if not config.slopes:
             known = torch.zeros_like(known)
-        both = known[task.edges].all(dim=1)
-        straight = task.edges[both]
         flat, along = task.lattice.points, task.directions
-        unlit = self._unlit(task, known)
+        lit = known[task.edges].all(dim=1) & upright(task.edges, along, union.normals_world)
+        straight = task.edges[lit]
+        unlit = self._unlit(task, known, lit)
         hold = torch.full_like(union.heights, _HOLD / task.spacing**2)
 
         def solve(
@@ -233,7 +236,7 @@ class Fuse(nn.Module):
 
         normals, solves = union.normals_world, config.noise_rounds
         heights = self._heights(task)
-        if config.drift_rounds == 0 or not bool(both.any()) or not (heights or points):
+        if config.drift_rounds == 0 or not bool(lit.any()) or not (heights or points):
             return solve(normals, [*points, *heights], None), solves
         shape = task.shape
         with torch.no_grad():
@@ -265,28 +268,32 @@ class Fuse(nn.Module):
         common = common_height(heights[0], fused.heights, facet, held)
         return self._heights(task, common)
 
-    def _unlit(self, task: _Task, known: Bool[Tensor, " vertex"]) -> list[Evidence]:
+    def _unlit(
+        self, task: _Task, known: Bool[Tensor, " vertex"], lit: Bool[Tensor, " edge"]
+    ) -> list[Evidence]:
         """List the slopes where light tells nothing; no residual tells their variances.
 
         Where lit ground encloses it, its normals are continued: the shape there is what the
         facets started with, since no round knew it. Elsewhere the shape is kept.
         """
-        flat, along = task.lattice.points, task.directions
-        doubt, lit = self._doubt(task, known), known[task.edges].all(dim=1)
+        flat, along, edges = task.lattice.points, task.directions, task.edges
+        carried, doubt = task.union.heights, self._doubt(task, known)
         island = enclosed(known, task.lattice.faces)
         normals = task.union.normals_world
         if bool(island.any()):
             # A facet's slopes are off alike: together they tell as much as one of them.
             alike = torch.bincount(task.lattice.facet)[task.lattice.facet].to(task.shape)
-            hold = _turn(task.shape, task.edges[lit]) / (doubt * alike)
-            normals = normalize(continued(normals, ~island, task.edges, task.shape, hold), dim=-1)
-        over = island[task.edges].any(dim=1)
-        kept = kept_slopes(
-            task.edges[~lit & ~over], flat, along, task.shape, task.union.heights, doubt
-        )
-        variance = torch.full_like(task.union.heights, doubt)
-        across = slopes(task.edges[over], flat, along, normals, variance)
-        return [kept, across.replace(judged=False)]
+            hold = _turn(task.shape, edges[lit]) / (doubt * alike)
+            normals = normalize(continued(normals, ~island, edges, task.shape, hold), dim=-1)
+        over = island[edges].any(dim=1) & upright(edges, along, normals)
+        stays = ~lit & ~over
+        sloped = stays & upright(edges, along, task.shape)
+        variance = torch.full_like(carried, doubt)
+        return [
+            slopes(edges[over], flat, along, normals, variance).replace(judged=False),
+            kept_slopes(edges[sloped], flat, along, task.shape, carried, doubt),
+            kept_steps(edges[stays & ~sloped], flat, carried, doubt),
+        ]
 
     def _doubt(self, task: _Task, known: Bool[Tensor, " vertex"]) -> float:
         """Estimate the variance of the slopes that the surface has already, from the others."""

@@ -7,8 +7,10 @@ from pimper_torch.fusion.evidence import (
     Common,
     cloud_points,
     kept_slopes,
+    kept_steps,
     slopes,
     swept_heights,
+    upright,
 )
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import face_edges
@@ -35,13 +37,6 @@ def paraboloid(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     height = 0.3 * x - 0.1 * y + 0.2 * x * x + 0.15 * x * y - 0.1 * y * y
     slope = torch.stack([0.3 + 0.4 * x + 0.15 * y, -0.1 + 0.15 * x - 0.2 * y], dim=1)
     return height, torch.cat([-slope, torch.ones_like(slope[:, :1])], dim=1)
-
-
-def test_every_edge_is_listed_once(lattice):
-    edges = face_edges(lattice.faces)[0]
-    assert len(torch.unique(edges, dim=0)) == len(edges)
-    # Euler's formula for a disc.
-    assert len(lattice.points) - len(edges) + len(lattice.faces) == 1
 
 
 def test_slopes_of_a_smooth_surface_are_met_by_it_and_by_no_other(lattice):
@@ -77,6 +72,35 @@ def test_kept_slopes_are_those_of_the_surface_there_is(lattice, generator):
     found = kept_slopes(edges, lattice.points, along, along, height, 0.01)
     assert_close(found.residual(height), torch.zeros(len(edges)).double())
     assert_close(found.residual(height + 3), torch.zeros(len(edges)).double(), rtol=0, atol=1e-12)
+    assert not found.judged
+
+
+def test_edges_across_a_contour_are_not_upright(lattice):
+    edges = face_edges(lattice.faces)[0]
+    across = lattice.points[:, 0] - 0.45  # from the contour
+    along = UP.expand(len(across), 3)
+    lean = torch.stack([torch.ones_like(across), 0 * across, across], dim=1)
+    both = (lean[edges].sum(dim=1)[:, 2] > 0.25).numpy()  # clearly on this side of it
+    found = upright(edges, along, normalize(lean, dim=1)).numpy()
+    assert found[both].all()
+    assert not found[(across[edges] < 0).any(dim=1).numpy() & ~both].any()
+    # Neither do normals that face the other way altogether, nor directions that do at one end.
+    assert not upright(edges, along, -along).any()
+    turned = along.clone()
+    turned[0] = -UP
+    assert torch.equal(~upright(edges, turned, along), (edges == 0).any(dim=1))
+
+
+def test_kept_steps_are_those_of_the_surface_there_is(lattice, generator):
+    height = torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
+    edges = face_edges(lattice.faces)[0]
+    found = kept_steps(edges, lattice.points, height, 0.01)
+    assert_close(found.residual(height + 3), torch.zeros(len(edges)).double(), rtol=0, atol=1e-12)
+    assert found.residual(1.1 * height).abs().max() > 0.01
+    flat = kept_slopes(
+        edges, lattice.points, UP.expand(len(height), 3), UP.expand(len(height), 3), height, 0.01
+    )
+    assert_close(found.information, flat.information)
     assert not found.judged
 
 

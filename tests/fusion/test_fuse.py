@@ -66,6 +66,20 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
     assert kept.std() < 0.5 * trusting.std()
 
 
+def test_normals_that_face_away_raise_no_fold(swept):
+    lifted, given = swept(1.0)
+    buckets = []
+    for found in given.photometric.buckets:
+        normals = found.normals_patch.clone()
+        size = normals.shape[1] // 3
+        wrong = torch.tensor([0.8, 0.0, 0.6], dtype=torch.float64)
+        normals[:, size : 2 * size, size : 2 * size] = wrong
+        buckets.append(found.replace(normals_patch=normals))
+    photometric = given.photometric.replace(buckets=tuple(buckets))
+    surface = Fuse(FuseConfig(heights=False))(given.replace(photometric=photometric))
+    assert (off_plane(lifted, surface) - lifted.height).abs().max() < 1.0  # a fold: 10
+
+
 def with_points(given, points, claimed: float):
     """Give the coarse mesh points of a cloud, each said to be so many scene units off."""
     covariance = claimed**2 * torch.eye(3).double().expand(len(points), 3, 3)

@@ -6,6 +6,7 @@ from torch.testing import assert_close
 from pimper_torch.geometry.surfaces import (
     barycentric_2d,
     boundary_vertices,
+    face_edges,
     face_normals,
     face_pairs,
     normals_from_slopes,
@@ -105,6 +106,16 @@ def test_neighbours_agree_with_trimesh_on_a_closed_mesh():
 def test_an_edge_of_three_faces_joins_nobody():
     pairs, _ = face_pairs(torch.tensor([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
     assert len(pairs) == 0
+
+
+def test_every_edge_is_listed_once_and_lies_opposite_to_its_corners():
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    faces = torch.from_numpy(mesh.faces)
+    edges, opposite = face_edges(faces)
+    assert len(torch.unique(edges, dim=0)) == len(edges)
+    assert len(mesh.vertices) - len(edges) + len(faces) == 2  # Euler's formula for a sphere
+    everything = torch.cat([edges[opposite], faces[:, :, None]], dim=2)
+    assert (everything.sort().values == faces.sort().values[:, None]).all()
 
 
 def test_the_boundary_is_where_faces_have_no_neighbour():
