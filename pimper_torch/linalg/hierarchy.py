@@ -10,13 +10,12 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from pimper_torch.linalg.aggregation import prolongation
+from pimper_torch.linalg.aggregation import dominant_diagonal, prolongation
 
 Product = Callable[[Tensor], Tensor]
 
@@ -158,15 +157,6 @@ def _smooth(
     found = step if start is None else start + step
     found = torch.add(found, step, alpha=gain * radius / center)
     return found.addcmul_(level.inverse_diagonal, left, value=2 * gain / radius)
-
-
-def dominant_diagonal(matrix: csr_array) -> np.ndarray:
-    """Give a diagonal with which Jacobi's iteration has a spectrum within [0, 2].
-
-    It is the matrix's own wherever that is diagonally dominant.
-    """
-    diagonal: np.ndarray = matrix.diagonal()
-    return np.maximum(diagonal, abs(matrix).sum(axis=1) / 2)
 
 
 def _dense_inverse(matrix: csr_array) -> Float[Tensor, "unknown unknown"]:

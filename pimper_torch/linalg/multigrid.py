@@ -9,10 +9,10 @@ from scipy.sparse import coo_array, csr_array
 from torch import Tensor
 
 from pimper_torch.linalg.adjoint import solve_adjointly
+from pimper_torch.linalg.aggregation import dominant_diagonal
 from pimper_torch.linalg.hierarchy import (
     Hierarchy,
     Product,
-    dominant_diagonal,
     may_keep,
     sparse_product,
 )
