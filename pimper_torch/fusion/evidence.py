@@ -217,7 +217,10 @@ def cloud_points(
 ) -> Evidence:
     """Say that points of the cloud lie on the surface.
 
-    Each is tied to the face that it lies above or below along the nearest vertex's direction.
+    Each lifts the surface where it lies above or below it along the nearest vertex's direction,
+    and with it the vertex next to that place. To share it out among three vertices would be
+    right to a further order; but it would tie these a thousand times as strongly as slopes do,
+    by entries of the wrong sign for multigrid.
 
     Args:
         points: With covariances.
@@ -233,15 +236,15 @@ def cloud_points(
     line = directions[torch.as_tensor(nearest, device=faces.device)]
     hits, lift = _above_or_below(RayCaster(surface, faces), points.points_world.to(line), line)
     met = (hits.face >= 0) & (lift.abs() <= reach)
-    corners, share, line = faces[hits.face[met]], hits.barycentric[met].to(carried), line[met]
-    along = (share[..., None] * directions[corners]).sum(dim=1)
-    facing = (along * line).sum(dim=-1).clamp_min(_LEAST_FACING)
+    corners, share, line = faces[hits.face[met]], hits.barycentric[met], line[met]
+    vertex = corners.gather(1, share.argmax(dim=1, keepdim=True))
+    facing = (directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(_LEAST_FACING)
     covariance = points.covariance_world[met].to(line)
     variance = torch.einsum("pi,pij,pj->p", line, covariance, line)
     return Evidence(
-        unknowns=corners,
-        coefficients=share,
-        targets=(share * carried[corners]).sum(dim=1) + lift[met] / facing,
+        unknowns=vertex,
+        coefficients=torch.ones_like(facing)[:, None],
+        targets=carried[vertex[:, 0]] + lift[met] / facing,
         information=1 / variance.clamp_min(finest**2),
         correlated=torch.ones_like(variance),
     )

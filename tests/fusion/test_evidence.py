@@ -143,8 +143,25 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
         cloud, lattice.points, lattice.faces, carried, along, reach=1.0, finest=1e-9
     )
     assert len(found.targets) == 40
-    assert_close(found.coefficients.sum(dim=1), torch.ones(40).double())
+    assert found.unknowns.shape == (40, 1)
+    assert_close(found.coefficients, torch.ones(40, 1).double())
     assert_close(found.targets, lift[:, 0], rtol=0.02, atol=1e-4)
+    # At the vertex next to it: vertices are 0.1 apart.
+    off = (lattice.points[found.unknowns[:, 0], :2] - xy).norm(dim=1)
+    assert off.max() < 0.1
+    # On a surface that leans, what it is lifted by is what it is off by at the point.
+    leaning = lattice.points + (0.3 * lattice.points[:, :1]) * UP
+    raised = torch.cat([xy, 0.3 * xy[:, :1] + 0.02], dim=1)
+    above = cloud_points(
+        cloud.replace(points_world=raised),
+        leaning,
+        lattice.faces,
+        leaning[:, 2],
+        UP.expand_as(along),
+        reach=1.0,
+        finest=1e-9,
+    )
+    assert_close(above.targets - leaning[above.unknowns[:, 0], 2], torch.full((40,), 0.02).double())
     # Uncertain across, sure along: only what is across a slanting line blurs it.
     assert (1 / found.information < 0.05).all()
     assert (1 / found.information >= 1e-4).all()
