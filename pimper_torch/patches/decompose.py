@@ -25,8 +25,8 @@ class DecomposeConfig:
         samples_per_pixel: Template samples per pixel of the reference view; the paper's
             zeta, made independent of the scene's unit.
         overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
-        max_samples: In all facets times the views that may see them: where there would be more,
-            samples lie further apart. Bounds time and memory; infinite for no limit.
+        max_samples: Of all facets in all views that they face: where there would be more, samples
+            lie further apart. Bounds time and memory; infinite for no limit.
         bucket_samples: Samples of all templates that are batched together; bounds memory.
     """
 
@@ -81,9 +81,9 @@ class Decompose(nn.Module):
         corners = transform(patch_from_world, vertices[faces])[..., :2]
         density = self.config.samples_per_pixel * scale
         spacing = sample_spacing(vertices, cameras, coarse.reference, density)
-        area = face_normals(vertices, faces).norm(dim=-1).sum() / 2
-        most = self.config.max_samples / cameras.num_views
-        spacing = torch.maximum(spacing, (area / most).sqrt())
+        area = face_normals(vertices, faces).norm(dim=-1) / 2
+        warped = (area * views_facing(vertices, faces, cameras)).sum()
+        spacing = torch.maximum(spacing, (warped / self.config.max_samples).sqrt())
         enlarged = enlarge(corners, self.config.overlap_samples * spacing)
         # A sliver's enlarged corner runs far away; no patch needs more than twice the overlap.
         reach = 2 * self.config.overlap_samples * spacing
@@ -126,6 +126,17 @@ def sample_spacing(
     _, depth = project(vertices, cameras.cam_from_world[reference], intrinsics)
     focal = (intrinsics[0, 0] * intrinsics[1, 1]).sqrt()
     return depth.median() / focal / samples_per_pixel
+
+
+def views_facing(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], cameras: Cameras
+) -> Int[Tensor, " face"]:
+    """Count, for each facet, the views that it faces and that have its middle in their frame."""
+    middle, normals = vertices[faces].mean(dim=1), face_normals(vertices, faces)
+    pixels, depth = project(middle[None], cameras.cam_from_world, cameras.intrinsics)
+    towards = cameras.centers_world[:, None] - middle
+    framed = ((pixels >= 0) & (pixels <= cameras.sizes_px[:, None])).all(dim=-1) & (depth > 0)
+    return (framed & ((towards * normals).sum(dim=-1) > 0)).sum(dim=0)
 
 
 def enlarge(

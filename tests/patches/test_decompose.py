@@ -12,6 +12,7 @@ from pimper_torch.patches.decompose import (
     enlarge,
     facet_masks,
     group_by_size,
+    views_facing,
 )
 
 
@@ -167,3 +168,20 @@ def test_no_more_samples_are_laid_than_asked_for(plane_scene, plane_mesh):
     assert free > 3000
     assert abs(bound / 1000 - 1) < 0.05
     assert on_facets(max_samples=2.0 * free * views) == free
+
+
+def test_views_that_a_facet_turns_away_from_cost_no_samples(plane_scene, plane_mesh):
+    away = plane_mesh.mesh.faces.flip(1)
+    views = plane_scene.cameras.num_views
+    there = plane_mesh.mesh.vertices_world
+    both = torch.cat([plane_mesh.mesh.faces, away])
+    assert views_facing(there, both, plane_scene.cameras).tolist() == [views, views, 0, 0]
+    aside = there + there.new_tensor([50.0, 0.0, 0.0])  # in no frame
+    assert views_facing(aside, plane_mesh.mesh.faces, plane_scene.cameras).tolist() == [0, 0]
+
+    def spacing(faces: torch.Tensor) -> torch.Tensor:
+        mesh = plane_mesh.mesh.replace(faces=faces)
+        bound = Decompose(DecomposeConfig(max_samples=1000.0 * views))
+        return bound(plane_mesh.replace(mesh=mesh), plane_scene.cameras).buckets[0].spacing[0]
+
+    assert_close(spacing(both), spacing(plane_mesh.mesh.faces))
