@@ -30,7 +30,7 @@ from pimper_torch.refinement.refine import Refine, RefineConfig
 SETTINGS = {
     "decompose": {"overlap_samples": 6.0, "max_samples": float("inf")},
     "factorize": {"loss_scale": 2.0, "shadows": False},
-    "extract": {"max_hole": 0.2, "max_mend": 0.0, "min_piece": 1.0},
+    "extract": {"max_hole": 0.2, "overturned": "all", "min_piece": 1.0},
 }
 
 CASES: dict[str, tuple[AlignConfig | None, RefineConfig]] = {

@@ -15,6 +15,7 @@ from pimper_torch.config import build, find_config, overlay, read_mapping, requi
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
 from pimper_torch.meshing.extract import Extract, ExtractConfig
+from pimper_torch.meshing.mend import Mend, MendConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
@@ -78,6 +79,7 @@ class PimperConfig:
     refine: RefineConfig = field(default_factory=RefineConfig)
     sweep: SweepConfig = field(default_factory=SweepConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
+    mend: MendConfig = field(default_factory=MendConfig)
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
     adjust: AdjustConfig = field(default_factory=AdjustConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
@@ -113,6 +115,7 @@ class Pimper(nn.Module):
         self.refine: nn.Module = Refine(config.refine)
         self.sweep: nn.Module = Sweep(config.sweep)
         self.fuse: nn.Module = Fuse(config.fuse)
+        self.mend: nn.Module = Mend(config.mend)
         self.adapt: nn.Module = Adapt(config.adapt)
         self.adjust: nn.Module = Adjust(config.adjust)
         self.extract: nn.Module = Extract(config.extract)
@@ -173,7 +176,7 @@ class Pimper(nn.Module):
             if settings.bundle and number == max(1, len(settings.scales) - 1):
                 cameras = self.adjust(views, cameras, seen, photometric, scene.lenses).cameras
             swept = self.sweep(views, cameras, seen, photometric)
-            surface = self.fuse(swept)
+            surface = self.mend(self.fuse(swept))
         assert swept is not None  # there is a round at least
         assert surface is not None
         return cameras, swept, surface

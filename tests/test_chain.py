@@ -13,7 +13,15 @@ from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.metrics import compare_in_view, pair_views, similarity_between_cameras
 from pimper_torch.metrics.relative import ViewComparison, angles_deg
-from pimper_torch.records import Mesh, Reconstruction, SparseScene, Views
+from pimper_torch.records import (
+    CoarseMesh,
+    Mesh,
+    Reconstruction,
+    SparseScene,
+    Surface,
+    SweptPatches,
+    Views,
+)
 from pimper_torch.scenes import (
     RenderedScene,
     potato_on_table,
@@ -126,6 +134,54 @@ def test_one_light_for_all_views_is_told_and_geometry_delivered(preset):
     fine = height_over_sphere(result.mesh).square().mean().sqrt()
     assert result.mesh.vertices_world.isfinite().all()
     assert fine < 1.5 * coarse
+
+
+class Dragging(nn.Module):
+    """A fusion that drags the vertex nearest to the view's axis over its neighbours."""
+
+    def __init__(self, fuse: nn.Module) -> None:
+        super().__init__()
+        self.fuse = fuse
+        self.sound: list[Surface] = []
+
+    def forward(self, swept: SweptPatches) -> Surface:
+        surface: Surface = self.fuse(swept)
+        self.sound.append(surface)
+        vertices = surface.vertices_world.clone()
+        vertices[self.dragged(surface), 0] += 0.3
+        return surface.replace(vertices_world=vertices)
+
+    @staticmethod
+    def dragged(surface: Surface) -> int:
+        return int(surface.vertices_world[:, :2].norm(dim=1).argmin())
+
+
+class Spy(nn.Module):
+    """Keeps the surface that a stage is handed."""
+
+    def __init__(self, stage: nn.Module) -> None:
+        super().__init__()
+        self.stage = stage
+        self.surface: Surface | None = None
+
+    def forward(self, swept: SweptPatches, surface: Surface) -> CoarseMesh:
+        self.surface = surface
+        found: CoarseMesh = self.stage(swept, surface)
+        return found
+
+
+def test_a_fold_is_mended_before_a_round_or_the_mesh_builds_on_it():
+    scene = photographed(Sphere(), 165, target=(0.0, 0.0, 1.0))
+    pimper = pt.Pimper(pt.load_config("default", SMALL["default"]))
+    pimper.reconstruct = Given(sparse_scene(scene, 150, torch.Generator().manual_seed(17)))
+    pimper.fuse, pimper.adapt = Dragging(pimper.fuse), Spy(pimper.adapt)
+    result = pimper(scene.views)
+    last = pimper.fuse.sound[-1]
+    for sound, found in ((pimper.fuse.sound[0], pimper.adapt.surface), (last, result.mesh)):
+        place = sound.vertices_world[Dragging.dragged(sound)]
+        away = (found.vertices_world - place).norm(dim=1)
+        assert away.min() < 0.01
+        assert found.confidence[away.argmin()] == 0
 
 
 def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene) -> ViewComparison:

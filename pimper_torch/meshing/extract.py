@@ -1,6 +1,7 @@
 """Extraction: the joined surface in, one connected mesh out."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,10 +11,9 @@ from torch.nn.functional import normalize
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.components import face_components, vertex_fans
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.meshing.faults import faults, overturned, stretched
 from pimper_torch.meshing.groups import diagonal, small_groups
-from pimper_torch.meshing.mend import mend, surroundings
 from pimper_torch.records import Mesh, Surface
 
 
@@ -28,12 +28,9 @@ class ExtractConfig:
             of bounding boxes).
         max_stretch: Longest edge of a face, in multiples of the surface's median edge;
             longer ones are spikes or cliffs. Infinite keeps all.
-        drop_overturned: Leave out faces turned more than 90 degrees from the mean of
-            their facet.
-        max_mend: Spikes and folds that other faces enclose are mended in place of being left
-            out, when they extend over no more than this share of the surface's extent: their
-            vertices move to where the surface bends least, and lose their confidence. A face
-            then counts as overturned only where a fold bounds it. 0 leaves all out.
+        overturned: Which of the faces turned more than 90 degrees from the mean of their facet
+            are left out: those that a fold bounds, as the others are on facets that bend far;
+            all; or none.
         min_piece: Share of the largest connected piece's area that another one needs to be
             kept; 1 keeps the largest only.
     """
@@ -41,29 +38,25 @@ class ExtractConfig:
     min_confidence: float = 0.0
     max_hole: float = 1.0
     max_stretch: float = 10.0
-    drop_overturned: bool = True
-    max_mend: float = 0.1
+    overturned: Literal["folded", "all", "none"] = "folded"
     min_piece: float = 0.01
 
     def __post_init__(self) -> None:
         require(0 <= self.min_confidence < 1, "min_confidence", self.min_confidence, "in [0, 1)")
         require(self.max_hole >= 0, "max_hole", self.max_hole, "0 or more")
         require(self.max_stretch > 1, "max_stretch", self.max_stretch, "above 1")
-        require(self.max_mend >= 0, "max_mend", self.max_mend, "0 or more")
         require(0 <= self.min_piece <= 1, "min_piece", self.min_piece, "in [0, 1]")
 
 
 class Extract(nn.Module):
     """Keep what the photographs support, as one connected manifold mesh.
 
-    Faces without support go. Spikes and folds inside of what remains are mended
-    (:mod:`~pimper_torch.meshing.mend`), so that a closed surface stays closed; those at its
-    border go. Of the rest the large pieces stay, and where two fans of faces touched in one
-    vertex only, each gets its own copy. Orientation is the coarse mesh's: counter-clockwise
-    from outside.
+    Faces without support go, and so do spikes and faces turned over. Of the rest the large
+    pieces stay, and where two fans of faces touched in one vertex only, each gets its own copy.
+    Orientation is the coarse mesh's: counter-clockwise from outside.
 
     Differentiable: what is kept is decided without gradient, and the kept vertices, normals,
-    albedo and confidence carry theirs; mended vertices carry that of the vertices round them.
+    albedo and confidence carry theirs.
     """
 
     def __init__(self, config: ExtractConfig | None = None) -> None:
@@ -88,12 +81,7 @@ class Extract(nn.Module):
         filled = small_groups(vertices, surface.faces, ~supported, max_hole)
         keep = (supported | filled)[surface.faces].all(dim=1)
         with_support = int(keep.sum())
-        faces = surface.faces[keep]
-        if self.config.max_mend > 0 and with_support:
-            surface, spikes = self._mended(surface, faces)
-        else:
-            spikes = self._spikes(surface)[keep]
-        faces = faces[~spikes]
+        faces = surface.faces[keep & ~self._spikes(surface)]
         if len(faces) == 0:
             raise ReconstructionError(
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
@@ -102,7 +90,6 @@ class Extract(nn.Module):
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the share "
                 "of missing data that the report gives."
             )
-        vertices = surface.vertices_world.detach()
         faces = faces[large_pieces(vertices, faces, self.config.min_piece)]
         source, faces = vertex_fans(faces)
         return Mesh(
@@ -114,39 +101,12 @@ class Extract(nn.Module):
         )
 
     def _spikes(self, surface: Surface) -> Bool[Tensor, " face"]:
-        vertices = surface.vertices_world.detach()
-        spikes = stretched(vertices, surface.faces, self.config.max_stretch)
-        if self.config.drop_overturned:
-            spikes = spikes | overturned(vertices, surface.faces, surface.facet)
-        return spikes
-
-    def _mended(
-        self, surface: Surface, faces: Int[Tensor, "face 3"]
-    ) -> tuple[Surface, Bool[Tensor, " face"]]:
-        """Mend what can be mended of some faces, and mark those that cannot."""
-        config, vertices = self.config, surface.vertices_world
-        before = vertices.detach()
-        found = faults(
-            before, faces, surface.facet, config.max_stretch, folds=config.drop_overturned
-        )
-        near = surroundings(faces, found.broken(before), len(vertices))
-        part, used = found.part(near)
-        farthest = config.max_mend * diagonal(before)
-        placed, moving = mend(vertices[used], part.faces, part.broken, farthest)
-        spikes = near.index_put((near,), part.worst(placed.detach()))
-        vertices = vertices.index_copy(0, used, placed)
-        moved = torch.zeros_like(surface.facet, dtype=torch.bool).index_put((used,), moving)
-        beside = torch.zeros_like(moved)
-        beside[faces[moved[faces].any(dim=1)].flatten()] = True
-        normals = torch.where(
-            beside[:, None], vertex_normals(vertices, faces), surface.normals_world
-        )
-        mended = surface.replace(
-            vertices_world=vertices,
-            normals_world=normals,
-            confidence=torch.where(moved, 0, surface.confidence),
-        )
-        return mended, spikes
+        config = self.config
+        vertices, faces, facet = surface.vertices_world.detach(), surface.faces, surface.facet
+        if config.overturned == "folded":
+            return faults(vertices, faces, facet, config.max_stretch).worst(vertices)
+        spikes = stretched(vertices, faces, config.max_stretch)
+        return spikes | overturned(vertices, faces, facet) if config.overturned == "all" else spikes
 
 
 def large_pieces(

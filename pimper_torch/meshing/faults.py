@@ -51,32 +51,28 @@ class Faults:
         faces: Of the surface.
         along: The way each was meant to look.
         longest: Side that a face may have, scene units.
-        folds: Whether these are looked for.
         pairs: Faces that share an edge.
     """
 
     faces: Int[Tensor, "face 3"]
     along: Float[Tensor, "face 3"]
     longest: Float[Tensor, ""]
-    folds: bool
     pairs: Int[Tensor, "pair 2"]
 
     def broken(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
         """Mark faces drawn out, on both sides of a fold, or overturned where a fold bounds them."""
-        drawn = self._drawn(vertices)
-        return drawn | self._folded(vertices) if self.folds else drawn
+        return self._drawn(vertices) | self._folded(vertices)
 
     def worst(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
         """Mark faces drawn out, or overturned where a fold bounds them."""
-        drawn = self._drawn(vertices)
-        return drawn | self._folded(vertices) & self._turned(vertices) if self.folds else drawn
+        return self._drawn(vertices) | self._folded(vertices) & self._turned(vertices)
 
     def part(self, chosen: Bool[Tensor, " face"]) -> tuple["Faults", Int[Tensor, " used"]]:
         """Look at some of the faces alone; their vertices, which have new numbers, come with it."""
         used, corners = torch.unique(self.faces[chosen], return_inverse=True)
         pairs, _ = face_pairs(corners)
         along, longest = self.along[chosen], self.longest
-        part = Faults(faces=corners, along=along, longest=longest, folds=self.folds, pairs=pairs)
+        part = Faults(faces=corners, along=along, longest=longest, pairs=pairs)
         return part, used
 
     def _drawn(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
@@ -106,8 +102,6 @@ def faults(
     faces: Int[Tensor, "face 3"],
     facet: Int[Tensor, " vertex"],
     max_stretch: float,
-    *,
-    folds: bool,
 ) -> Faults:
     """Learn from a surface as it is what to call broken.
 
@@ -116,14 +110,12 @@ def faults(
         faces: Of the surface.
         facet: Of each vertex. The mean of its faces says which way a face was meant to look.
         max_stretch: Longest side, in multiples of the median.
-        folds: Whether these are looked for.
     """
     pairs, _ = face_pairs(faces)
     return Faults(
         faces=faces,
         along=facet_means(vertices, faces, facet),
         longest=max_stretch * side_lengths(vertices[faces]).median(),
-        folds=folds,
         pairs=pairs,
     )
 

@@ -4,19 +4,76 @@ The faces stay as they are, so that what was closed stays closed.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from torch import Tensor
+from torch import Tensor, nn
 
+from pimper_torch.config import require
 from pimper_torch.geometry.components import vertex_components
-from pimper_torch.geometry.surfaces import face_edges
-from pimper_torch.linalg.systems import solutions
-from pimper_torch.meshing.groups import small_groups
+from pimper_torch.geometry.surfaces import face_edges, vertex_normals
+from pimper_torch.meshing.faults import faults
+from pimper_torch.meshing.groups import diagonal, small_groups
+from pimper_torch.meshing.plates import corners_of, least_bent
+from pimper_torch.records import Surface
 
 # Rings of sound vertices that a place which stays broken may take in, one at a time.
 _RINGS = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MendConfig:
+    """What of a surface is broken, and how far a broken place may extend to be mended.
+
+    Attributes:
+        max_extent: Diagonal of a mended place's bounding box, as a share of the surface's; 0
+            mends nothing.
+        max_stretch: Longest edge of a face, in multiples of the surface's median edge; longer
+            ones are spikes.
+    """
+
+    max_extent: float = 0.1
+    max_stretch: float = 10.0
+
+    def __post_init__(self) -> None:
+        require(self.max_extent >= 0, "mend.max_extent", self.max_extent, "0 or more")
+        require(self.max_stretch > 1, "mend.max_stretch", self.max_stretch, "above 1")
+
+
+class Mend(nn.Module):
+    """Mend spikes and folds that other faces enclose, before a round or a mesh builds on them.
+
+    A fold that is left would be carried by the next round's templates, and grow there. Mended
+    vertices have no confidence, and the normals of where they are put.
+
+    Differentiable in the vertices that stay; which these are is a constant.
+    """
+
+    def __init__(self, config: MendConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or MendConfig()
+
+    def forward(self, surface: Surface) -> Surface:
+        """Mend what can be mended."""
+        if self.config.max_extent == 0:
+            return surface
+        vertices, faces = surface.vertices_world, surface.faces
+        before = vertices.detach()
+        found = faults(before, faces, surface.facet, self.config.max_stretch)
+        part, used = found.part(surroundings(faces, found.broken(before), len(vertices)))
+        farthest = self.config.max_extent * diagonal(before)
+        placed, moving = mend(vertices[used], part.faces, part.broken, farthest)
+        vertices = vertices.index_copy(0, used, placed)
+        moved = torch.zeros_like(surface.facet, dtype=torch.bool).index_put((used,), moving)
+        beside = corners_of(faces, moved[faces].any(dim=1), len(vertices))
+        return surface.replace(
+            vertices_world=vertices,
+            normals_world=torch.where(
+                beside[:, None], vertex_normals(vertices, faces), surface.normals_world
+            ),
+            confidence=torch.where(moved, 0, surface.confidence),
+        )
 
 
 def mend(
@@ -44,16 +101,16 @@ def mend(
     """
     before, count = vertices.detach(), len(vertices)
     held = _border(faces, count)
-    free = _corners(faces, broken(before), count)
+    free = corners_of(faces, broken(before), count)
     free = _anchored(faces, free & ~_together(faces, free, held))
     for ring in range(_RINGS + 1):
         places = least_bent(before, faces, free)
         held = held | (free & ~small_groups(places, faces, free, max_extent))
         free = free & ~held
-        still = _together(faces, free, _corners(faces, broken(places), count))
+        still = _together(faces, free, corners_of(faces, broken(places), count))
         if not bool(still.any()):
             break
-        wider = _corners(faces, still[faces].any(dim=1), count) & ~held
+        wider = corners_of(faces, still[faces].any(dim=1), count) & ~held
         free = free & ~still if ring == _RINGS else _anchored(faces, free | wider)
     return least_bent(vertices, faces, free), free
 
@@ -64,57 +121,8 @@ def surroundings(
     """Mark the faces round broken ones that :func:`mend` may look at: it needs no others."""
     near = broken
     for _ in range(_RINGS + 3):  # the plate is clamped by two rings, and one tells the border
-        near = _corners(faces, near, num_vertices)[faces].any(dim=1)
+        near = corners_of(faces, near, num_vertices)[faces].any(dim=1)
     return near
-
-
-def least_bent(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    free: Bool[Tensor, " vertex"],
-) -> Float[Tensor, "vertex 3"]:
-    r"""Place some vertices where the surface bends least, as a thin plate clamped all round.
-
-    The sum of :math:`\lVert x_i - \tfrac{1}{d_i} \sum_{j \sim i} x_j \rVert^2` over free
-    vertices and their neighbours is made as small as can be. Neighbours count alike, whatever
-    their distances: those of folded faces mean nothing.
-
-    Args:
-        vertices: World.
-        faces: Of the surface.
-        free: Everything that hangs together of these must have a neighbour that is not free.
-
-    Differentiable in the vertices that are held; one solve.
-
-    Source: Kobbelt, Campagna, Vorsatz, Seidel: Interactive multi-resolution modeling on
-    arbitrary meshes, SIGGRAPH 1998, for the energy.
-    """
-    if not bool(free.any()):
-        return vertices
-    known = vertices.double()
-    ring = _corners(faces, free[faces].any(dim=1), len(vertices))
-    edges, _ = face_edges(faces[ring[faces].any(dim=1)])
-    links = torch.cat([edges, edges.flip(1)])
-    here, there = links[ring[links[:, 0]]].unbind(dim=1)
-    (middle,) = torch.nonzero(ring, as_tuple=True)
-    degree = torch.bincount(here, minlength=len(vertices)).to(known)
-    row = (ring.cumsum(dim=0) - 1)[torch.cat([middle, here])]
-    col = torch.cat([middle, there])
-    share = torch.cat([torch.ones_like(degree[middle]), -1 / degree[here]])
-    unknown = free[col]
-    fixed = share[~unknown, None] * known[col[~unknown]]
-    target = -known.new_zeros(len(middle), 3).index_add(0, row[~unknown], fixed)
-    row, col, share = row[unknown], (free.cumsum(dim=0) - 1)[col[unknown]], share[unknown]
-    side = known.new_zeros(int(free.sum()), 3).index_add(0, col, share[:, None] * target[row])
-    shape = (len(middle), len(side))
-    bending = coo_array((share.cpu().numpy(), (row.cpu().numpy(), col.cpu().numpy())), shape=shape)
-    energy = (bending.T @ bending).tocoo()
-    rows, cols, values = (
-        torch.from_numpy(part).to(side.device) for part in (*energy.coords, energy.data)
-    )
-    (found,) = solutions(rows.long(), cols.long(), values, side, what="the mending")
-    (moved,) = torch.nonzero(free, as_tuple=True)
-    return vertices.index_copy(0, moved, found.to(vertices))
 
 
 def _border(faces: Int[Tensor, "face 3"], num_vertices: int) -> Bool[Tensor, " {num_vertices}"]:
@@ -123,15 +131,6 @@ def _border(faces: Int[Tensor, "face 3"], num_vertices: int) -> Bool[Tensor, " {
     single = torch.bincount(index.flatten(), minlength=len(edges)) != 2
     marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
     marked[edges[single].flatten()] = True
-    return marked
-
-
-def _corners(
-    faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, " face"], num_vertices: int
-) -> Bool[Tensor, " {num_vertices}"]:
-    """Mark the vertices of some faces."""
-    marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
-    marked[faces[chosen].flatten()] = True
     return marked
 
 
@@ -151,4 +150,4 @@ def _anchored(
     """Leave out groups that make up all they hang together with."""
     of_face = free[faces]
     mixed = of_face.any(dim=1) & ~of_face.all(dim=1)
-    return _together(faces, free, _corners(faces, mixed, len(free)))
+    return _together(faces, free, corners_of(faces, mixed, len(free)))

@@ -9,12 +9,13 @@ from pimper_torch.geometry.components import boundary_loops, vertex_components
 from pimper_torch.geometry.surfaces import boundary_vertices, face_edges, vertex_normals
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.faults import faults, overturned
-from pimper_torch.meshing.mend import least_bent, mend, surroundings
+from pimper_torch.meshing.mend import Mend, MendConfig, mend, surroundings
+from pimper_torch.meshing.plates import least_bent
 from pimper_torch.metrics.closedness import closedness
 from pimper_torch.records import Convergence, Surface
 from pimper_torch.scenes.meshes import icosphere
 
-OLD = ExtractConfig(max_mend=0.0)
+OLD = ExtractConfig(overturned="all")
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_a_folded_sphere_was_slit_and_comes_out_closed():
     sphere, surface = folded_sphere()
     slit = closedness(Extract(OLD)(surface))
     assert len(slit.loops) >= 3
-    mesh = Extract()(surface)
+    mesh = Extract()(Mend()(surface))
     found = closedness(mesh)
     assert found.closed
     assert found.folds == 0
@@ -84,7 +85,7 @@ def test_a_folded_sphere_was_slit_and_comes_out_closed():
 
 def test_only_what_is_mended_changes_and_it_says_so():
     _, surface = folded_sphere()
-    mesh = Extract()(surface)
+    mesh = Extract()(Mend()(surface))
     moved = (mesh.vertices_world != surface.vertices_world).any(dim=1)
     assert 9 <= moved.sum() < 0.1 * len(moved)
     assert torch.equal(mesh.confidence == 0, moved)
@@ -113,20 +114,20 @@ def test_without_mending_exactly_the_overturned_faces_go():
 def test_looking_only_round_the_folds_changes_nothing():
     _, surface = folded_sphere()
     vertices = surface.vertices_world
-    found = faults(vertices, surface.faces, surface.facet, 10.0, folds=True)
+    found = faults(vertices, surface.faces, surface.facet, 10.0)
     farthest = torch.tensor(0.1 * 2 * 3**0.5).double()
     whole, moved = mend(vertices, surface.faces, found.broken, farthest)
     assert moved.any()
     near = surroundings(surface.faces, found.broken(vertices), len(vertices))
     assert near.sum() < 0.7 * len(near)
-    assert_close(Extract()(surface).vertices_world, whole)
+    assert_close(Mend()(surface).vertices_world, whole)
 
 
 def test_a_genuine_opening_stays_as_it_is():
     _, surface = folded_sphere()
     below = (surface.vertices_world[:, 2] > -0.3) & (surface.vertices_world[:, 0] > -0.9)
     bowl = surface.replace(faces=surface.faces[below[surface.faces].all(dim=1)])
-    mesh = Extract()(bowl)
+    mesh = Extract()(Mend()(bowl))
     rims = [
         {tuple(row) for row in points[boundary_loops(faces)[0]].flatten(1).tolist()}
         for points, faces in (
@@ -141,34 +142,36 @@ def test_a_genuine_opening_stays_as_it_is():
 
 def test_a_fold_at_the_border_goes_as_before():
     _, surface = folded_sphere()
-    fold = faults(
-        surface.vertices_world, surface.faces, surface.facet, torch.inf, folds=True
-    ).broken(surface.vertices_world)
+    fold = faults(surface.vertices_world, surface.faces, surface.facet, torch.inf).broken(
+        surface.vertices_world
+    )
     through = torch.zeros_like(surface.facet, dtype=torch.bool)
     group = vertex_components(surface.faces[fold], torch.ones_like(through))
     dragged = (surface.vertices_world.norm(dim=1) - 1).abs() > 1e-3
     for label in torch.unique(group[dragged]).tolist():
         through[((group == label) & dragged).nonzero()[0]] = True
     cut = surface.replace(faces=surface.faces[~through[surface.faces].any(dim=1)])
-    folds = faults(cut.vertices_world, cut.faces, cut.facet, torch.inf, folds=True)
+    folds = faults(cut.vertices_world, cut.faces, cut.facet, torch.inf)
     gone = folds.worst(cut.vertices_world)
     assert gone.sum() > 6
-    mesh = Extract()(cut)
+    mesh = Extract()(Mend()(cut))
     assert (mesh.confidence == 1).all()
     assert_close(mesh.vertices_world[mesh.faces], cut.vertices_world[cut.faces[~gone]])
 
 
-def test_a_fold_that_extends_too_far_goes_as_before():
+def test_a_fold_that_extends_too_far_is_left():
     _, surface = folded_sphere()
-    mesh, before = Extract(ExtractConfig(max_mend=0.01))(surface), Extract(OLD)(surface)
-    assert torch.equal(mesh.vertices_world, before.vertices_world)
+    left = Mend(MendConfig(max_extent=0.01))(surface)
+    assert torch.equal(left.vertices_world, surface.vertices_world)
+    assert torch.equal(left.confidence, surface.confidence)
+    assert Mend(MendConfig(max_extent=0.0))(surface) is surface
 
 
 def test_a_spike_is_drawn_in():
     vertices, faces = icosphere(4)
     spiked = vertices.clone()
     spiked[100] *= 3
-    mesh = Extract()(surface_of(spiked, faces))
+    mesh = Extract()(Mend()(surface_of(spiked, faces)))
     assert closedness(mesh).closed
     assert_close(mesh.vertices_world[100].norm(), torch.ones(()).double(), rtol=0, atol=0.01)
     assert not closedness(Extract(OLD)(surface_of(spiked, faces))).closed
@@ -182,7 +185,7 @@ def test_a_facet_that_bends_far_has_no_fold():
     surface = surface_of(bulge, faces, torch.zeros(len(bulge), dtype=torch.long))
     surface = surface.replace(faces=faces[(bulge[faces][..., 2] > -0.8).all(dim=1)])
     assert overturned(surface.vertices_world, surface.faces, surface.facet).any()
-    mesh = Extract()(surface)
+    mesh = Extract()(Mend()(surface))
     assert len(mesh.faces) == len(surface.faces)
     assert (mesh.confidence == 1).all()
 
@@ -190,7 +193,7 @@ def test_a_facet_that_bends_far_has_no_fold():
 def test_gradients_reach_what_is_held_and_none_what_is_mended():
     _, surface = folded_sphere(3)
     leaf = surface.vertices_world.clone().requires_grad_()
-    mesh = Extract()(surface.replace(vertices_world=leaf))
+    mesh = Extract()(Mend()(surface.replace(vertices_world=leaf)))
     moved = (mesh.vertices_world != surface.vertices_world).any(dim=1)
     (pulled,) = torch.autograd.grad(mesh.vertices_world[moved].sum(), leaf)
     assert (pulled[moved] == 0).all()

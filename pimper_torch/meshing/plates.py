@@ -1,0 +1,67 @@
+"""Parts of a surface placed anew, as a thin plate that the rest of it clamps."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from torch import Tensor
+
+from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.linalg.systems import solutions
+
+
+def least_bent(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    free: Bool[Tensor, " vertex"],
+) -> Float[Tensor, "vertex 3"]:
+    r"""Place some vertices where the surface bends least, as a thin plate clamped all round.
+
+    The sum of :math:`\lVert x_i - \tfrac{1}{d_i} \sum_{j \sim i} x_j \rVert^2` over free
+    vertices and their neighbours is made as small as can be. Neighbours count alike, whatever
+    their distances: those of folded faces mean nothing.
+
+    Args:
+        vertices: World.
+        faces: Of the surface.
+        free: Everything that hangs together of these must have a neighbour that is not free.
+
+    Differentiable in the vertices that are held; one solve.
+
+    Source: Kobbelt, Campagna, Vorsatz, Seidel: Interactive multi-resolution modeling on
+    arbitrary meshes, SIGGRAPH 1998, for the energy.
+    """
+    if not bool(free.any()):
+        return vertices
+    known = vertices.double()
+    ring = corners_of(faces, free[faces].any(dim=1), len(vertices))
+    edges, _ = face_edges(faces[ring[faces].any(dim=1)])
+    links = torch.cat([edges, edges.flip(1)])
+    here, there = links[ring[links[:, 0]]].unbind(dim=1)
+    (middle,) = torch.nonzero(ring, as_tuple=True)
+    degree = torch.bincount(here, minlength=len(vertices)).to(known)
+    row = (ring.cumsum(dim=0) - 1)[torch.cat([middle, here])]
+    col = torch.cat([middle, there])
+    share = torch.cat([torch.ones_like(degree[middle]), -1 / degree[here]])
+    unknown = free[col]
+    fixed = share[~unknown, None] * known[col[~unknown]]
+    target = -known.new_zeros(len(middle), 3).index_add(0, row[~unknown], fixed)
+    row, col, share = row[unknown], (free.cumsum(dim=0) - 1)[col[unknown]], share[unknown]
+    side = known.new_zeros(int(free.sum()), 3).index_add(0, col, share[:, None] * target[row])
+    shape = (len(middle), len(side))
+    bending = coo_array((share.cpu().numpy(), (row.cpu().numpy(), col.cpu().numpy())), shape=shape)
+    energy = (bending.T @ bending).tocoo()
+    rows, cols, values = (
+        torch.from_numpy(part).to(side.device) for part in (*energy.coords, energy.data)
+    )
+    (found,) = solutions(rows.long(), cols.long(), values, side, what="the mending")
+    (moved,) = torch.nonzero(free, as_tuple=True)
+    return vertices.index_copy(0, moved, found.to(vertices))
+
+
+def corners_of(
+    faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, " face"], num_vertices: int
+) -> Bool[Tensor, " {num_vertices}"]:
+    """Mark the vertices of some faces."""
+    marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
+    marked[faces[chosen].flatten()] = True
+    return marked
