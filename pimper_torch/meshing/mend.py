@@ -19,7 +19,7 @@ from pimper_torch.meshing.plates import corners_of, least_bent
 from pimper_torch.records import Surface
 
 # Rings of sound vertices that a place which stays broken may take in, one at a time.
-_RINGS = 6
+_RINGS = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -112,7 +112,7 @@ def test_without_mending_exactly_the_overturned_faces_go():
 
 
 def test_looking_only_round_the_folds_changes_nothing():
-    _, surface = folded_sphere()
+    _, surface = folded_sphere(5)
     vertices = surface.vertices_world
     found = faults(vertices, surface.faces, surface.facet, 10.0)
     farthest = torch.tensor(0.1 * 2 * 3**0.5).double()
