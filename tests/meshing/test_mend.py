@@ -5,6 +5,7 @@ import trimesh
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.components import boundary_loops, vertex_components
 from pimper_torch.geometry.surfaces import boundary_vertices, face_edges, vertex_normals
 from pimper_torch.meshing.extract import Extract, ExtractConfig
@@ -165,6 +166,12 @@ def test_a_fold_that_extends_too_far_is_left():
     assert torch.equal(left.vertices_world, surface.vertices_world)
     assert torch.equal(left.confidence, surface.confidence)
     assert Mend(MendConfig(max_extent=0.0))(surface) is surface
+
+
+@pytest.mark.parametrize(("name", "value"), [("max_extent", -0.1), ("max_stretch", 1.0)])
+def test_settings_that_mean_nothing_are_refused(name, value):
+    with pytest.raises(ConfigError, match=name):
+        MendConfig(**{name: value})
 
 
 def test_a_spike_is_drawn_in():
