@@ -82,11 +82,11 @@ def face_edges(
 def boundary_vertices(
     faces: Int[Tensor, "face 3"], num_vertices: int
 ) -> Bool[Tensor, " {num_vertices}"]:
-    """Mark vertices on an edge that only one face has."""
+    """Mark vertices on an edge that has one face, or more than two."""
     edges, index = face_edges(faces)
-    alone = torch.bincount(index.flatten(), minlength=len(edges)) == 1
+    border = torch.bincount(index.flatten(), minlength=len(edges)) != 2
     marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
-    marked[edges[alone].reshape(-1)] = True
+    marked[edges[border].flatten()] = True
     return marked
 
 

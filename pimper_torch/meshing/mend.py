@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from pimper_torch.config import require
 from pimper_torch.geometry.components import vertex_components
-from pimper_torch.geometry.surfaces import face_edges, vertex_normals
+from pimper_torch.geometry.surfaces import boundary_vertices, vertex_normals
 from pimper_torch.meshing.faults import faults
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.meshing.plates import corners_of, least_bent
@@ -100,7 +100,7 @@ def mend(
     Differentiable in the vertices that stay; which these are is a constant.
     """
     before, count = vertices.detach(), len(vertices)
-    held = _border(faces, count)
+    held = boundary_vertices(faces, count)
     free = corners_of(faces, broken(before), count)
     free = _anchored(faces, free & ~_together(faces, free, held))
     for ring in range(_RINGS + 1):
@@ -123,15 +123,6 @@ def surroundings(
     for _ in range(_RINGS + 3):  # the plate is clamped by two rings, and one tells the border
         near = corners_of(faces, near, num_vertices)[faces].any(dim=1)
     return near
-
-
-def _border(faces: Int[Tensor, "face 3"], num_vertices: int) -> Bool[Tensor, " {num_vertices}"]:
-    """Mark vertices on an edge with one face, or more than two."""
-    edges, index = face_edges(faces)
-    single = torch.bincount(index.flatten(), minlength=len(edges)) != 2
-    marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
-    marked[edges[single].flatten()] = True
-    return marked
 
 
 def _together(

@@ -118,12 +118,16 @@ def test_every_edge_is_listed_once_and_lies_opposite_to_its_corners():
     assert (everything.sort().values == faces.sort().values[:, None]).all()
 
 
-def test_the_boundary_is_where_faces_have_no_neighbour():
+def test_the_boundary_is_where_an_edge_has_not_two_faces():
     hexagon = torch.tensor([[0, k, k % 6 + 1] for k in range(1, 7)])  # a fan round vertex 0
     marked = boundary_vertices(hexagon, 8)
     assert marked.tolist() == [False, *[True] * 6, False]
     closed = torch.tensor(trimesh.creation.icosphere(subdivisions=1).faces)
     assert not boundary_vertices(closed, int(closed.max()) + 1).any()
+    fin = torch.cat([closed, torch.tensor([[*closed[0, :2], int(closed.max()) + 1]])])
+    assert boundary_vertices(fin, int(fin.max()) + 1).nonzero()[:, 0].tolist() == sorted(
+        [*closed[0, :2].tolist(), int(fin.max())]
+    )
 
 
 def test_barycentric_coordinates_rebuild_the_point_and_tell_the_side(generator):
