@@ -274,23 +274,22 @@ class Fuse(nn.Module):
         """List the slopes where light tells nothing; no residual tells their variances.
 
         Where lit ground encloses it, its normals are continued: the shape there is what the
-        facets started with, since no round knew it. Elsewhere the shape is kept.
+        facets started with, since no round knew it. Elsewhere the shape is kept. Continued normals
+        of a facet are off alike: together they tell as much as one of them.
         """
         flat, along, edges = task.lattice.points, task.directions, task.edges
         carried, doubt = task.union.heights, self._doubt(task, known)
+        alike = doubt * torch.bincount(task.lattice.facet)[task.lattice.facet].to(task.shape)
         island = enclosed(known, task.lattice.faces)
         normals = task.union.normals_world
         if bool(island.any()):
-            # A facet's slopes are off alike: together they tell as much as one of them.
-            alike = torch.bincount(task.lattice.facet)[task.lattice.facet].to(task.shape)
-            hold = _turn(task.shape, edges[lit]) / (doubt * alike)
+            hold = _turn(task.shape, edges[lit]) / alike
             normals = normalize(continued(normals, ~island, edges, task.shape, hold), dim=-1)
         over = island[edges].any(dim=1) & upright(edges, along, normals)
         stays = ~lit & ~over
         sloped = stays & upright(edges, along, task.shape)
-        variance = torch.full_like(carried, doubt)
         return [
-            slopes(edges[over], flat, along, normals, variance).replace(judged=False),
+            slopes(edges[over], flat, along, normals, alike).replace(judged=False),
             kept_slopes(edges[sloped], flat, along, task.shape, carried, doubt),
             kept_steps(edges[stays & ~sloped], flat, carried, doubt),
         ]
