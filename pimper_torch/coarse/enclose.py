@@ -23,9 +23,9 @@ from pimper_torch.coarse.select import frontal_view, named_view, triangulation_a
 from pimper_torch.coarse.triangulate import smooth_over_mesh
 from pimper_torch.coarse.trim import (
     evidence,
-    hanging_together,
     large_pieces,
     point_distances,
+    too_far,
     without_small_holes,
 )
 from pimper_torch.config import require
@@ -53,8 +53,8 @@ class EncloseConfig:
         point_weight: Of points against smoothness, in the surface.
         reach_px: A face nearer to a point of the cloud than this is borne out by it.
         least_views: That have to see a face which is not.
-        gap_px: Distance from all points of the cloud, above which seen faces without any go,
-            and all that hang together with them.
+        gap_px: Distance from all points of the cloud, above which seen faces without any go.
+        brink_px: With them goes what hangs together with them further than this from all points.
         hole_px: Side of a square as large as the largest hole that is closed.
         min_share: Of the area borne out, that a piece apart has to have.
         boundary_weight: Of rims against the surface, in simplification.
@@ -75,6 +75,7 @@ class EncloseConfig:
     reach_px: float = 4.0
     least_views: int = 2
     gap_px: float = 40.0
+    brink_px: float = 10.0
     hole_px: float = 24.0
     min_share: float = 0.01
     boundary_weight: float = 10.0
@@ -90,6 +91,10 @@ class EncloseConfig:
         require(self.point_weight >= 0, "point_weight", self.point_weight, "0 or more")
         require(self.reach_px > 0, "reach_px", self.reach_px, "above 0")
         require(self.least_views >= 1, "least_views", self.least_views, "1 or more")
+        require(self.gap_px > 0, "gap_px", self.gap_px, "above 0")
+        require(
+            0 <= self.brink_px <= self.gap_px, "brink_px", self.brink_px, "in [0, enclose.gap_px]"
+        )
         require(self.hole_px >= 0, "hole_px", self.hole_px, "0 or more")
         require(0 <= self.min_share < 1, "min_share", self.min_share, "in [0, 1)")
         require(self.max_distance_px > 0, "max_distance_px", self.max_distance_px, "above 0")
@@ -218,8 +223,9 @@ class Enclose(nn.Module):
         kept = (said.seen >= config.least_views) & supported
         between = (said.lit >= config.least_views) & (said.denied < config.least_views)
         between &= ~supported
-        gaps = hanging_together(faces, between, distance > config.gap_px * pixel)
-        kept |= between & ~gaps
+        kept |= between & ~too_far(
+            faces, between, distance, config.gap_px * pixel, config.brink_px * pixel
+        )
         kept = without_small_holes(vertices, faces, kept, (config.hole_px * pixel) ** 2)
         chosen = kept.nonzero()[:, 0]
         pieces = large_pieces(vertices, faces[chosen], supported[chosen], config.min_share)

@@ -96,6 +96,22 @@ def hanging_together(
     return among & (count[label] > 0)
 
 
+def too_far(
+    faces: Int[Tensor, "face 3"],
+    between: Bool[Tensor, " face"],
+    distance: Float[Tensor, " face"],
+    gap: float,
+    brink: float,
+) -> Bool[Tensor, " face"]:
+    """Mark faces between points that are further than ``gap`` from all, and their surroundings.
+
+    These are what hangs together with them further than ``brink`` from all points: what spans
+    a gap inside the object is joined to what hangs in the air by strips along points, which
+    cut nothing off here.
+    """
+    return hanging_together(faces, between & (distance > brink), distance > gap)
+
+
 def without_small_holes(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],

@@ -4,9 +4,9 @@ from torch.testing import assert_close
 from pimper_torch.coarse.densify import push_pull, sweep
 from pimper_torch.coarse.matching import Matcher, Windows, level_of, mean_of_largest, pair
 from pimper_torch.coarse.oriented import OrientedPoints, fitted_planes, thinned
-from pimper_torch.coarse.trim import hanging_together, large_pieces, without_small_holes
+from pimper_torch.coarse.trim import hanging_together, large_pieces, too_far, without_small_holes
 from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.meshes import icosphere
+from pimper_torch.scenes.meshes import icosphere, table
 from pimper_torch.scenes.render import render_shape
 from pimper_torch.scenes.shapes import Sphere
 from pimper_torch.scenes.sparse import sparse_scene
@@ -146,3 +146,19 @@ def test_faces_go_with_what_they_hang_together_with():
     caps = height.abs() > 0.5
     found = hanging_together(faces, caps, height > 0.99)
     assert (found == (height > 0.5)).all()
+
+
+def test_what_spans_a_gap_does_not_go_with_what_hangs_in_the_air_beside_it():
+    flat = table(half_side=12.0, cells=48)
+    middle = flat.vertices_world[flat.faces].mean(dim=1)[:, :2]
+    # Points all over, but in two discs of radius 6 and 3, and in a strip that joins them.
+    wide = (middle - middle.new_tensor([-5.0, 0.0])).norm(dim=-1)
+    narrow = (middle - middle.new_tensor([6.0, 0.0])).norm(dim=-1)
+    strip = torch.where((middle[:, 0] - 0.5).abs() < 5.5, 0.9 - middle[:, 1].abs(), 0.0)
+    distance = torch.stack([6 - wide, 3 - narrow, strip]).amax(dim=0).clamp_min(0)
+    between = distance > 0.2
+    hanging = hanging_together(flat.faces, between, distance > 4)
+    assert hanging[narrow < 2].all()  # the strip joins them
+    far = too_far(flat.faces, between, distance, 4.0, 1.0)
+    assert (far == (wide < 5)).all()
+    assert not too_far(flat.faces, between, distance, 6.0, 1.0).any()

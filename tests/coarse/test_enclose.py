@@ -165,6 +165,8 @@ def test_settings_out_of_range_are_refused():
         DensifyConfig(sources=2, best_sources=3)
     with pytest.raises(ConfigError, match="num_facets"):
         EncloseConfig(num_facets=3)
+    with pytest.raises(ConfigError, match="brink_px"):
+        EncloseConfig(gap_px=8.0, brink_px=9.0)
 
 
 def test_the_nearest_facet_is_that_of_a_search_over_all():
