@@ -8,7 +8,6 @@ from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.colour import ColourFactors, solve_in_colour
-from pimper_torch.photometry.coupling import couple_lights
 from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.implicit import differentiable
@@ -32,7 +31,6 @@ __all__ = [
     "SecondOrder",
     "Solver",
     "Squares",
-    "couple_lights",
     "differentiable",
     "factorize_from_many",
     "low_rank_problem",

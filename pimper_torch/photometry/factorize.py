@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
-from pimper_torch.geometry.surfaces import face_pairs
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.patches.carry import carried_normals
 from pimper_torch.photometry.alternation import solve_alternation
@@ -20,7 +19,6 @@ from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver, select
 from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold
 from pimper_torch.photometry.colour import solve_in_colour, split_colours
-from pimper_torch.photometry.coupled import Batch, differentiable_together, solve_coupled
 from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.harmonics import rotate_lights
 from pimper_torch.photometry.implicit import differentiable
@@ -103,10 +101,6 @@ class FactorizeConfig:
             Lagrangian; ``"descent"``, autograd with projection.
         light_pull: How strongly each patch's lights hold to those fitted to the mesh, in units
             of the patch's own data; 0 leaves them free, 1e6 fixes them.
-        light_coupling: How strongly they hold to those of the neighbours, in units of what a
-            patch's data say in the mean: 0, patches by themselves, to infinity, one light for
-            all (one difference from the lamp's). Above 0 all patches are solved together, by
-            alternation.
         geometry_weight: How strongly normals hold to the coarse ones, in units of one view.
         loss: How highlights and shadows lose weight: ``"cauchy"``; ``"geman-mcclure"``, more
             sharply; ``"squares"``, not at all.
@@ -129,7 +123,6 @@ class FactorizeConfig:
     start: Literal["mesh", "svd"] = "mesh"
     solver: Literal["variable-projection", "alternation", "balm", "descent"] = "variable-projection"
     light_pull: float = 1.0
-    light_coupling: float = 0.0
     geometry_weight: float = 0.1
     loss: Literal["squares", "cauchy", "geman-mcclure"] = "cauchy"
     loss_scale: float = 2.385  # 95 % efficient on Gaussian noise
@@ -143,15 +136,12 @@ class FactorizeConfig:
         models = ("auto", "soft", "lamp")
         require(self.light in models, "factorize.light", self.light, "auto, soft or lamp")
         require(self.rank in MANIFOLDS, "factorize.rank", self.rank, "3, 4 or 9")
-        plain = self.rank == 4 and not self.colour
-        one = plain or self.light_coupling == 0
-        require(one, "factorize.light_coupling", self.light_coupling, "0 unless gray, of rank 4")
         four = self.rank == 4 or self.start == "mesh"
         require(four, "factorize.start", self.start, "mesh unless rank 4")
         require(self.start in ("mesh", "svd"), "factorize.start", self.start, "mesh or svd")
         require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
         require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
-        for name in ("light_pull", "light_coupling", "geometry_weight"):
+        for name in ("light_pull", "geometry_weight"):
             value = getattr(self, name)
             require(value >= 0, f"factorize.{name}", value, "0 or more")
         require(self.loss_scale > 0, "factorize.loss_scale", self.loss_scale, "above 0")
@@ -187,9 +177,8 @@ class Factorize(nn.Module):
 
     First the light field of every view is fitted to the smoothed normals of the coarse mesh:
     soft light, or a lamp at some place. Then every patch is factorized, its lights held to
-    what the field has there by ``light_pull`` and to those of its neighbours by
-    ``light_coupling``; samples that face away from the lamp are missing. The last step of each
-    sample is exact, and albedo is fitted to every channel.
+    what the field has there by ``light_pull``; samples that face away from the lamp are
+    missing. The last step of each sample is exact, and albedo is fitted to every channel.
 
     Gauge: albedo and light share one free factor for the whole scene; it is set so that the
     99th percentile of gray albedo is 1. With nothing that holds lights and ``start="svd"`` each
@@ -231,13 +220,10 @@ class Factorize(nn.Module):
                 seen.patches.buckets, lit, coarse, strict=True
             )
         ]
-        everything = [chunk for bucket in chunks for chunk in bucket]
-        coupled = self._coupled(seen, everything, field) if config.light_coupling > 0 else None
         found = []
-        for place, chunk in enumerate(track(everything)):
+        for chunk in track([chunk for bucket in chunks for chunk in bucket]):
             posed = self._pose(chunk, field)
-            solved = self._solve(posed) if coupled is None else (posed.problem, coupled[place])
-            found.append(self._conclude(chunk, posed, *solved))
+            found.append(self._conclude(chunk, posed, *self._solve(posed)))
         rest = iter(found)
         buckets = [_joined([next(rest) for _ in bucket]) for bucket in chunks]
         warn_of_verdicts(buckets, config.min_views, config.min_light_variation)
@@ -296,8 +282,8 @@ class Factorize(nn.Module):
         self, chunk: _Chunk, posed: _Posed, problem: Bilinear, factors: Factors
     ) -> Photometry:
         rows, normals = posed.rows, chunk.normals
-        if problem.radiance.requires_grad and self.config.light_coupling == 0:
-            factors = differentiable(problem, factors)  # coupled ones have their gradients
+        if problem.radiance.requires_grad:
+            factors = differentiable(problem, factors)
         found = refine_on_manifold(problem, factors)
         sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
         lit = rows.seen.sum(dim=1) >= self.config.min_views
@@ -342,7 +328,7 @@ class Factorize(nn.Module):
             lights = anchor
             if config.start == "svd":
                 lights, shading = start_from_data(gray, rows.seen, anchor, shading)
-            if config.light_pull == 0 and config.light_coupling == 0:
+            if config.light_pull == 0:
                 anchor = lights
             square = manifold.split(shading.mT)[0] ** 2
             count = (square > 0).sum(dim=1).clamp_min(1)
@@ -383,27 +369,6 @@ class Factorize(nn.Module):
             convergence=found.convergence,
         )
         return split_colours(problem, radiance, found.chroma), factors
-
-    def _coupled(
-        self, seen: PatchViews, chunks: list[_Chunk], field: LightField
-    ) -> tuple[Factors, ...]:
-        batches = []
-        for chunk in chunks:
-            problem = self._pose(chunk, field).problem
-            batches.append(
-                Batch(
-                    problem=problem,
-                    patch_from_world=chunk.templates.patch_from_world.to(chunk.normals),
-                    facet=chunk.templates.facet,
-                )
-            )
-        pairs, _ = face_pairs(seen.patches.coarse.mesh.faces)
-        config = self.config
-        strength = config.light_coupling
-        found = solve_coupled(batches, pairs, strength, config.max_iterations, config.tolerance)
-        if any(batch.problem.radiance.requires_grad for batch in batches):
-            return differentiable_together(batches, found, pairs, strength)
-        return found
 
 
 def _of_rank(lights: Float[Tensor, "*batch 4"], rank: int) -> Float[Tensor, "*batch rank"]:

@@ -5,10 +5,9 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, PimperWarning
-from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.patches.carry import coarse_normals
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.photometry.harmonics import harmonics, rotate_lights
+from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.records import PatchVerdict, PatchViews
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
@@ -105,37 +104,6 @@ def test_a_patch_that_few_views_see_is_told_from_one_that_none_sees(scene):
     assert found.verdict.tolist() == [0, PatchVerdict.FEW_VIEWS, 0, 0, 0]
     assert (found.lights_patch[1, 3:] == 0).all()
     assert found.convergence.residual.isfinite().all()
-
-
-@pytest.mark.parametrize("coupling", [3.0, math.inf])
-def test_coupled_lights_agree_in_the_world_and_keep_the_normals(scene, coupling):
-    true = scene()
-    free, coupled = (
-        Factorize(
-            FactorizeConfig(
-                light="soft",
-                light_coupling=strength,
-                light_pull=0.1,
-                geometry_weight=0.0,
-                loss_scale=2.0,
-            )
-        )(true.seen)
-        for strength in (0.0, coupling)
-    )
-
-    def scatter(found):
-        world = torch.cat(
-            [
-                rotate_lights(invert_rigid(templates.patch_from_world), bucket.lights_patch)
-                for bucket, templates in zip(found.buckets, true.seen.patches.buckets, strict=True)
-            ]
-        )
-        return (world - world.mean(dim=0)).norm() / world.norm()
-
-    assert scatter(coupled) < 0.3 * scatter(free)
-    if math.isinf(coupling):
-        assert scatter(coupled) < 1e-6
-    assert median_error(coupled, true) < median_error(free, true)
 
 
 @pytest.mark.parametrize("rank", [3, 9])
@@ -273,7 +241,7 @@ def test_confidence_falls_with_noise(scene, generator):
     assert dirty.confidence[dirty.valid].mean() < 0.8 * clean.confidence[clean.valid].mean()
 
 
-@pytest.mark.parametrize("settings", [{}, {"light_coupling": 1.0}, {"colour": True}, {"rank": 3}])
+@pytest.mark.parametrize("settings", [{}, {"colour": True}, {"rank": 3}])
 def test_gradients_reach_the_radiance_of_lit_samples_only(scene, settings):
     true = scene()
     first = true.seen.buckets[0]
@@ -298,9 +266,6 @@ def test_what_is_handed_in_is_left_alone(scene):
     "wrong",
     [
         {"light_pull": -1.0},
-        {"light_coupling": -1.0},
-        {"light_coupling": 1.0, "rank": 9},
-        {"light_coupling": 1.0, "colour": True},
         {"start": "svd", "rank": 3},
         {"geometry_weight": -0.1},
         {"loss_scale": 0.0},
