@@ -75,7 +75,7 @@ def _parse(command: str, arguments: Sequence[str]) -> _Job:
         overwrite: Flag = False,
         config: Annotated[SceneConfig, tyro.conf.arg(name="")] = _DEFAULT,
     ) -> _Job:
-        """Render photographs of a scene under a moving lamp, and write the truth beside them.
+        """Render photographs of a scene under a lamp, and write the truth beside them.
 
         Args:
             scene: One of mug, jar, balls, potatoes, or the path of a mesh file.

@@ -66,7 +66,9 @@ def read_rendered(
     lamps, lights = _read_lights(folder, names, chosen)
     truth = Truth(
         mesh=read_mesh(folder / "truth" / "mesh.ply"),
-        surroundings=read_mesh(folder / "truth" / "surroundings.ply"),
+        surroundings=None
+        if settings.fixed_table
+        else read_mesh(folder / "truth" / "surroundings.ply"),
         lights_world=lights,
         lamps_world=lamps,
     )

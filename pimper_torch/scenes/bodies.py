@@ -1,12 +1,13 @@
 """What stands in a rendered scene, and what it is made of."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.config import require
+from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Mesh
 
@@ -45,6 +46,35 @@ class Body:
             self.texture,
             "a texture, or a mesh with an albedo of its own",
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Carried:
+    """A texture that moves with its body.
+
+    Attributes:
+        texture: In the body's own frame.
+        own_from_world: Rigid.
+    """
+
+    texture: Texture
+    own_from_world: Float[Tensor, "4 4"]
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
+        """Give the albedo at points of the world."""
+        return self.texture(transform(self.own_from_world.to(points), points))
+
+
+def carried(body: Body, world_from_own: Float[Tensor, "4 4"]) -> Body:
+    """Move a body from its own frame to a place in the world, with its texture."""
+    normals, texture = body.mesh.normals_world, body.texture
+    mesh = body.mesh.replace(
+        vertices_world=transform(world_from_own, body.mesh.vertices_world),
+        normals_world=None if normals is None else rotate(world_from_own, normals),
+    )
+    if texture is not None:
+        texture = Carried(texture=texture, own_from_world=invert_rigid(world_from_own))
+    return replace(body, mesh=mesh, texture=texture)
 
 
 def normals_at_vertices(body: Body) -> Float[Tensor, "vertex 3"]:

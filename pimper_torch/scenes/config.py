@@ -22,6 +22,12 @@ class SceneConfig:
         elevation_deg: Mean height of the camera over the table's plane.
         sway_deg: How far the camera goes up and down along the arc.
         fill: Share of the picture that the object takes, along the tighter side.
+        fixed_lamp: The lamp stands still beside the camera, as where the object turns; only with
+            the turntable. Else it goes to another place for every photograph.
+        fixed_room: A patterned floor and wall behind the object, which stand still before the
+            camera; only with the turntable. Else there is nothing beyond the table.
+        fixed_table: The table stands still before the camera, too, and the object alone turns;
+            only with the turntable. Else it turns with the object.
         light: A near lamp, whose light falls off over the object, or one far away.
         lamp_distance: Of the near lamp, in object sizes; up to a quarter nearer or farther.
         irradiance: Of the lamp, as the radiance of white facing it; a quarter more or less.
@@ -50,6 +56,9 @@ class SceneConfig:
     elevation_deg: float = 30.0
     sway_deg: float = 4.0
     fill: float = 0.94
+    fixed_lamp: bool = False
+    fixed_room: bool = False
+    fixed_table: bool = False
     light: Literal["point", "directional"] = "point"
     lamp_distance: float = 2.5
     irradiance: float = 0.85
@@ -81,6 +90,14 @@ class SceneConfig:
             f"between 2 and 85 with {self.sway_deg} (sway_deg) taken from it or added",
         )
         require(0.1 <= self.fill <= 1, "fill", self.fill, "between 0.1 and 1")
+        for name in ("fixed_lamp", "fixed_room", "fixed_table"):
+            fixed = getattr(self, name)
+            require(
+                not fixed or self.path == "turntable",
+                name,
+                fixed,
+                f"path turntable instead of {self.path}, for what stands still before the camera",
+            )
         require(self.lamp_distance >= 1, "lamp_distance", self.lamp_distance, "1 or more")
         for name in ("irradiance", "ambient", "flash"):
             value = getattr(self, name)

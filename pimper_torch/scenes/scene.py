@@ -13,7 +13,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Cameras, Mesh
-from pimper_torch.scenes.bodies import Body, albedo_at_vertices, normals_at_vertices
+from pimper_torch.scenes.bodies import Body, albedo_at_vertices, carried, normals_at_vertices
 from pimper_torch.scenes.cameras import (
     UP,
     aim_to_fit,
@@ -28,8 +28,10 @@ from pimper_torch.scenes.lights import Lights, lights_round
 from pimper_torch.scenes.meshes import join
 from pimper_torch.scenes.noise import random_speckle
 from pimper_torch.scenes.objects import RECIPES, cloth
+from pimper_torch.scenes.room import fixed_light, room, turned_about, turntable
 
 OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
+_MARGIN = 1.15  # of the turntable's radius over the object's reach from the axis
 _FOCAL = 1.6  # widths of the picture: a normal to short telephoto lens
 
 
@@ -40,9 +42,12 @@ class Scene:
     Attributes:
         name: Of the object, or the path of its mesh.
         config: How it is photographed.
-        bodies: The object's first, then its surroundings.
+        bodies: At rest in the world: the object's first, then its table, if that turns along.
         cameras: One a photograph; float64.
         lights: One a photograph.
+        fixed: Bodies that are at rest before the camera while the object turns, in the frame of
+            :mod:`pimper_torch.scenes.room`.
+        world_from_room: Where that frame is in each photograph.
     """
 
     name: str
@@ -50,6 +55,12 @@ class Scene:
     bodies: tuple[Body, ...]
     cameras: Cameras
     lights: Lights
+    fixed: tuple[Body, ...]
+    world_from_room: Float[Tensor, "view 4 4"]
+
+    def bodies_in(self, view: int) -> tuple[Body, ...]:
+        """Give all bodies where one photograph has them."""
+        return (*self.bodies, *(carried(body, self.world_from_room[view]) for body in self.fixed))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -62,9 +73,10 @@ class Scene:
         return _dressed([body for body in self.bodies if not body.surroundings])
 
     @property
-    def surroundings_mesh(self) -> Mesh:
-        """The table."""
-        return _dressed([body for body in self.bodies if body.surroundings])
+    def surroundings_mesh(self) -> Mesh | None:
+        """The table, if it turns with the object."""
+        around = [body for body in self.bodies if body.surroundings]
+        return _dressed(around) if around else None
 
     def noise(self, view: int) -> torch.Generator:
         """Give the random numbers of one photograph, whoever renders it."""
@@ -103,23 +115,56 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     eyes = target + distance * toward
     poses = look_at(eyes, target, target.new_tensor(UP))
     azimuths = torch.atan2(toward[:, 0], -toward[:, 1])
+    world_from_room = turned_about(target, azimuths)
+    lights = _lights(config, generator, azimuths, target, (lowest, highest))
+    reach = float((points - target)[:, :2].norm(dim=-1).amax())
+    turning, fixed = _surroundings(config, generator, target, _MARGIN * reach)
+    return Scene(
+        name=str(name_or_path),
+        config=config,
+        bodies=(*bodies, *turning),
+        cameras=pinholes(poses, focal_px, config.width, config.height),
+        lights=lights,
+        fixed=fixed,
+        world_from_room=world_from_room,
+    )
+
+
+def _lights(
+    config: SceneConfig,
+    generator: torch.Generator,
+    azimuths: Float[Tensor, " view"],
+    aim: Float[Tensor, " 3"],
+    box: tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]],
+) -> Lights:
+    lowest, highest = box
+    target = aim * aim.new_tensor(UP) if config.fixed_lamp else (lowest + highest) / 2
+    ahead = torch.zeros_like(azimuths) if config.path == "arc" else azimuths
     lights = lights_round(
-        torch.zeros_like(azimuths) if config.path == "arc" else azimuths,
+        torch.zeros_like(azimuths[:1]) if config.fixed_lamp else ahead,
         generator,
         distance=config.lamp_distance * float((highest - lowest).amax()),
-        target=(lowest + highest) / 2,
+        target=target,
         irradiance=config.irradiance,
         ambient=config.ambient,
         flash=config.flash,
         far=config.light == "directional",
     )
-    return Scene(
-        name=str(name_or_path),
-        config=config,
-        bodies=(*bodies, cloth(generator)),
-        cameras=pinholes(poses, focal_px, config.width, config.height),
-        lights=lights,
-    )
+    return fixed_light(lights, turned_about(aim, azimuths)) if config.fixed_lamp else lights
+
+
+def _surroundings(
+    config: SceneConfig, generator: torch.Generator, axis: Float[Tensor, " 3"], radius: float
+) -> tuple[tuple[Body, ...], tuple[Body, ...]]:
+    """Give what turns with the object, in the world, and what is fixed, in the room."""
+    table = cloth(generator)
+    if not (config.fixed_room or config.fixed_table):
+        return (table,), ()
+    table = turntable(table, radius)
+    fixed = room(generator) if config.fixed_room else ()
+    if config.fixed_table:
+        return (), (table, *fixed)
+    return (carried(table, turned_about(axis, torch.zeros_like(axis[:1]))[0]),), fixed
 
 
 def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "view 3"]:

@@ -9,7 +9,7 @@ file                            what
 `truth/sparse/`                 COLMAP model: exact cameras, true points, their tracks
 `truth/lights.json`             lamps of every photograph, and first-order harmonics
 `truth/mesh.ply`                the object
-`truth/surroundings.ply`        its table
+`truth/surroundings.ply`        its table, if that turns with the object
 `truth/maps/view_000.npz` ...   depth, normals, albedo and masks of every pixel; see
                                 :func:`pimper_torch.scenes.maps.write_maps`
 ==============================  ====================================================
@@ -126,26 +126,31 @@ class _Studio:
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         self._scene, self._folder = scene, folder
-        self._stage = Stage(scene.bodies)
-        bounces, seed = scene.config.bounces, scene.config.seed
-        self._between = Interreflection(self._stage, bounces, seed=seed) if bounces else None
+        self._set = _stage_in(scene, 0)
 
     def take(self, view: int) -> None:
         """Render one photograph and write it with its truth."""
         scene, name = self._scene, self._scene.names[view]
+        stage, between = _stage_in(scene, view) if scene.fixed else self._set
         frame = render_frame(
-            self._stage,
+            stage,
             scene.cameras,
             scene.lights,
             view,
             scene.noise(view),
             scene.config.sensor,
-            self._between,
+            between,
         )
         _write_photograph(frame.image, scene.config, self._folder / "photos" / name)
         mask = Image.fromarray(255 * frame.foreground.numpy().astype(np.uint8))
         mask.save(self._folder / "masks" / name)
         write_maps(frame, (self._folder / "truth" / "maps" / name).with_suffix(".npz"))
+
+
+def _stage_in(scene: Scene, view: int) -> tuple[Stage, Interreflection | None]:
+    stage = Stage(scene.bodies_in(view))
+    bounces, seed = scene.config.bounces, scene.config.seed
+    return stage, Interreflection(stage, bounces, seed=seed) if bounces else None
 
 
 _studio: _Studio | None = None  # of this process
@@ -188,11 +193,11 @@ def _write_photograph(
 def _write_truth(scene: Scene, folder: Path) -> None:
     surface, around = scene.object_mesh, scene.surroundings_mesh
     write_ply(surface, folder / "mesh.ply")
-    write_ply(around, folder / "surroundings.ply")
+    if around is not None:
+        write_ply(around, folder / "surroundings.ply")
     generator = torch.Generator().manual_seed(scene.config.seed)
-    model, albedo = true_model(
-        surface, join(surface, around), scene.cameras, scene.names, generator
-    )
+    blockers = surface if around is None else join(surface, around)
+    model, albedo = true_model(surface, blockers, scene.cameras, scene.names, generator)
     write_binary(model, to_bytes(albedo), folder / "sparse")
     _write_json(_lights_account(scene), folder / "lights.json")
     account = {

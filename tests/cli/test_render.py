@@ -34,6 +34,17 @@ def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
     assert "photographs 2" in told.err
 
 
+def test_a_room_and_a_lamp_stand_still_on_demand_and_only_where_the_object_turns(
+    ball, tmp_path, capsys
+):
+    options = ("--fixed-lamp", "--fixed-room", "--fixed-table")
+    assert render(ball, tmp_path / "out", *options) == 2
+    assert "fixed_lamp is True; needed: path turntable" in capsys.readouterr().err
+    assert render(ball, tmp_path / "out", "--path", "turntable", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert all(settings[name] for name in ("fixed_lamp", "fixed_room", "fixed_table"))
+
+
 def test_a_former_rendering_is_replaced_only_on_demand(ball, tmp_path, capsys):
     assert render(ball, tmp_path / "out") == 0
     assert render(ball, tmp_path / "out") == 2
