@@ -24,14 +24,15 @@ def checked(
     """Check a mesh, wind its faces alike, and turn each piece's front to the cameras.
 
     Args:
-        mesh: World frame.
-        cameras: That see it.
+        mesh: World frame; files give it in double precision.
+        cameras: That see it; the result has their floating-point type and device.
 
     Raises:
         InputError: The mesh has no faces, is not finite, names vertices it does not have, or
             no camera sees it.
     """
-    vertices, faces = mesh.vertices_world.detach(), mesh.faces
+    vertices = mesh.vertices_world.detach().to(cameras.cam_from_world)
+    faces = mesh.faces.to(vertices.device)
     if len(faces) == 0:
         raise InputError(
             f"coarse mesh: the mesh that was given has {len(vertices)} vertices and no faces. "

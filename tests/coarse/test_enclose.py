@@ -123,7 +123,7 @@ def test_masks_keep_the_rest_out():
 
 def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_about):
     vertices, faces = icosphere(3)
-    inside_out = Mesh(vertices_world=vertices.float(), faces=faces.flip(1))
+    inside_out = Mesh(vertices_world=vertices, faces=faces.flip(1))
     coarse = Enclose(SETTINGS)(round_about, inside_out)
     outward = face_normals(coarse.mesh.vertices_world, coarse.mesh.faces)
     middle = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
@@ -135,7 +135,9 @@ def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_ab
 
 def test_a_small_mesh_that_is_brought_stays_as_it_is(round_about):
     vertices, faces = icosphere(1)
-    coarse = Enclose(SETTINGS)(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
+    assert vertices.dtype == torch.float64  # as files give it
+    coarse = Enclose(SETTINGS)(round_about, Mesh(vertices_world=vertices, faces=faces))
+    assert coarse.mesh.vertices_world.dtype == round_about.cameras.intrinsics.dtype == torch.float32
     assert_close(coarse.mesh.vertices_world[coarse.mesh.faces], vertices.float()[faces])
 
 
