@@ -121,7 +121,7 @@ class Pimper(nn.Module):
         self.extract: nn.Module = Extract(config.extract)
 
     def forward(
-        self, views: Views, sparse_model: Path | None = None, mesh: Mesh | None = None
+        self, views: Views, sparse_model: Path | str | None = None, mesh: Mesh | None = None
     ) -> Reconstruction:
         """Reconstruct the surface that the photographs show.
 
@@ -130,7 +130,8 @@ class Pimper(nn.Module):
                 is to run on.
             sparse_model: Folder of a COLMAP model of these photographs, used instead of
                 running structure from motion.
-            mesh: A rough surface in that model's frame, used instead of the photographs' own.
+            mesh: A rough surface in that model's frame, of any floating-point type, used
+                instead of the photographs' own.
 
         Raises:
             PimperError: What was found at which stage, what was needed, what to do.

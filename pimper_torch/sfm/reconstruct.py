@@ -117,7 +117,7 @@ class Reconstruct(nn.Module):
         super().__init__()
         self.config = config or ReconstructConfig()
 
-    def forward(self, views: Views, sparse_model: Path | None = None) -> SparseScene:
+    def forward(self, views: Views, sparse_model: Path | str | None = None) -> SparseScene:
         """Place the photographs.
 
         Args:
@@ -135,7 +135,7 @@ class Reconstruct(nn.Module):
         if sparse_model is None:
             model = self._structure_from_motion(views)
         else:
-            model = self._existing_model(views, sparse_model)
+            model = self._existing_model(views, Path(sparse_model))
         missing = [name for name in views.names if name not in model.names]
         if missing:
             warnings.warn(

@@ -77,6 +77,7 @@ def test_a_models_subfolders_do_not_matter(scene, views, tmp_path):
     )
     write_model(inside, tmp_path)
     assert Reconstruct()(views, tmp_path).views.names == views.names
+    assert Reconstruct()(views, str(tmp_path)).views.names == views.names
 
 
 def test_a_model_of_larger_photographs_is_scaled_to_these(scene, views, tmp_path):
