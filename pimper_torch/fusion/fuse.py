@@ -23,6 +23,7 @@ from pimper_torch.fusion.evidence import (
     swept_heights,
     upright,
 )
+from pimper_torch.fusion.photometry import check_photometry
 from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import face_edges, vertex_normals
@@ -149,7 +150,11 @@ class Fuse(nn.Module):
 
         The convergence's residual is the root mean square distance that the surface moved, in
         scene units; its iterations are the solves.
+
+        Raises:
+            InputError: As :func:`~pimper_torch.fusion.photometry.check_photometry`.
         """
+        check_photometry(swept.photometric)
         config, patches = self.config, swept.patches
         facets = patches.coarse.mesh.faces
         spacing = vertex_spacing(patches, config.samples_per_vertex)

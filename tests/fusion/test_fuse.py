@@ -1,8 +1,9 @@
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from pimper_torch.coarse.adapt import Adapt
-from pimper_torch.errors import ConfigError
+from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.records import FacetPoints
@@ -57,7 +58,7 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
     buckets = []
     for found in given.photometric.buckets:
         wrong = found.normals_patch + torch.tensor([0.15, 0.0, 0.0]).double()
-        buckets.append(found.replace(normals_patch=torch.nn.functional.normalize(wrong, dim=-1)))
+        buckets.append(found.replace(normals_patch=normalize(wrong, dim=-1)))
     photometric = given.photometric.replace(buckets=tuple(buckets))
     tilted = given.replace(photometric=photometric)
     kept = off_plane(lifted, Fuse()(tilted))
@@ -66,18 +67,52 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
     assert kept.std() < 0.5 * trusting.std()
 
 
-def test_normals_that_face_away_raise_no_fold(swept):
+def test_normals_at_right_angles_to_the_direction_of_heights_raise_no_fold(swept):
     lifted, given = swept(1.0)
     buckets = []
     for found in given.photometric.buckets:
         normals = found.normals_patch.clone()
         size = normals.shape[1] // 3
-        wrong = torch.tensor([0.8, 0.0, 0.6], dtype=torch.float64)
+        wrong = normalize(torch.tensor([1.0, 0.0, -0.05], dtype=torch.float64), dim=0)
         normals[:, size : 2 * size, size : 2 * size] = wrong
         buckets.append(found.replace(normals_patch=normals))
     photometric = given.photometric.replace(buckets=tuple(buckets))
     surface = Fuse(FuseConfig(heights=False))(given.replace(photometric=photometric))
-    assert (off_plane(lifted, surface) - lifted.height).abs().max() < 1.0  # a fold: 10
+    assert (off_plane(lifted, surface) - lifted.height).abs().max() < 1.0  # a fold: 5.6
+
+
+def spoiled(given, **changes):
+    """Change one sample of the photometry of facet 1."""
+    buckets = []
+    for templates, found in zip(given.patches.buckets, given.photometric.buckets, strict=True):
+        new = {name: getattr(found, name).clone() for name in changes}
+        for name, value in changes.items():
+            new[name][templates.facet == 1, 3, 3] = value
+        buckets.append(found.replace(**new))
+    return given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"normals_patch": torch.tensor([0.0, 0, 1]).double()}, "1 of .* face away .* facet 1"),
+        ({"normals_patch": torch.tensor([1.0, 0, 0]).double()}, "1 of .* face away"),
+        ({"normals_patch": torch.full((3,), torch.nan).double()}, "not finite"),
+        ({"confidence": 1.5}, "1 confidences .* such as 1.5, .* facet 1"),
+        ({"confidence": -0.1}, "such as -0.1"),
+        ({"confidence": torch.nan}, "such as nan"),
+    ],
+)
+def test_normals_and_confidences_that_cannot_be_are_refused(swept, changes, told):
+    _, given = swept(0.5)
+    with pytest.raises(InputError, match=told):
+        Fuse()(spoiled(given, valid=True, **changes))
+
+
+def test_normals_that_are_not_valid_may_face_anywhere(swept):
+    _, given = swept(0.5)
+    away = spoiled(given, valid=False, normals_patch=torch.tensor([0.0, 0, 1]).double())
+    assert Fuse()(away).vertices_world.isfinite().all()
 
 
 def with_points(given, points, claimed: float):
@@ -121,7 +156,7 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
     for found, templates in zip(given.photometric.buckets, given.patches.buckets, strict=True):
         lean = 0.1 * (1 - 2 * templates.facet.double())[:, None, None]
         wrong = found.normals_patch + torch.stack([lean, 0 * lean, 0 * lean], dim=-1)
-        buckets.append(found.replace(normals_patch=torch.nn.functional.normalize(wrong, dim=-1)))
+        buckets.append(found.replace(normals_patch=normalize(wrong, dim=-1)))
     tilted = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
     points = near_plane(lifted, 0.3 * spacing, count=60)
     surface = Fuse()(with_points(tilted, points, 0.02 * spacing))
