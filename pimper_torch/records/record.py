@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,13 +18,21 @@ class Record:
     were handed.
     """
 
-    def to(self: AnyRecord, device: torch.device | str) -> AnyRecord:
-        """Copy every tensor, in nested records and tuples too, to ``device``."""
-        moved = {
-            field.name: _moved(getattr(self, field.name), device)
-            for field in dataclasses.fields(self)
-        }
-        return dataclasses.replace(self, **moved)
+    def to(
+        self: AnyRecord,
+        target: torch.device | str | torch.dtype,
+        dtype: torch.dtype | None = None,
+    ) -> AnyRecord:
+        """Copy every tensor, in nested records and tuples too, to a device, a dtype, or both.
+
+        Args:
+            target: A device, or a dtype alone: ``to("cuda")``, ``to(torch.float64)``,
+                ``to("cuda", torch.float64)``.
+            dtype: Of floating-point tensors. Integers and masks keep theirs.
+        """
+        if isinstance(target, torch.dtype):
+            return _moved(self, None, target)
+        return _moved(self, torch.device(target), dtype)
 
     def replace(self: AnyRecord, **changes: object) -> AnyRecord:
         """Return a copy with some fields changed."""
@@ -38,11 +46,21 @@ class Record:
         return f"{type(self).__name__}({fields})"
 
 
-def _moved(value: object, device: torch.device | str) -> object:
-    if isinstance(value, Tensor | Record):
-        return value.to(device)
+def _moved(  # gives a record for a record, a tensor for a tensor
+    value: Any,  # noqa: ANN401
+    device: torch.device | None,
+    dtype: torch.dtype | None,
+) -> Any:  # noqa: ANN401
+    if isinstance(value, Tensor):
+        return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+    if isinstance(value, Record):
+        moved = {
+            field.name: _moved(getattr(value, field.name), device, dtype)
+            for field in dataclasses.fields(value)
+        }
+        return dataclasses.replace(value, **moved)
     if isinstance(value, tuple):
-        return tuple(_moved(item, device) for item in value)
+        return tuple(_moved(item, device, dtype) for item in value)
     return value
 
 

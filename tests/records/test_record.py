@@ -42,6 +42,18 @@ def test_moving_a_record_moves_every_tensor_down_to_the_last(cameras):
     assert box.inside.intrinsics.device.type == "cpu"
 
 
+def test_only_floating_point_tensors_change_their_type(cameras):
+    many = (torch.zeros(2), torch.ones(3) > 0, torch.arange(4))
+    box = Box(inside=cameras.to(torch.float32), many=many, label="box")
+    for moved in (box.to(torch.float64), box.to("cpu", torch.float64)):
+        assert moved.inside.intrinsics.dtype == torch.float64
+        assert moved.inside.sizes_px.dtype == torch.int64
+        assert [tensor.dtype for tensor in moved.many] == [torch.float64, torch.bool, torch.int64]
+    both = box.to("meta", torch.float64).inside.intrinsics
+    assert (both.device.type, both.dtype) == ("meta", torch.float64)
+    assert box.to("meta").inside.intrinsics.dtype == torch.float32
+
+
 def test_replace_changes_a_copy_alone(cameras):
     farther = cameras.replace(sizes_px=cameras.sizes_px * 2)
     assert farther.sizes_px[0].tolist() == [12, 8]
