@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import singledispatch
 from typing import Protocol, runtime_checkable
 
@@ -53,9 +54,15 @@ class Silent:
         """Do nothing."""
 
 
+# The reports of the call that this thread is in. Hooks belong to a module, which threads share.
+_recording: ContextVar[list[StageReport] | None] = ContextVar("recording", default=None)
+
+
 @contextmanager
 def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]]:
     """Time the direct submodules of ``chain`` while the ``with`` block calls them.
+
+    Threads that share ``chain`` have reports of their own.
 
     Yields:
         The list that a report is appended to whenever a submodule has run.
@@ -66,10 +73,13 @@ def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]
     for name, stage in chain.named_children():
 
         def before(_: nn.Module, __: tuple[object, ...], name: str = name) -> None:
-            began[name] = time.perf_counter()
-            observer.started(name)
+            if _recording.get() is reports:
+                began[name] = time.perf_counter()
+                observer.started(name)
 
         def after(_: nn.Module, __: tuple[object, ...], output: object, name: str = name) -> None:
+            if _recording.get() is not reports:
+                return
             reports.append(
                 StageReport(
                     name=name,
@@ -81,10 +91,12 @@ def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]
             observer.finished(reports[-1])
 
         hooks += [stage.register_forward_pre_hook(before), stage.register_forward_hook(after)]
+    token = _recording.set(reports)
     try:
         with listening(observer.progressed):
             yield reports
     finally:
+        _recording.reset(token)
         for hook in hooks:
             hook.remove()
 

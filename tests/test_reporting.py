@@ -1,3 +1,5 @@
+import threading
+
 import pytest
 import torch
 from torch import nn
@@ -50,6 +52,30 @@ def test_stages_are_reported_in_the_order_they_run_with_their_figures():
     assert reports[0].figures == {"vertices": 4, "faces": 4, "openings": 0}
     assert all(entry.seconds >= 0 and entry.peak_memory_mb > 10 for entry in reports)
     assert listener.heard[:3] == ["started second", "1/1", "finished second"]
+
+
+def test_threads_that_share_a_chain_have_reports_of_their_own():
+    chain, told = Chain(), {}
+    inside, listeners = (
+        threading.Barrier(2, timeout=60),
+        {"first": Listener(), "second": Listener()},
+    )
+
+    def call(stage):
+        with recorded(chain, listeners[stage]) as reports:
+            inside.wait()  # both have their hooks on the chain
+            getattr(chain, stage)()
+            inside.wait()
+        told[stage] = [entry.name for entry in reports]
+
+    threads = [threading.Thread(target=call, args=(stage,)) for stage in listeners]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert told == {"first": ["first"], "second": ["second"]}
+    for stage, listener in listeners.items():
+        assert listener.heard == [f"started {stage}", "1/1", f"finished {stage}"]
 
 
 def test_no_hook_stays_behind_even_after_a_failure():
