@@ -36,7 +36,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
 
         Args:
             photos: Folder of JPEG, PNG or TIFF files; the camera did not move.
-            mask: Image that is bright on the object and dark off it.
+            mask: Image that is bright on the object and dark off it, of the photographs' size.
             rank: 3 if lamps are far away and the room is dark, 4 with ambient light.
             max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         """
@@ -49,7 +49,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
             bars.started("read")
             with listening(bars.progressed):
                 views = load_views(photos, encoding=LINEAR, max_size_px=max_size_px)
-        drawn = None if mask is None else read_mask(mask)
+        drawn = None if mask is None else read_mask(mask, max_size_px)
         found = gamma_of_photographs(views, mask=drawn, rank=rank)
         Console().print(f"{found}{advice(found)}", highlight=False, soft_wrap=True, markup=False)
 

@@ -65,9 +65,12 @@ def read_photographs(
     )
 
 
-def read_mask(path: Path) -> Bool[Tensor, "height width"]:
-    """Read a drawn mask: true where it is brighter than half."""
-    return decode(_there(path)).samples.amax(dim=0) >= _OPAQUE
+def read_mask(path: Path, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
+    """Read a drawn mask, true where it is brighter than half; shrunk as its photographs are."""
+    drawn = decode(_there(path)).samples.amax(dim=0) >= _OPAQUE
+    if max_size_px == 0:
+        return drawn
+    return resized_mask(drawn.float(), *shrunk_size(read_header(path), max_size_px))
 
 
 def nearest(

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from pimper_torch.cli import gamma
 from pimper_torch.cli.gamma import advice
 from pimper_torch.cli.main import main
 from pimper_torch.photometry.gamma import GammaEstimate
@@ -30,9 +32,23 @@ def test_the_gamma_of_a_folder_is_told_with_the_option_that_says_so(fixed, capsy
     mask = str(fixed / "mask.png")
     assert main(["gamma", str(fixed / "photos"), "--mask", mask, "--rank", "3"]) == 0
     told = capsys.readouterr().out
-    gamma = float(told.split()[1])
-    assert abs(gamma - 1.8) < 0.06
-    assert f"--photographs.response {gamma:.2f}" in told
+    found = float(told.split()[1])
+    assert abs(found - 1.8) < 0.06
+    assert f"--photographs.response {found:.2f}" in told
+
+
+def test_the_mask_is_shrunk_with_the_photographs(fixed, capsys, monkeypatch):
+    given = {}
+
+    def stand_in(views, *, mask, rank):
+        given.update(views=views, mask=mask)
+        return estimate(1.81, (0.005, 0.012, 0.009))
+
+    monkeypatch.setattr(gamma, "gamma_of_photographs", stand_in)
+    options = ["--mask", str(fixed / "mask.png"), "--max-size-px", "20"]
+    assert main(["gamma", str(fixed / "photos"), *options]) == 0
+    assert given["views"].images.shape[-2:] == given["mask"].shape == (20, 20)
+    assert abs(float(given["mask"].double().mean()) - 0.2 * torch.pi) < 0.03  # x^2 + y^2 < 0.8
 
 
 def test_what_the_user_can_mend_is_one_message(fixed, capsys):
