@@ -1,0 +1,208 @@
+"""Every option of every command, once, from the command line."""
+
+import dataclasses
+import re
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import pytest
+
+from pimper_torch.cli.main import main
+from pimper_torch.cli.options import parse
+from pimper_torch.errors import ConfigError
+from pimper_torch.io import results
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.pipeline import PimperConfig
+from pimper_torch.records import Mesh
+from pimper_torch.scenes.meshes import icosphere
+
+# What each option is given; {names} are places in the folder of `world`.
+RUNS = {
+    "reconstruct": [
+        "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
+        "--preset {preset} --reference view_002 --max-size-px 48 --overwrite"
+    ],
+    "demo": [
+        "-o {out} --preset fast --reference 38 --device cpu --max-size-px 60 --overwrite",
+    ],
+    "render": [
+        "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
+        "--elevation-deg 40 --sway-deg 2 --light point --lamp-distance 3 --irradiance 0.5 "
+        "--ambient 0.2 --flash 0.1 --bounces 1 --exposure 1.2 --read-noise 0.01 --shot-noise 0.01 "
+        "--supersample 2 --bits 16 --encoding linear --up y --specular 0.1 --roughness 0.2",
+        "{ball} -o {out} {tiny} --path turntable --fixed-lamp --fixed-room --fixed-table",
+        "{ball} -o {out} {tiny} --path turntable --no-fixed-lamp --no-fixed-room --no-fixed-table",
+    ],
+    "evaluate": [
+        "{true_mesh} {scene} -o {out}.json --truth-layout rendered --samples 500 --seed 2 --views "
+        "view_000 view_001 --thresholds-percent 0.5 1 --seen-from 2 --alignment icp "
+        "--trimmed-share 0.1 --icp-distance point",
+        "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500",
+    ],
+    "bench": [
+        "--out {out} --scale quick --scenes {scene} --methods smoothed --masks --cameras true "
+        "--seed 2 --samples 500 --processes 1 --overwrite",
+        "-o {out} --no-masks --scenes {scene} --methods smoothed --cameras true --samples 500",
+    ],
+    "convert": [
+        "{sparse} --out {out} --source colmap --target idr --overwrite --images {photos} "
+        "--masks {masks} --mesh {ball} --max-size-px 32 --photographs.response linear "
+        "--photographs.saturation 250 --photographs.black 2",
+        "{dtu} -o {out} --source dtu-mvs --target transforms --scan 9 --light-seed 1",
+    ],
+    "gamma": ["{photos} --mask {masks}/view_000.png --rank 3 --max-size-px 40"],
+}
+TINY = "--num-views 2 --width 32 --height 24 --processes 1"
+PRESET = "rounds: {scales: [0.5]}\nsweep: {min_views: 2, num_views: 4}\n"
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory, dtu):
+    """A ball and photographs of it, as `pimper render` writes them."""
+    folder = tmp_path_factory.mktemp("world")
+    vertices, faces = icosphere(2)
+    write_ply(Mesh(vertices_world=vertices, faces=faces), folder / "ball.ply")
+    (folder / "preset.yaml").write_text(PRESET)
+    scene = folder / "scene"
+    small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1"
+    assert main(["render", str(folder / "ball.ply"), "-o", str(scene), *small.split()]) == 0
+    return {
+        "ball": folder / "ball.ply",
+        "preset": folder / "preset.yaml",
+        "scene": scene,
+        "photos": scene / "photos",
+        "masks": scene / "masks",
+        "sparse": scene / "truth" / "sparse",
+        "true_mesh": scene / "truth" / "mesh.ply",
+        "dtu": dtu,
+        "tiny": TINY,
+    }
+
+
+@pytest.fixture
+def small_overview(monkeypatch):
+    draw = results.draw_overview
+    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+
+
+def run(command, line, world, tmp_path):
+    return main([command, *line.format(out=tmp_path / "out", **world).split()])
+
+
+@pytest.mark.parametrize(
+    ("command", "line"),
+    [(command, line) for command in RUNS if command != "demo" for line in RUNS[command]],
+)
+@pytest.mark.usefixtures("small_overview")
+def test_every_option_of_a_command_runs(command, line, world, tmp_path):
+    assert run(command, line, world, tmp_path) == 0
+
+
+def test_every_option_of_the_demo_reaches_the_chain(chain, tmp_path):
+    # Its chain is that of `reconstruct`, whose options run above; its photographs are large.
+    (line,) = RUNS["demo"]
+    assert run("demo", line, {}, tmp_path) == 0
+    config, views, _ = chain.given
+    assert config.enclose.reference == config.triangulate.reference == "38"
+    assert config.rounds.scales == ()
+    assert max(views.images.shape[-2:]) == 60
+
+
+def told(command, capsys):
+    """List the options that a command's help tells, with each of their names."""
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    lines = re.findall(r"^  (-.*?)(?:  .*)?$", capsys.readouterr().out, flags=re.MULTILINE)
+    return {name for line in lines for name in re.findall(r"(?:^| )(--?[a-z][\w.-]*)", line)}
+
+
+@pytest.mark.parametrize("command", RUNS)
+def test_no_option_is_without_a_run(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    names = told(command, capsys) - {"-h", "--help"}
+    if command in ("reconstruct", "demo"):
+        settings, names = ({n for n in names if ("." in n) is dotted} for dotted in (True, False))
+        assert settings == {name for field in leaves(PimperConfig()) for name in spelt(field)}
+    given = " ".join(RUNS[command]).replace("{tiny}", TINY).replace("-o ", "--out ").split()
+    assert names - {"-o"} == {word for word in given if word.startswith("-")}
+
+
+@dataclasses.dataclass(frozen=True)
+class Leaf:
+    """A setting: its path in the configuration, its type and its default."""
+
+    path: tuple[str, ...]
+    kind: Any
+    value: Any
+
+
+def leaves(config, path=()):
+    kinds = get_type_hints(type(config))
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from leaves(value, (*path, field.name))
+        else:
+            yield Leaf((*path, field.name), kinds[field.name], value)
+
+
+def spelt(leaf):
+    """Give the names of a setting's option."""
+    *stages, name = (part.replace("_", "-") for part in leaf.path)
+    if leaf.kind is not bool:
+        return [f"--{'.'.join([*stages, name])}"]
+    return [f"--{'.'.join([*stages, no + name])}" for no in ("", "no-")]
+
+
+def rivals(leaf):
+    """Give values that a setting may have in place of its default."""
+    kind, value = leaf.kind, leaf.value
+    if get_origin(kind) in (UnionType, Union):
+        choices = [one for kind in get_args(kind) for one in get_args(kind)]
+        yield from (choice for choice in choices if isinstance(choice, str) and choice != value)
+        yield 0.9
+    elif get_origin(kind) is Literal:
+        yield from (choice for choice in get_args(kind) if choice != value)
+    elif isinstance(value, bool):
+        yield not value
+    elif isinstance(value, tuple):
+        yield value[:-1]
+        yield (*value, 0.5)
+    elif isinstance(value, str):
+        yield from ("SIMPLE_PINHOLE", "other")
+    elif isinstance(value, int):
+        yield from (value + 1, value - 1)
+    else:
+        yield from (0.9 * value, 1.1 * value, 0.25, value + 1)
+
+
+def changed(config, path, value):
+    first, *rest = path
+    inner = changed(getattr(config, first), rest, value) if rest else value
+    return dataclasses.replace(config, **{first: inner})
+
+
+def words(leaf, value):
+    if isinstance(value, bool):
+        return [spelt(leaf)[0 if value else 1]]
+    text = f"({','.join(map(repr, value))},)" if isinstance(value, tuple) else str(value)
+    return [spelt(leaf)[0], text]
+
+
+def test_every_setting_of_every_stage_reaches_the_configuration():
+    left = list(leaves(PimperConfig()))
+    while left:  # some settings exclude one another: those refused come in the next line
+        config, line, refused = PimperConfig(), [], []
+        for leaf in left:
+            for value in rivals(leaf):
+                try:
+                    config = changed(config, leaf.path, value)
+                except ConfigError:
+                    continue
+                line += words(leaf, value)
+                break
+            else:
+                refused.append(leaf)
+        assert len(refused) < len(left), f"no other value is allowed: {refused}"
+        assert parse("reconstruct", ["photos", "-o", "out", *line]).config == config
+        left = refused
