@@ -28,13 +28,6 @@ def grid_from_pixels(
     return 2 * pixels / pixels.new_tensor([width, height]) - 1
 
 
-def pixels_from_grid(
-    grid: Float[Tensor, "*batch 2"], width: int, height: int
-) -> Float[Tensor, "*batch 2"]:
-    """Undo :func:`grid_from_pixels`."""
-    return (grid + 1) / 2 * grid.new_tensor([width, height])
-
-
 def indices_from_pixels(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
     """Count from the centre of the top-left pixel instead of its corner."""
     return pixels - 0.5
@@ -43,20 +36,6 @@ def indices_from_pixels(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*ba
 def pixels_from_indices(indices: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
     """Count from the corner of the top-left pixel instead of its centre."""
     return indices + 0.5
-
-
-def homography_in_indices(
-    homography: Float[Tensor, "*batch 3 3"],
-) -> Float[Tensor, "*batch 3 3"]:
-    """Conjugate a homography between pixels for functions that count centres from 0.
-
-    kornia's ``warp_perspective`` is such a function, whichever flag it gets.
-    """
-    index_from_pixel = torch.eye(3, dtype=homography.dtype, device=homography.device)
-    index_from_pixel[:2, 2] = -0.5
-    pixel_from_index = 2 * torch.eye(3, dtype=homography.dtype, device=homography.device)
-    pixel_from_index = pixel_from_index - index_from_pixel
-    return index_from_pixel @ homography @ pixel_from_index
 
 
 def pixel_centers(

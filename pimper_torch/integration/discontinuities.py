@@ -37,9 +37,6 @@ from pimper_torch.records import Convergence, Record, StopCause
 # The first scale, in pixels, and by how much each round divides it.
 _FIRST_SCALE, _NARROWER = 3.0, 3.0
 
-# The twist at which a step starts with a quarter of its weight.
-_TWIST = 1.0
-
 # Of the linear systems' solutions, in their energy; what remains is far below any scale.
 _TOLERANCE = 1e-6
 

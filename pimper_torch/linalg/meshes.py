@@ -1,13 +1,10 @@
-r"""Linear finite elements on triangle meshes: gradient, divergence, Laplacian and mass.
+r"""Linear finite elements on triangle meshes: gradient, Laplacian and mass.
 
 A function is its values at the vertices, linear on every face. With :math:`G` the gradient,
-:math:`A` the areas of the faces and :math:`w` a weight of each, the operators are tied by
-
-.. math:: \mathrm{div} = -G^T A, \qquad L = G^T A\, w\, G
-
-so that the least-squares fit of heights to slopes :math:`p`, :math:`\min \int w |\nabla z - p|^2`,
-is :math:`L z = -\mathrm{div}(w p)`: a graph Laplacian with half the cotangents of the angles
-opposite to an edge.
+:math:`A` the areas of the faces and :math:`w` a weight of each, the Laplacian is
+:math:`L = G^T A\, w\, G`: that of a graph whose edges weigh half the cotangents of the angles
+opposite to them. The least-squares fit of heights to slopes :math:`p`,
+:math:`\min \int w |\nabla z - p|^2`, is :math:`L z = G^T A\, w\, p`.
 
 Source: Dziuk, in Partial Differential Equations and Calculus of Variations, 1988.
 """
@@ -59,19 +56,6 @@ def gradient(
 ) -> Float[Tensor, "face channel 3"]:
     """Give the gradient on every face, within its plane; a face without area has none, NaN."""
     return values[mesh.faces].mT @ mesh.turned / (2 * mesh.area)[:, None, None]
-
-
-def divergence(
-    mesh: Elements, field: Float[Tensor, "face channel 3"]
-) -> Float[Tensor, "vertex channel"]:
-    """Give what flows out round each vertex, times the area it stands for.
-
-    Minus the transpose of :func:`gradient` with areas as weights; nothing flows through the
-    border. Constant fields have none at vertices inside a plane.
-    """
-    flow = mesh.turned @ field.mT / -2
-    total = flow.new_zeros(mesh.count, field.shape[1])
-    return total.index_add(0, mesh.faces.flatten(), flow.flatten(0, 1))
 
 
 def cotangent_laplacian(

@@ -34,39 +34,6 @@ Method = Literal["auto", "cholesky", "multigrid", "cosine"]
 _CHOLESKY_PIXELS = 20_000
 
 
-def edge_weights(
-    weight: Float[Tensor, "height width"],
-    pixel_width: float = 1.0,
-    pixel_height: float = 1.0,
-) -> tuple[Float[Tensor, "height steps_right"], Float[Tensor, "steps_down width"]]:
-    """Give the weights of steps from those of pixels.
-
-    Args:
-        weight: Of a pixel's slopes, per area; zero outside the mask.
-        pixel_width: Distance between neighbours in a row.
-        pixel_height: Distance between rows.
-
-    Returns:
-        Of steps to the right and down: the mean of both pixels, times the area over the squared
-        distance, as a step is a slope times a distance; zero where either pixel is outside.
-    """
-    inside = weight > 0
-    right = torch.where(inside[:, 1:] & inside[:, :-1], (weight[:, 1:] + weight[:, :-1]) / 2, 0)
-    down = torch.where(inside[1:] & inside[:-1], (weight[1:] + weight[:-1]) / 2, 0)
-    return right * (pixel_height / pixel_width), down * (pixel_width / pixel_height)
-
-
-def steps_from_slopes(
-    slope_right: Float[Tensor, "height width"],
-    slope_down: Float[Tensor, "height width"],
-    pixel_width: float = 1.0,
-    pixel_height: float = 1.0,
-) -> tuple[Float[Tensor, "height steps_right"], Float[Tensor, "steps_down width"]]:
-    """Give the steps between neighbours: the mean slope of both, right to second order."""
-    right = (slope_right[:, 1:] + slope_right[:, :-1]) * (pixel_width / 2)
-    return right, (slope_down[1:] + slope_down[:-1]) * (pixel_height / 2)
-
-
 class RasterSystem:
     r"""The matrix :math:`D^T W D + \mathrm{diag}(a)` of a raster, prepared for many solves.
 

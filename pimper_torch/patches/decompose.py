@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -11,7 +11,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
 from pimper_torch.patches.carry import carry
 from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
@@ -183,39 +183,6 @@ def group_by_size(
         starts = range(0, len(facets), count)
         buckets += [(facets[start : start + count], (height, width)) for start in starts]
     return buckets
-
-
-def facet_masks(
-    coarse: CoarseMesh, cameras: Cameras, view: int, overlap: float
-) -> Bool[Tensor, "face height width"]:
-    """Give the paper's binary masks: which pixels of a view see which enlarged facet.
-
-    A pixel belongs when the point where its ray meets the facet's plane has barycentric
-    coordinates inside the enlarged triangle. Occlusion is not considered.
-
-    Args:
-        coarse: The facets.
-        cameras: Of all views.
-        view: The one asked about.
-        overlap: How far edges are moved outward, scene units.
-    """
-    vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
-    frames = facet_frames(vertices, faces, cameras.cam_from_world[coarse.reference])
-    enlarged = enlarge(
-        transform(frames, vertices[faces])[..., :2], torch.as_tensor(overlap).to(vertices)
-    )
-    width, height = (int(side) for side in cameras.sizes_px[view])
-    pixels = pixel_centers(width, height, like=vertices).reshape(-1, 2)
-    rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
-    center = transform(frames, cameras.centers_world[view][None])
-    masks = []
-    for frame, corners, start in zip(frames, enlarged, center[:, 0], strict=True):
-        along = rays @ frame[:3, :3].mT
-        reach = -start[2] / along[:, 2]
-        where = start[:2] + reach[:, None] * along[:, :2]
-        inside = (barycentric_2d(where, corners[None]) >= 0).all(dim=-1) & (reach > 0)
-        masks.append(inside.reshape(height, width))
-    return torch.stack(masks)
 
 
 def _templates(

@@ -78,30 +78,6 @@ class Plane:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ridge:
-    """A roof: ``z = -slope |x|``; a negative slope makes a valley."""
-
-    slope: float = 0.5
-
-    def intersect(
-        self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*#batch 3"]
-    ) -> Float[Tensor, "*batch"]:
-        """Meet both planes, and take the first hit on the half that is really there."""
-        found = []
-        for side in (-1.0, 1.0):
-            half = Plane(normal=(side * self.slope, 0.0, 1.0)).intersect(origins, directions)
-            x = origins[..., 0] + torch.where(half.isfinite(), half, 0) * directions[..., 0]
-            found.append(torch.where(side * x >= 0, half, torch.inf))
-        return torch.minimum(found[0], found[1])
-
-    def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Lean to the side that the point is on."""
-        side = torch.where(points[..., 0] < 0, -1.0, 1.0).to(points)
-        up = torch.ones_like(side)
-        return normalize(torch.stack([self.slope * side, 0 * side, up], dim=-1), dim=-1)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Bumps:
     """A gently wavy plane: ``z = relief(x, y)``.
 

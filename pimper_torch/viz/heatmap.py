@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate
-from pimper_torch.geometry.visibility import Hits, cast_view
+from pimper_torch.geometry.visibility import Hits
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viz.maps import normal_colors, view_maps
@@ -90,18 +90,6 @@ class SceneRow:
     photograph: Picture
     truth: Picture
     methods: tuple[MethodPanels, ...]
-
-
-def vertex_errors_in_view(
-    mesh: Mesh, errors: Float[Tensor, " vertex"], cameras: Cameras, view: int
-) -> Float[Tensor, "height width"]:
-    """Look at errors of vertices through a camera; NaN where no surface is seen."""
-    if not len(mesh.faces):
-        width, height = (int(side) for side in cameras.sizes_px[view])
-        return errors.new_full((height, width), torch.nan)
-    hits = cast_view(mesh, cameras, view)
-    seen = hits.interpolate(errors[:, None], mesh.faces)[..., 0]
-    return torch.where(hits.face >= 0, seen, torch.nan)
 
 
 def error_picture(

@@ -1,6 +1,5 @@
 """Every convention of the package, held against somebody else's code or a hand-made case."""
 
-import kornia
 import pycolmap
 import torch
 from torch.nn.functional import grid_sample
@@ -9,10 +8,8 @@ from torch.testing import assert_close
 from pimper_torch.geometry.pixels import (
     crop_intrinsics,
     grid_from_pixels,
-    homography_in_indices,
     indices_from_pixels,
     pixel_centers,
-    pixels_from_grid,
     pixels_from_indices,
     scale_intrinsics,
 )
@@ -56,13 +53,10 @@ def test_grid_sample_half_way_between_centers_gives_the_mean():
     assert_close(found[0, 0, 0, 0], image[0, 0, 2, 2:4].mean())
 
 
-def test_grid_and_pixels_undo_each_other_and_corners_are_the_ends():
+def test_the_corners_of_the_image_are_the_ends_of_the_grid():
     corners = torch.tensor([[0.0, 0.0], [WIDTH, HEIGHT]], dtype=torch.float64)
     grid = grid_from_pixels(corners, WIDTH, HEIGHT)
     assert_close(grid, torch.tensor([[-1.0, -1.0], [1.0, 1.0]], dtype=torch.float64))
-    pixels = torch.tensor([[1.3, 4.2], [-2.0, 9.0]], dtype=torch.float64)
-    back = pixels_from_grid(grid_from_pixels(pixels, WIDTH, HEIGHT), WIDTH, HEIGHT)
-    assert_close(back, pixels)
 
 
 def test_an_index_points_at_the_center_of_its_pixel():
@@ -71,44 +65,6 @@ def test_an_index_points_at_the_center_of_its_pixel():
     pixel = pixels_from_indices(index)
     assert_close(pixel, pixel_centers(WIDTH, HEIGHT, like=image)[1, 4])
     assert_close(indices_from_pixels(pixel), index)
-
-
-def test_kornia_warps_pixels_right_once_the_homography_counts_from_centers():
-    width, height = 24, 18
-    dst_from_src = torch.tensor(
-        [[1.1, 0.08, -1.7], [-0.05, 0.93, 0.9], [1e-3, -2e-3, 1.0]], dtype=torch.float64
-    )
-    warped = kornia.geometry.transform.warp_perspective(
-        ramp_image(width, height),
-        homography_in_indices(dst_from_src)[None],
-        (height, width),
-        align_corners=True,
-    )
-    # By our convention the pixel p of the target shows the place H^-1 p of the source.
-    target = pixel_centers(width, height, like=dst_from_src)
-    homogeneous = torch.cat([target, torch.ones_like(target[..., :1])], dim=-1)
-    source = homogeneous @ torch.linalg.inv(dst_from_src).mT
-    source = source[..., :2] / source[..., 2:]
-    size = source.new_tensor([width, height])
-    inside = ((source > 0.5) & (source < size - 0.5)).all(dim=-1)
-    assert inside.float().mean() > 0.6
-    found = warped[0].movedim(0, -1)
-    assert_close(found[inside], source[inside], atol=1e-9, rtol=0)
-    # Without the shift kornia is off, whichever flag it gets: else we would not need it.
-    for flag in (True, False):
-        plain = kornia.geometry.transform.warp_perspective(
-            ramp_image(width, height), dst_from_src[None], (height, width), align_corners=flag
-        )[0].movedim(0, -1)
-        assert (plain[inside] - source[inside]).abs().max() > 0.01
-
-
-def test_homographies_in_indices_chain_like_those_in_pixels():
-    generator = torch.Generator().manual_seed(104)
-    one, two = torch.randn(2, 3, 3, generator=generator, dtype=torch.float64)
-    chained = homography_in_indices(one) @ homography_in_indices(two)
-    assert_close(homography_in_indices(one @ two), chained)
-    batch = torch.stack([one, two])
-    assert_close(homography_in_indices(batch)[1], homography_in_indices(two))
 
 
 def test_resized_images_keep_corners_and_so_intrinsics_only_scale():

@@ -5,12 +5,10 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError, ReconstructionError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import barycentric_2d
 from pimper_torch.patches.decompose import (
     Decompose,
     DecomposeConfig,
     enlarge,
-    facet_masks,
     group_by_size,
     views_facing,
 )
@@ -97,42 +95,6 @@ def test_buckets_hold_every_facet_once_and_fit_their_rasters():
         assert len(facets) * height * width <= 20_000
     padded = sum(len(facets) * height * width for facets, (height, width) in buckets)
     assert padded < 1.6 * sides.prod(dim=1).sum()
-
-
-def test_masks_belong_by_barycentric_coordinates(plane_scene, plane_mesh):
-    view, overlap = 0, 0.1
-    masks = facet_masks(plane_mesh, plane_scene.cameras, view, overlap)
-    vertices, faces = plane_mesh.mesh.vertices_world, plane_mesh.mesh.faces
-    corners = vertices[faces]
-    # Oracle: project the enlarged triangle's corners and test pixels in the image; a plane's
-    # image keeps straight lines straight.
-    edge = corners.roll(-1, dims=1) - corners
-    normal = torch.linalg.cross(edge[:, 0], edge[:, 1])
-    in_plane = torch.linalg.cross(edge, normal[:, None].expand_as(edge))
-    in_plane = in_plane / in_plane.norm(dim=-1, keepdim=True)
-    pixels = torch.stack(
-        torch.meshgrid(
-            torch.arange(200, dtype=torch.float64) + 0.5,
-            torch.arange(160, dtype=torch.float64) + 0.5,
-            indexing="xy",
-        ),
-        dim=-1,
-    )
-    for face in range(len(faces)):
-        moved = corners[face] + overlap * in_plane[face]  # a point on each moved edge
-        lines = [(moved[i], edge[face, i]) for i in range(3)]
-        enlarged = torch.stack([_meet(lines[i - 1], lines[i]) for i in range(3)])
-        image, _ = project(
-            enlarged, plane_scene.cameras.cam_from_world[view], plane_scene.cameras.intrinsics[view]
-        )
-        inside = (barycentric_2d(pixels, image[None, None]) >= 0).all(dim=-1)
-        assert (inside != masks[face]).sum() <= 2  # rounding on the rim
-
-
-def _meet(first, second):
-    (p, d), (q, e) = first, second
-    s = torch.linalg.lstsq(torch.stack([d, -e], dim=1), (q - p)[:, None]).solution[0, 0]
-    return p + s * d
 
 
 def test_a_mesh_without_facets_is_refused(plane_scene, plane_mesh):

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.scenes.noise import random_waves
-from pimper_torch.scenes.shapes import Bumps, Plane, Ridge, Sphere
+from pimper_torch.scenes.shapes import Bumps, Plane, Sphere
 
 
 def rays_from_above(generator, count=500):
@@ -21,12 +21,10 @@ def waves(generator):
 LEVELS = {
     "sphere": lambda p: p.norm(dim=-1) - 1,
     "plane": lambda p: p @ p.new_tensor([0.2, -0.1, 1.0]) - 0.3,
-    "ridge": lambda p: p[..., 2] + 0.4 * p[..., 0].abs(),
 }
 SHAPES = {
     "sphere": Sphere(),
     "plane": Plane(point=(0.0, 0.0, 0.3), normal=(0.2, -0.1, 1.0)),
-    "ridge": Ridge(slope=0.4),
 }
 
 

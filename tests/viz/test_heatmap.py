@@ -5,7 +5,6 @@ import pytest
 import torch
 from matplotlib import colormaps
 from PIL import Image
-from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Mesh
@@ -23,7 +22,6 @@ from pimper_torch.viz.heatmap import (
     photograph_picture,
     shading_in_view,
     surface_picture,
-    vertex_errors_in_view,
 )
 
 SCALE = ErrorScale(clip=2.0, unit="% of the diagonal")
@@ -71,20 +69,8 @@ def test_shading_darkens_a_colour_without_changing_its_hue():
     np.testing.assert_allclose(picture[0, 0], 0.65 * picture[0, 1], atol=1e-6)
 
 
-def test_errors_of_vertices_are_blended_over_faces(plane, front):
-    errors = plane.vertices_world[:, 0] + 3  # linear over the plane
-    seen = vertex_errors_in_view(plane, errors, front, 0)
-    u = torch.arange(48) + 0.5
-    wanted = 3 + (u - 24) / 60 * 5  # the camera looks along -z with x to the right
-    there = ~seen.isnan()
-    assert there[18, 24]
-    assert not there[0, 0]
-    assert_close(seen[there], wanted.expand(36, 48)[there])
-
-
 def test_points_without_faces_are_drawn_as_nothing(plane, front, tmp_path):
     points = plane.replace(faces=torch.zeros(0, 3, dtype=torch.long))
-    assert vertex_errors_in_view(points, torch.ones(4), front, 0).isnan().all()
     assert shading_in_view(points, front, 0) is None
     assert (surface_picture(points, front, 0) == 1).all()
     error = torch.full((36, 48), torch.inf)
@@ -118,7 +104,7 @@ def test_the_crop_holds_every_true_pixel_and_stays_inside():
 
 
 def test_a_heat_map_is_drawn_with_what_is_missed(plane, front, tmp_path):
-    error = vertex_errors_in_view(plane, torch.zeros(4), front, 0)
+    error = torch.zeros(36, 48)
     shading = shading_in_view(plane, front, 0)
     draw_heatmap(error, SCALE, tmp_path / "whole.png", shading=shading, title="mug, default")
     assert not has_color(tmp_path / "whole.png", MISSED)
