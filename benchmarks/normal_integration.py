@@ -25,6 +25,7 @@ from pimper_torch.datasets.diligent import NormalMap, read_normal_map
 from pimper_torch.integration.normal_map import IntegratedMap, integrate_normal_map
 from pimper_torch.integration.steps import Steps, orthographic_steps, perspective_steps
 from pimper_torch.linalg.rasters import RasterSystem
+from pimper_torch.metrics.maps import mean_absolute_depth_error
 
 PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1": 0.635}
 METHODS = ("frankot-chellappa", "cosine", "weighted", "discontinuities")
@@ -85,8 +86,7 @@ def integrate(one: NormalMap, method: str) -> IntegratedMap:
 def depth_error(one: NormalMap, depth: Tensor) -> float:
     """Give the mean absolute error after the scale of the median ratio."""
     assert one.depth is not None
-    true, found = one.depth.double()[one.mask], depth[one.mask]
-    return float((found * (true / found).median() - true).abs().mean())
+    return mean_absolute_depth_error(depth, one.depth, "median scale", one.mask)
 
 
 def with_true_weights(one: NormalMap) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pimper_torch.linalg.adjoint import solve_adjointly
 from pimper_torch.linalg.aggregation import dominant_diagonal
+from pimper_torch.linalg.conjugate_gradients import conjugate_gradients
 from pimper_torch.linalg.hierarchy import (
     Hierarchy,
     Product,
@@ -47,7 +48,7 @@ class Iterate:
     residual: float
 
 
-def conjugate_gradients(
+def solve_with_hierarchy(
     product: Product,
     hierarchy: Hierarchy,
     diagonal: Float[Tensor, " unknown"],
@@ -56,7 +57,7 @@ def conjugate_gradients(
     what: str,
     start: Float[Tensor, " unknown"] | None = None,
 ) -> Iterate:
-    """Solve A x = b for one right-hand side in float64.
+    """Solve A x = b for one right-hand side in float64, by conjugate gradients.
 
     Args:
         product: Of A.
@@ -64,39 +65,27 @@ def conjugate_gradients(
         diagonal: Of A; only to measure the residual.
         rhs: ``b``.
         tolerance: Of the error's energy norm, as the hierarchy estimates it, next to that of
-            the solution. Scaling all of A, or any unknown's unit, changes nothing.
+            the solution.
         what: Names the system in errors.
         start: Where to begin; zero if not given.
 
     Raises:
         SingularSystemError: No convergence, with the iterations and the residual reached.
     """
-    found = torch.zeros_like(rhs) if start is None else start.clone()
-    residual = rhs.clone() if start is None else rhs - product(found)
-    better = hierarchy.precondition(residual)
-    decrease = float(residual @ better)
-    goal = decrease if start is None else float(rhs @ hierarchy.precondition(rhs))
-    goal *= tolerance**2
-    direction, cycles = better, 0
-    # Written so that what is not a number stops the loop, and is refused below.
-    while decrease > goal and cycles < _MOST_CYCLES:
-        image = product(direction)
-        curvature = float(direction @ image)
-        if not curvature > 0:
-            break
-        length = decrease / curvature
-        found.add_(direction, alpha=length)
-        residual.add_(image, alpha=-length)
-        better = hierarchy.precondition(residual)
-        previous, decrease = decrease, float(residual @ better)
-        direction = better.add_(direction, alpha=decrease / previous)
-        cycles += 1
+    found, cycles, converged = conjugate_gradients(
+        product,
+        hierarchy.precondition,
+        rhs,
+        start=start,
+        tolerance=tolerance,
+        max_iterations=_MOST_CYCLES,
+    )
     scale = diagonal.rsqrt()
     size = float((scale * rhs).norm())
     misfit = float((scale * (rhs - product(found))).norm())
     share = misfit / size if size > 0 else misfit
     worst = max(_WORST_MISFIT, _MISFIT_TOLERANCES * tolerance)
-    if not (share < worst and decrease <= goal):
+    if not (share < worst and converged):
         raise SingularSystemError(
             f"{what} ({len(rhs)} unknowns) did not converge: after {cycles} iterations of "
             f"multigrid its residual is {share:.1e} of the right-hand side; "
@@ -164,7 +153,7 @@ class Multigrid:
     ) -> Iterate:
         """Solve for one right-hand side and say how; not differentiable."""
         with torch.no_grad():
-            return conjugate_gradients(
+            return solve_with_hierarchy(
                 self._product,
                 self._hierarchy,
                 self._diagonal,

@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.linalg.conjugate_gradients import conjugate_gradients
+
 
 def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:
     """Give the orthonormal cosines (DCT-II), one a row, with device and dtype of ``like``."""
@@ -136,9 +138,7 @@ class _Weighted(torch.autograd.Function):
         iterations: int,
         tolerance: float,
     ) -> Float[Tensor, "patch height width"]:
-        heights = _conjugate_gradients(
-            weight_right, weight_down, source, start, iterations, tolerance
-        )
+        heights = _solve_weighted(weight_right, weight_down, source, start, iterations, tolerance)
         ctx.save_for_backward(weight_right, weight_down, heights)
         ctx.limits = (iterations, tolerance)
         return heights
@@ -152,13 +152,13 @@ class _Weighted(torch.autograd.Function):
         weight_right, weight_down, heights = ctx.saved_tensors
         wanted = upstream - upstream.mean(dim=(-2, -1), keepdim=True)
         start = solve_poisson(wanted)
-        adjoint = _conjugate_gradients(weight_right, weight_down, wanted, start, *ctx.limits)
+        adjoint = _solve_weighted(weight_right, weight_down, wanted, start, *ctx.limits)
         right, down = differences(heights)
         adjoint_right, adjoint_down = differences(adjoint)
         return -right * adjoint_right, -down * adjoint_down, adjoint, None, None, None
 
 
-def _conjugate_gradients(
+def _solve_weighted(
     weight_right: Float[Tensor, "patch height steps_right"],
     weight_down: Float[Tensor, "patch steps_down width"],
     source: Float[Tensor, "patch height width"],
@@ -166,30 +166,17 @@ def _conjugate_gradients(
     iterations: int,
     tolerance: float,
 ) -> Float[Tensor, "patch height width"]:
-    def apply(heights: Tensor) -> Tensor:
+    def product(heights: Float[Tensor, "patch height width"]) -> Float[Tensor, "..."]:
         right, down = differences(heights)
         return differences_transposed(weight_right * right, weight_down * down)
 
-    def inner(a: Tensor, b: Tensor) -> Tensor:
-        return (a * b).sum(dim=(-2, -1), keepdim=True)
-
-    def share(part: Tensor, whole: Tensor) -> Tensor:
-        return torch.where(whole > 0, part / torch.where(whole > 0, whole, 1), 0)
-
-    heights = start
-    residual = source - apply(start)
-    better = solve_poisson(residual)
-    direction, decrease = better, inner(residual, better)
-    # Measured as the preconditioner does, so that the units of the weights drop out.
-    goal = tolerance**2 * inner(source, solve_poisson(source))
-    for _ in range(iterations):
-        if bool((decrease <= goal).all()):
-            break
-        image = apply(direction)
-        length = share(decrease, inner(direction, image))
-        heights = heights + length * direction
-        residual = residual - length * image
-        better = solve_poisson(residual)
-        previous, decrease = decrease, inner(residual, better)
-        direction = better + share(decrease, previous) * direction
-    return heights
+    found, _, _ = conjugate_gradients(
+        product,
+        solve_poisson,
+        source,
+        start=start,
+        dims=(-2, -1),
+        tolerance=tolerance,
+        max_iterations=iterations,
+    )
+    return found

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from pimper_torch.linalg.hierarchy import Hierarchy, may_keep
-from pimper_torch.linalg.multigrid import Iterate, conjugate_gradients
+from pimper_torch.linalg.multigrid import Iterate, solve_with_hierarchy
 from pimper_torch.linalg.poisson import solve_poisson
 from pimper_torch.linalg.sparse import SparseCholesky
 
@@ -154,7 +154,7 @@ class MultigridRaster:
         self, rhs: Float[Tensor, "height width"], start: Float[Tensor, "height width"] | None
     ) -> Iterate:
         """Cycle until the error is below the tolerance."""
-        return conjugate_gradients(
+        return solve_with_hierarchy(
             self._stencil.product,
             self._hierarchy,
             self._stencil.diagonal.reshape(-1),
