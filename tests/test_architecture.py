@@ -51,7 +51,7 @@ ROOMS = [
 SOLE_IMPORTERS = {
     "pycolmap": {"sfm/binding.py"},
     "embreex": {"geometry/visibility.py"},
-    "fcpw": {"metrics/nearest.py"},
+    "fcpw": {"geometry/nearest.py"},
     "kornia_rs": {"io/decode.py"},
     "tifffile": {"io/decode.py"},
     "yaml": {"config.py"},

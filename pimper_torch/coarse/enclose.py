@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from pimper_torch.coarse.brought import checked
@@ -30,7 +29,8 @@ from pimper_torch.coarse.trim import (
 )
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
@@ -240,13 +240,14 @@ class Enclose(nn.Module):
         faces: Int[Tensor, "face 3"],
         pixel: float,
     ) -> FacetPoints:
-        facet, distance = nearest_facets(scene.points_world[trusted], vertices, faces)
-        near = distance <= self.config.max_distance_px * pixel
+        surface = NearestSurface(Mesh(vertices_world=vertices, faces=faces))
+        found = surface.query(scene.points_world[trusted])
+        near = found.distance <= self.config.max_distance_px * pixel
         chosen = trusted[near]
         return FacetPoints(
             points_world=scene.points_world[chosen],
             covariance_world=point_covariances(scene, chosen),
-            facet=facet[near],
+            facet=found.face[near],
         )
 
 
@@ -263,37 +264,6 @@ def two_faces_an_edge(
         area = face_normals(vertices, faces).norm(dim=-1)
         smallest = torch.where(crowded, area, torch.inf).argmin()
         faces = torch.cat([faces[:smallest], faces[smallest + 1 :]])
-
-
-def nearest_facets(
-    points: Float[Tensor, "point 3"],
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    divisions: int = 12,
-) -> tuple[Int[Tensor, " point"], Float[Tensor, " point"]]:
-    """Find the facet nearest to each point, and how far its plane is.
-
-    Facets are compared by a lattice of samples, so that of two about as near either may be
-    found where a point lies close to their common edge.
-    """
-    steps = [
-        (a, b, divisions - a - b) for a in range(divisions + 1) for b in range(divisions + 1 - a)
-    ]
-    weights = vertices.new_tensor(steps) * (1 - 1 / divisions) / divisions + 1 / (3 * divisions)
-    samples = torch.einsum("sc,fcx->fsx", weights, vertices[faces])
-    tree = cKDTree(samples.reshape(-1, 3).detach().cpu().numpy())
-    _, index = tree.query(points.detach().cpu().numpy())
-    facet = torch.as_tensor(index, device=points.device).long() // len(steps)
-    corner = vertices[faces[facet]]
-    normal = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = torch.nn.functional.normalize(normal, dim=-1)
-    nearest = samples.reshape(-1, 3)[torch.as_tensor(index, device=points.device)]
-    offset = points - nearest
-    off_plane = (offset * normal).sum(dim=-1)
-    # Beside the facet, the sample's distance counts as far as the lattice does not explain it.
-    beside = (offset - off_plane[:, None] * normal).norm(dim=-1)
-    spacing = side_lengths(corner).amax(dim=1) / divisions
-    return facet, torch.hypot(off_plane, (beside - spacing).clamp_min(0))
 
 
 def _few(

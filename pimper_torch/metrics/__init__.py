@@ -1,5 +1,6 @@
 """Figures that compare a result with the truth, each under its own named convention."""
 
+from pimper_torch.geometry.nearest import Nearest, NearestSurface
 from pimper_torch.metrics.account import Row, account, rows
 from pimper_torch.metrics.alignment import Alignment, align_estimate, carry
 from pimper_torch.metrics.distances import SurfaceComparison, TrueSurface
@@ -9,7 +10,6 @@ from pimper_torch.metrics.icp import IcpConfig, IcpResult, trimmed_icp
 from pimper_torch.metrics.in_view import ViewFigures, compare_along_rays
 from pimper_torch.metrics.lights import LightFigures, compare_lights
 from pimper_torch.metrics.maps import mean_absolute_depth_error, mean_angular_error_deg
-from pimper_torch.metrics.nearest import Nearest, NearestSurface
 from pimper_torch.metrics.poses import CameraFigures, compare_cameras
 from pimper_torch.metrics.reflectance import AlbedoFigures, compare_albedo
 from pimper_torch.metrics.relative import (

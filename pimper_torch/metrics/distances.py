@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.metrics.nearest import NearestSurface
+from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.metrics.sampling import sample_surface
 from pimper_torch.metrics.visible import count_seeing
 from pimper_torch.records import Capture, Mesh, Record

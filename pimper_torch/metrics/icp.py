@@ -9,8 +9,8 @@ from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.geometry.frames import rigid, transform
+from pimper_torch.geometry.nearest import Nearest, NearestSurface
 from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.metrics.nearest import Nearest, NearestSurface
 from pimper_torch.metrics.sampling import sample_surface
 from pimper_torch.metrics.similarity import similarity_between_points
 from pimper_torch.records import Mesh, Record

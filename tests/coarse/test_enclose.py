@@ -4,9 +4,10 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.coarse.densify import DensifyConfig
-from pimper_torch.coarse.enclose import Enclose, EncloseConfig, nearest_facets, two_faces_an_edge
+from pimper_torch.coarse.enclose import Enclose, EncloseConfig, two_faces_an_edge
 from pimper_torch.errors import ConfigError, InputError, ReconstructionError
 from pimper_torch.geometry.components import face_components
+from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals, face_pairs
 from pimper_torch.records import Mesh
 from pimper_torch.scenes.cameras import arc_cameras, look_at, pinholes
@@ -107,8 +108,7 @@ def test_a_few_views_on_an_arc_give_the_side_that_they_see():
         torch.tensor([[0.0, 0, 1], [0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.7, 0.7], [0, -0.7, 0.7]]),
         dim=-1,
     )
-    _, distance = nearest_facets(wanted, mesh.vertices_world, mesh.faces)
-    assert (distance < 0.03).all()
+    assert (NearestSurface(mesh).query(wanted).distance < 0.03).all()
 
 
 def test_masks_keep_the_rest_out():
@@ -169,19 +169,6 @@ def test_settings_out_of_range_are_refused():
         EncloseConfig(num_facets=3)
     with pytest.raises(ConfigError, match="brink_px"):
         EncloseConfig(gap_px=8.0, brink_px=9.0)
-
-
-def test_the_nearest_facet_is_that_of_a_search_over_all():
-    generator = torch.Generator().manual_seed(0)
-    vertices, faces = icosphere(1)
-    directions = normalize(torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=-1)
-    facet, distance = nearest_facets(1.1 * directions, vertices, faces)
-    # From above a convex solid, the nearest facet's plane is met first or a neighbour's is.
-    normals = normalize(face_normals(vertices, faces), dim=-1)
-    height = (normals * vertices[faces[:, 0]]).sum(dim=-1)
-    above = (1.1 * directions) @ normals.T - height
-    assert (distance >= above.amax(dim=1) - 0.02).all()
-    assert (above.gather(1, facet[:, None])[:, 0] >= above.amax(dim=1) - 0.02).all()
 
 
 def test_of_three_faces_at_an_edge_the_smallest_goes():

@@ -3,9 +3,20 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.metrics import NearestSurface
-from pimper_torch.metrics.nearest import closest_on_triangles
+from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.records import Mesh
+from pimper_torch.scenes.meshes import icosphere
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(83)
+
+
+@pytest.fixture
+def square():
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
+    return Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
 
 def brute_force(points, mesh):
@@ -59,33 +70,34 @@ def test_distances_to_tiny_and_huge_triangles_are_those_of_brute_force(generator
     assert_close((points - found.points).norm(dim=1), found.distance)
 
 
-def test_a_smooth_surface_of_many_triangles_is_searched_without_a_miss(generator, make):
-    mesh = make.potato(level=2)
+def test_a_smooth_surface_of_many_triangles_is_searched_without_a_miss(generator):
+    vertices, faces = icosphere(2)
+    bumps = 1 + 0.15 * torch.sin(3 * vertices[:, :1] + 1) * torch.cos(2 * vertices[:, 1:2])
+    mesh = Mesh(vertices_world=bumps * vertices * vertices.new_tensor([1.3, 1, 0.8]), faces=faces)
     points = 1.5 * torch.randn(60, 3, generator=generator, dtype=torch.float64)
     expected = brute_force(points, mesh)
     assert_close(NearestSurface(mesh).query(points).distance, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_points_on_the_surface_far_from_the_origin_are_found_on_it(generator, make):
-    sphere = make.sphere(level=3)
-    far = sphere.replace(vertices_world=sphere.vertices_world + 1e6)
+def test_points_on_the_surface_far_from_the_origin_are_found_on_it():
+    vertices, faces = icosphere(3)
+    far = Mesh(vertices_world=vertices + 1e6, faces=faces)
     found = NearestSurface(far).query(far.vertices_world)
     assert float(found.distance.max()) < 1e-8  # float64 at a million
 
 
-def test_no_points_have_no_distances(make):
-    assert len(NearestSurface(make.square()).query(torch.zeros(0, 3)).distance) == 0
+def test_no_points_have_no_distances(square):
+    assert len(NearestSurface(square).query(torch.zeros(0, 3)).distance) == 0
 
 
-def test_without_faces_the_points_themselves_are_the_surface(make):
-    corners = make.square().replace(faces=torch.zeros(0, 3, dtype=torch.long))
+def test_without_faces_the_points_themselves_are_the_surface(square):
+    corners = square.replace(faces=torch.zeros(0, 3, dtype=torch.long))
     found = NearestSurface(corners).query(torch.tensor([[0.5, 0.4, 0.0]]).double())
     assert_close(found.distance, torch.tensor([0.41]).double().sqrt())
     assert found.face.tolist() in ([0], [1])
 
 
-def test_a_vertex_without_a_face_is_no_part_of_the_surface(make):
-    square = make.square()
+def test_a_vertex_without_a_face_is_no_part_of_the_surface(square):
     stray = torch.tensor([[5.0, 5, 5]], dtype=torch.float64)
     mesh = square.replace(vertices_world=torch.cat([square.vertices_world, stray]))
     assert float(NearestSurface(mesh).query(stray).distance) > 5
