@@ -22,8 +22,8 @@ from pimper_torch.coarse.select import frontal_view, named_view, triangulation_a
 from pimper_torch.coarse.triangulate import smooth_over_mesh
 from pimper_torch.coarse.trim import (
     evidence,
-    large_pieces,
     point_distances,
+    supported_pieces,
     too_far,
     without_small_holes,
 )
@@ -137,7 +137,7 @@ class Enclose(nn.Module):
         if mesh is None:
             faces = two_faces_an_edge(vertices, faces)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
-            pieces = large_pieces(vertices, faces, whole, config.min_share)
+            pieces = supported_pieces(vertices, faces, whole, config.min_share)
             vertices, faces = _used(vertices, faces[pieces])
         normals = smooth_over_mesh(vertex_normals(vertices, faces), faces, config.smoothing_rounds)
         return CoarseMesh(
@@ -228,7 +228,7 @@ class Enclose(nn.Module):
         )
         kept = without_small_holes(vertices, faces, kept, (config.hole_px * pixel) ** 2)
         chosen = kept.nonzero()[:, 0]
-        pieces = large_pieces(vertices, faces[chosen], supported[chosen], config.min_share)
+        pieces = supported_pieces(vertices, faces[chosen], supported[chosen], config.min_share)
         kept[chosen[~pieces]] = False
         return kept
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DepthMaps
-from pimper_torch.geometry.components import graph_components
+from pimper_torch.geometry.components import component_areas, face_components, graph_components
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals, face_pairs, side_lengths
 from pimper_torch.geometry.visibility import RayCaster
@@ -121,38 +121,20 @@ def without_small_holes(
     """Take back dropped faces that hang together over less than an area, in scene units."""
     pairs, _ = face_pairs(faces)
     dropped = pairs[~kept[pairs].any(dim=1)]
-    return kept | (~kept & (_piece_areas(vertices, faces, dropped) < largest))
+    areas = component_areas(vertices, faces, graph_components(dropped, len(faces)))
+    return kept | (~kept & (areas < largest))
 
 
-def large_pieces(
+def supported_pieces(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
-    counted: Bool[Tensor, " face"],
+    supported: Bool[Tensor, " face"],
     share: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark faces of pieces that hold a share of all the area that counts."""
-    pairs, _ = face_pairs(faces)
-    areas = _piece_areas(vertices, faces, pairs, counted)
-    whole = (_areas(vertices, faces) * counted).sum()
-    return areas >= share * whole
-
-
-def _piece_areas(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    links: Int[Tensor, "link 2"],
-    counted: Bool[Tensor, " face"] | None = None,
-) -> Float[Tensor, " face"]:
-    """Give the area of the piece that each face belongs to."""
-    label = graph_components(links, len(faces))
-    area = _areas(vertices, faces)
-    if counted is not None:
-        area = area * counted
-    total = torch.zeros_like(area).index_add(0, label, area)
-    return total[label]
-
-
-def _areas(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Float[Tensor, " face"]:
-    return face_normals(vertices, faces).norm(dim=-1) / 2
+    """Mark the faces of components that hold a share of all the area that is supported."""
+    everything = torch.zeros_like(faces[:, 0])
+    own, total = (
+        component_areas(vertices, faces, label, supported)
+        for label in (face_components(faces), everything)
+    )
+    return own >= share * total

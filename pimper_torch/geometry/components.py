@@ -1,12 +1,12 @@
 """What hangs together in a triangle mesh. Graphs are searched by scipy, on the CPU."""
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import face_edges, face_pairs
+from pimper_torch.geometry.surfaces import face_edges, face_normals, face_pairs
 
 
 def vertex_components(
@@ -24,6 +24,19 @@ def face_components(faces: Int[Tensor, "face 3"]) -> Int[Tensor, " face"]:
     """Label faces that hang together by edges with exactly two faces; a vertex is not enough."""
     pairs, _ = face_pairs(faces)
     return graph_components(pairs, len(faces))
+
+
+def component_areas(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    label: Int[Tensor, " face"],
+    counted: Bool[Tensor, " face"] | None = None,
+) -> Float[Tensor, " face"]:
+    """Give each face the area of all faces with its label, or of those that count; float64."""
+    area = face_normals(vertices, faces).norm(dim=-1).double() / 2
+    if counted is not None:
+        area = area * counted
+    return torch.zeros_like(area).index_add(0, label, area)[label]
 
 
 def vertex_fans(

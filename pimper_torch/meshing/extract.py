@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.components import face_components, vertex_fans
-from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.components import component_areas, face_components, vertex_fans
 from pimper_torch.meshing.faults import faults, overturned, stretched
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.records import Mesh, Surface
@@ -117,9 +115,7 @@ def large_pieces(
     Pieces hang together by edges. With share 1 one piece is marked, the first of the largest.
     """
     label = face_components(faces)
-    area = face_normals(vertices, faces).norm(dim=-1).double()
-    areas = area.new_zeros(int(label.max()) + 1).index_add(0, label, area)
-    large = areas >= share * areas.amax()
+    areas = component_areas(vertices, faces, label)
     if share == 1:
-        large = torch.arange(len(areas), device=areas.device) == areas.argmax()
-    return large[label]
+        return label == label[areas.argmax()]
+    return areas >= share * areas.amax()

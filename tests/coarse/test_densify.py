@@ -4,7 +4,12 @@ from torch.testing import assert_close
 from pimper_torch.coarse.densify import push_pull, sweep
 from pimper_torch.coarse.matching import Matcher, Windows, level_of, mean_of_largest, pair
 from pimper_torch.coarse.oriented import OrientedPoints, fitted_planes, thinned
-from pimper_torch.coarse.trim import hanging_together, large_pieces, too_far, without_small_holes
+from pimper_torch.coarse.trim import (
+    hanging_together,
+    supported_pieces,
+    too_far,
+    without_small_holes,
+)
 from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.meshes import icosphere, table
 from pimper_torch.scenes.render import render_shape
@@ -131,12 +136,12 @@ def test_small_holes_are_closed_and_large_ones_and_crumbs_are_not():
     middle = vertices[faces].mean(dim=1)
     kept = (middle[:, 2] < 0.6) & ~(middle[:, 0] > 0.95)
     whole = torch.ones(len(faces), dtype=torch.bool)
-    assert (large_pieces(vertices, faces, whole, 0.9)).all()
+    assert (supported_pieces(vertices, faces, whole, 0.9)).all()
     mended = without_small_holes(vertices, faces, kept, 1.0)
     assert mended[middle[:, 0] > 0.95].all()  # 0.3 of the area unit
     assert not mended[middle[:, 2] > 0.6].any()  # 2.5
     crumbs = (middle[:, 2] < 0) | (middle[:, 2] > 0.97)
-    pieces = large_pieces(vertices, faces[crumbs], whole[crumbs], 0.05)
+    pieces = supported_pieces(vertices, faces[crumbs], whole[crumbs], 0.05)
     assert (pieces == (middle[crumbs][:, 2] < 0)).all()
 
 

@@ -1,7 +1,9 @@
 import torch
+from torch.testing import assert_close
 
 from pimper_torch.geometry.components import (
     boundary_loops,
+    component_areas,
     face_components,
     vertex_components,
     vertex_fans,
@@ -60,3 +62,15 @@ def test_an_edge_of_three_faces_is_border_of_each():
     ends, loop = boundary_loops(torch.tensor([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
     assert len(ends) == 9
     assert torch.bincount(loop).tolist() == [3, 3, 3]
+
+
+def test_areas_of_components_are_those_of_their_counted_faces():
+    square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    vertices = torch.cat([square, 5 + 3 * square])
+    faces = torch.tensor([[0, 1, 2], [4, 5, 6], [0, 2, 3], [4, 6, 7]])
+    label = face_components(faces)
+    wanted = torch.tensor([1.0, 9, 1, 9]).double()
+    assert_close(component_areas(vertices, faces, label), wanted)
+    counted = torch.tensor([True, True, False, True])
+    wanted = torch.tensor([0.5, 9, 0.5, 9]).double()
+    assert_close(component_areas(vertices, faces, label, counted), wanted)
