@@ -1,13 +1,35 @@
+import os
+from pathlib import Path
+
 import pytest
-import torch
+
+# Tests run one to a core, and their scenes are tiny: threads would wait for one another longer
+# than they compute. Read when torch and numpy are loaded, here and in programs that tests start.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import torch  # noqa: E402
 
 
 def pytest_configure(config: pytest.Config) -> None:
     # Not in pyproject.toml: pytest would import the package to resolve the category before
     # jaxtyping's hook is in place.
     config.addinivalue_line("filterwarnings", "error::pimper_torch.errors.PimperWarning")
-    # Test scenes are tiny: threads would wait for one another longer than they compute.
     torch.set_num_threads(1)
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
+    """Run single files in this process: workers take longer to start than most files."""
+    files = all(Path(argument.split("::")[0]).is_file() for argument in config.args)
+    return 0 if files else None
+
+
+@pytest.fixture
+def shapes_checked(pytestconfig: pytest.Config) -> None:
+    """Skip where annotations are not checked when functions are called."""
+    if not pytestconfig.getoption("jaxtyping_packages"):
+        pytest.skip("needs --jaxtyping-packages=pimper_torch,beartype.beartype")
 
 
 @pytest.fixture

@@ -78,6 +78,7 @@ def test_a_record_shows_shapes_instead_of_numbers(cameras):
     assert len(shown) < 300
 
 
+@pytest.mark.usefixtures("shapes_checked")
 def test_tensors_of_the_wrong_shape_or_kind_are_refused(cameras):
     with pytest.raises(jaxtyping.TypeCheckError):
         cameras.replace(cam_from_world=cameras.cam_from_world[:1])  # one camera, two intrinsics
