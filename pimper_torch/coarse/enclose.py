@@ -18,7 +18,7 @@ from pimper_torch.coarse.oriented import (
     thinned,
     with_common_normals,
 )
-from pimper_torch.coarse.select import frontal_view, named_view, triangulation_angles
+from pimper_torch.coarse.select import frontal_view, named_view
 from pimper_torch.coarse.triangulate import smooth_over_mesh
 from pimper_torch.coarse.trim import (
     evidence,
@@ -30,6 +30,7 @@ from pimper_torch.coarse.trim import (
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.projection import triangulation_angles
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
@@ -181,7 +182,7 @@ class Enclose(nn.Module):
 
     def _trusted(self, scene: SparseScene) -> Int[Tensor, " trusted"]:
         config, observed = self.config, scene.observed
-        angle = triangulation_angles(scene.points_world, observed, scene.cameras)
+        angle = triangulation_angles(scene.points_world, observed, scene.cameras.centers_world)
         trusted = (
             (observed.sum(dim=1) >= config.min_track_length)
             & (scene.reprojection_errors_px <= config.max_reprojection_px)

@@ -4,7 +4,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Cameras, SparseScene, Views
@@ -38,18 +37,6 @@ def named_view(views: Views, name: str) -> int:
             f"is needed. Registered are: {', '.join(views.names)}."
         )
     return found[0]
-
-
-def triangulation_angles(
-    points_world: Float[Tensor, "point 3"],
-    observed: Bool[Tensor, "point view"],
-    cameras: Cameras,
-) -> Float[Tensor, " point"]:
-    """Give each point's widest angle between two rays that saw it, in radians."""
-    rays = normalize(points_world[:, None] - cameras.centers_world, dim=-1)
-    cosines = rays @ rays.mT
-    both = observed[:, :, None] & observed[:, None, :]
-    return torch.where(both, cosines, 1).flatten(1).amin(dim=1).clamp(-1, 1).acos()
 
 
 def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[Tensor, " view"]:

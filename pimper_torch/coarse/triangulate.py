@@ -17,7 +17,6 @@ from pimper_torch.coarse.select import (
     on_hull,
     spread,
     spread_to_number,
-    triangulation_angles,
     views_near,
     well_accompanied,
 )
@@ -26,7 +25,7 @@ from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
-from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
 from pimper_torch.geometry.surfaces import (
     face_normals,
     side_lengths,
@@ -168,7 +167,7 @@ class Triangulate(nn.Module):
         """List the points that pass every filter, and how good each is."""
         config, cameras, observed = self.config, scene.cameras, scene.observed
         length = observed.sum(dim=1)
-        angle = triangulation_angles(scene.points_world, observed, cameras)
+        angle = triangulation_angles(scene.points_world, observed, cameras.centers_world)
         near = views_near(cameras, reference, config.max_view_angle_deg)
         pixels, depth = _project(scene.points_world, cameras, reference)
         within = ((pixels > 0) & (pixels < cameras.sizes_px[reference])).all(dim=1) & (depth > 0)

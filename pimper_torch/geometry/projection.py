@@ -3,9 +3,12 @@
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import transform
 from pimper_torch.records import Cameras
+
+_POINTS = 2048  # at once: 72 MB of angles between the rays of 66 views
 
 
 def project(
@@ -65,3 +68,20 @@ def triangulate_rays(
     matrix = across.sum(dim=1)
     right = (across @ cameras.centers_world[..., None]).sum(dim=1)
     return torch.linalg.solve(matrix, right)[..., 0]
+
+
+def triangulation_angles(
+    points_world: Float[Tensor, "point 3"],
+    observed: Bool[Tensor, "point view"],
+    centers_world: Float[Tensor, "view 3"],
+) -> Float[Tensor, " point"]:
+    """Give each point's widest angle between two rays that saw it, in radians."""
+    widest = []
+    for points, seen in zip(
+        torch.split(points_world, _POINTS), torch.split(observed, _POINTS), strict=True
+    ):
+        rays = normalize(points[:, None] - centers_world, dim=-1)
+        both = seen[:, :, None] & seen[:, None, :]
+        cosines = torch.where(both, rays @ rays.mT, 1).flatten(1).amin(dim=1)
+        widest.append(cosines.clamp(-1, 1).acos())
+    return torch.cat(widest)

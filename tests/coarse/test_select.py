@@ -10,7 +10,6 @@ from pimper_torch.coarse.select import (
     on_hull,
     spread,
     spread_to_number,
-    triangulation_angles,
     views_near,
     well_accompanied,
 )
@@ -30,21 +29,6 @@ def test_a_view_is_found_by_file_name_and_by_stem(dome_cloud):
 def test_an_unknown_reference_is_refused_with_the_known_names(dome_cloud):
     with pytest.raises(InputError, match=dome_cloud.views.names[0]):
         named_view(dome_cloud.views, "nobody")
-
-
-def test_triangulation_angle_is_the_widest_between_rays_that_saw_the_point(dome_cloud):
-    found = triangulation_angles(dome_cloud.points_world, dome_cloud.observed, dome_cloud.cameras)
-    point = int(dome_cloud.observed.sum(dim=1).argmin())
-    seeing = dome_cloud.observed[point].nonzero()[:, 0].tolist()
-    centers = dome_cloud.cameras.centers_world
-    widest = 0.0
-    for a in seeing:
-        for b in seeing:
-            ray_a = dome_cloud.points_world[point] - centers[a]
-            ray_b = dome_cloud.points_world[point] - centers[b]
-            cosine = torch.cosine_similarity(ray_a, ray_b, dim=0).clamp(-1, 1)
-            widest = max(widest, float(cosine.acos()))
-    assert_close(float(found[point]), widest, atol=1e-6, rtol=0)
 
 
 def test_views_near_counts_from_the_optical_axis(dome_cloud):

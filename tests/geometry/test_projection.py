@@ -2,7 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry import projection
+from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
 from pimper_torch.scenes.cameras import arc_cameras
 
 
@@ -64,3 +65,23 @@ def test_gradients_of_projection_and_rays_are_right(cameras, points):
     assert torch.autograd.gradcheck(project, (some, frames, K))
     pixels = (points[:4, :2] * 30 + 30).requires_grad_()
     assert torch.autograd.gradcheck(rays_through, (pixels, frames, K))
+
+
+def test_triangulation_angle_is_the_widest_between_rays_that_saw_the_point(monkeypatch):
+    generator = torch.Generator().manual_seed(122)
+    monkeypatch.setattr(projection, "_POINTS", 3)  # in several parts
+    centers = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    points = torch.randn(7, 3, generator=generator, dtype=torch.float64)
+    observed = torch.rand(7, 5, generator=generator) < 0.6
+    observed[0] = False
+    found = triangulation_angles(points, observed, centers)
+    for point in range(7):
+        widest = 0.0
+        seeing = observed[point].nonzero()[:, 0].tolist()
+        for a in seeing:
+            for b in seeing:
+                rays = points[point] - centers[a], points[point] - centers[b]
+                cosine = torch.cosine_similarity(*rays, dim=0).clamp(-1, 1)
+                widest = max(widest, float(cosine.acos()))
+        # The arc cosine near 1 turns float64's rounding into 1e-8.
+        assert_close(float(found[point]), widest, atol=1e-7, rtol=0)
