@@ -1,0 +1,94 @@
+"""Features of things in photographs, in an order of their own in each, and their matches."""
+
+import torch
+from torch import Tensor
+
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Cameras
+from pimper_torch.scenes.cameras import FRONT, UP, arc_cameras
+from pimper_torch.sfm.at_rest import Pair, Rest, find_rest
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0
+
+
+class Captured:
+    """All that two photographs show is matched, one in ten wrongly.
+
+    Args:
+        generator: Of the order, the noise of 0.2 px and the wrong matches.
+        pixels: Of things, ``view thing 2``; NaN where not seen.
+    """
+
+    def __init__(self, generator: torch.Generator, pixels: Tensor) -> None:
+        self.thing, self.keypoints = [], []
+        for view in pixels:
+            seen = torch.nonzero(view.isfinite().all(dim=1))[:, 0]
+            order = seen[torch.randperm(len(seen), generator=generator)]
+            self.thing.append(order)
+            noise = 0.2 * torch.randn(len(order), 2, generator=generator, dtype=torch.float64)
+            self.keypoints.append((view[order] + noise).float())
+        self.pairs = [
+            self._pair(first, second, generator)
+            for second in range(len(pixels))
+            for first in range(second)
+        ]
+
+    def _pair(self, first: int, second: int, generator: torch.Generator) -> Pair:
+        one, other = torch.nonzero(self.thing[first][:, None] == self.thing[second], as_tuple=True)
+        (wrong,) = torch.nonzero(torch.rand(len(one), generator=generator) < 0.1, as_tuple=True)
+        other[wrong] = other[wrong][torch.randperm(len(wrong), generator=generator)]
+        return Pair(first=first, second=second, matches=torch.stack([one, other], dim=1))
+
+    def right(self, pair: Pair) -> Tensor:
+        """Know which matches are of one thing, as a verification finds out."""
+        one, other = pair.matches.unbind(dim=1)
+        return self.thing[pair.first][one] == self.thing[pair.second][other]
+
+    def rest(self) -> Rest:
+        """Find what is at rest."""
+        return find_rest(
+            self.keypoints, self.pairs, self.right, still_px=1.0, max_error_px=2.0, fewest=15
+        )
+
+
+def orbit(count: int, span_deg: float, elevation_deg: float = 25.0) -> Cameras:
+    """Look down on the origin from round it."""
+    return arc_cameras(
+        count,
+        width=WIDTH,
+        height=HEIGHT,
+        focal_px=FOCAL,
+        distance=8.0,
+        span_deg=span_deg,
+        elevation_deg=elevation_deg,
+        sway_deg=0.0,
+        front=FRONT,
+        up=UP,
+    )
+
+
+def seen_of_ball(generator: torch.Generator, count: int, cameras: Cameras) -> Tensor:
+    """Give pixels ``view point 2`` of random points on a unit ball; NaN on its far side."""
+    points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    points = points / points.norm(dim=1, keepdim=True)
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    toward = cameras.centers_world[:, None] - points
+    hidden = torch.einsum("vpi,pi->vp", toward, points) < 0
+    return pixels.masked_fill(hidden[..., None], torch.nan)
+
+
+def turntable(
+    generator: torch.Generator,
+    *,
+    turning: int = 500,
+    resting: int = 200,
+    elevation_deg: float = 25.0,
+    count: int = 12,
+    span_deg: float = 330.0,
+) -> Captured:
+    """Turn a ball before a room at rest; things from ``turning`` on are the room's."""
+    cameras = orbit(count, span_deg, elevation_deg)
+    ball = seen_of_ball(generator, turning, cameras)
+    room = torch.rand(resting, 2, generator=generator, dtype=torch.float64)
+    room = room * room.new_tensor([WIDTH, HEIGHT])
+    return Captured(generator, torch.cat([ball, room.expand(count, -1, -1)], dim=1))

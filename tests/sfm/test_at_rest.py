@@ -1,0 +1,144 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.projection import project
+from pimper_torch.sfm.at_rest import (
+    fundamental_matrix,
+    is_still,
+    moving_matches,
+    sampson_errors,
+    shared_geometry,
+)
+from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable
+
+
+# The violating share is smaller the nearer the camera is to the table's plane: all moves sideways,
+# as before a camera that only shifts.
+@pytest.mark.parametrize(("elevation_deg", "share"), [(2.0, 0.2), (10.0, 0.5), (25.0, 0.7)])
+def test_a_room_behind_a_turntable_is_at_rest_and_what_turns_is_not(
+    elevation_deg, share, generator
+):
+    scene = turntable(generator, elevation_deg=elevation_deg)
+    rest = scene.rest()
+    assert rest.room
+    assert not rest.nothing_moves
+    assert rest.moving_pairs >= 12
+    assert rest.violating_share > share
+    for thing, resting in zip(scene.thing, rest.features, strict=True):
+        assert resting[thing < 500].double().mean() < 0.01
+        assert resting[thing >= 500].double().mean() > 0.99
+    kept = right = 0
+    for pair in scene.pairs:
+        moving = moving_matches(scene.keypoints, pair, rest, 1.0)
+        of_room = scene.thing[pair.first][pair.matches[:, 0]] >= 500
+        true = scene.right(pair)
+        assert not (moving & of_room & true).any()
+        kept, right = kept + int((moving & true).sum()), right + int((~of_room & true).sum())
+    assert kept > 0.98 * right > 1000
+
+
+def test_far_points_that_do_not_move_before_a_camera_that_shifts_belong_to_the_scene(generator):
+    cameras = orbit(8, 330.0)
+    shift = torch.linspace(-1, 1, 8, dtype=torch.float64)
+    poses = cameras.cam_from_world[:1].repeat(8, 1, 1)
+    poses[:, 0, 3] += shift
+    cameras = cameras.replace(cam_from_world=poses)
+    far = torch.randn(300, 3, generator=generator, dtype=torch.float64) * 400
+    far = transform(torch.linalg.inv(poses[0]), far.abs() + far.new_tensor([-500, -400, 6000.0]))
+    near = seen_of_ball(generator, 600, cameras)
+    far, _ = project(far, cameras.cam_from_world, cameras.intrinsics)
+    scene = Captured(generator, torch.cat([near, far], dim=1))
+    still = [is_still(scene.keypoints, pair, 1.0).sum() for pair in scene.pairs]
+    assert min(still) > 100  # the far ones lie still
+    rest = scene.rest()
+    assert rest.moving_pairs == len(scene.pairs)
+    assert rest.violating_share < 0.01
+    assert not rest.room
+    assert not any(resting.any() for resting in rest.features)
+
+
+def test_a_flat_object_that_hardly_moves_from_one_photograph_to_the_next_keeps_its_features(
+    generator,
+):
+    cameras = orbit(12, 18.0)
+    points = torch.rand(500, 3, generator=generator, dtype=torch.float64) - 0.5
+    points = points * points.new_tensor([4.0, 0.1, 3.0])
+    points[:100, 1] *= 12
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    scene = Captured(generator, pixels)
+    rest = scene.rest()
+    assert rest.moving_pairs > 20
+    assert rest.still_share > 0.05
+    assert rest.violating_share < 0.01
+    assert not rest.room
+
+
+def test_photographs_that_are_there_twice_leave_nothing_out(generator):
+    cameras = orbit(6, 90.0)
+    once = seen_of_ball(generator, 400, cameras)
+    scene = Captured(generator, once.repeat_interleave(3, dim=0))
+    assert scene.rest().still_share > 0.1
+    rest = scene.rest()
+    assert not rest.room
+    assert not rest.nothing_moves
+    assert not any(resting.any() for resting in rest.features)
+
+
+def test_where_all_is_at_rest_nothing_moves(generator):
+    room = torch.rand(200, 2, generator=generator, dtype=torch.float64) * 400
+    rest = Captured(generator, room.expand(5, -1, -1)).rest()
+    assert rest.nothing_moves
+    assert not rest.room
+    assert rest.moving_pairs == 0
+
+
+def test_features_at_rest_that_are_found_inexactly_are_no_motion(generator):
+    room = torch.rand(300, 2, generator=generator, dtype=torch.float64) * 400
+    shaken = room + 1.2 * torch.randn(5, 300, 2, generator=generator, dtype=torch.float64)
+    rest = Captured(generator, torch.where(torch.arange(300)[:, None] < 200, room, shaken)).rest()
+    assert rest.nothing_moves
+
+
+def test_one_geometry_is_shared_where_there_is_one_and_none_hides_a_contradiction(generator):
+    cameras = orbit(2, 20.0)
+    pixels = seen_of_ball(generator, 400, cameras)
+    first, second = pixels[:, pixels.isfinite().all(dim=-1).all(dim=0)]
+    near = (first - second).norm(dim=1) < 10
+    ends = (first[near], second[near]), (first[~near], second[~near])
+    assert sampson_errors(shared_geometry(*ends, 2.0), first, second).max() < 1e-4
+    resting = torch.rand(100, 2, generator=generator, dtype=torch.float64) * 400
+    geometry = shared_geometry((resting, resting), (first, second), 2.0)
+    assert (sampson_errors(geometry, first, second) > 2).double().mean() > 0.5
+
+
+def test_the_fundamental_matrix_is_that_of_the_cameras(generator):
+    cameras = orbit(2, 20.0)
+    points = torch.randn(30, 3, generator=generator, dtype=torch.float64)
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    found = fundamental_matrix(pixels[0], pixels[1], torch.ones(30).double())
+    between = cameras.cam_from_world[1] @ torch.linalg.inv(cameras.cam_from_world[0])
+    x, y, z = between[:3, 3]
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    inverse = torch.linalg.inv(cameras.intrinsics)
+    true = inverse[1].mT @ cross @ between[:3, :3] @ inverse[0]
+    found, true = found / found.norm(), true / true.norm()
+    assert_close(found * torch.sign((found * true).sum()), true, atol=1e-7, rtol=0)
+    assert abs(float(torch.linalg.det(found))) < 1e-15
+
+
+def test_the_error_of_a_match_is_how_far_it_must_move(generator):
+    cameras = orbit(2, 20.0)
+    points = torch.randn(30, 3, generator=generator, dtype=torch.float64)
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    geometry = fundamental_matrix(pixels[0], pixels[1], torch.ones(30).double())
+    assert sampson_errors(geometry, pixels[0], pixels[1]).max() < 1e-6
+    line = torch.nn.functional.pad(pixels[0], (0, 1), value=1.0) @ geometry.mT
+    across = line[:, :2] / line[:, :2].norm(dim=1, keepdim=True)
+    shifted = pixels[1] + 3 * across
+    # Both photographs share the way: about 3 / sqrt(2) where both lines are as steep.
+    found = sampson_errors(geometry, pixels[0], shifted)
+    assert ((found > 1.9) & (found < 2.4)).all()
+    along = torch.stack([-across[:, 1], across[:, 0]], dim=1)
+    assert sampson_errors(geometry, pixels[0], pixels[1] + 9 * along).max() < 1e-6

@@ -1,0 +1,87 @@
+import numpy as np
+import torch
+
+from pimper_torch.sfm.binding import loaded
+from pimper_torch.sfm.colmap import MatchSettings
+from pimper_torch.sfm.leave_out import leave_out_room
+from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
+
+SETTINGS = MatchSettings(
+    max_ratio=0.8, guided=False, max_error_px=2.0, min_inliers=15, seed=0, threads=1
+)
+
+
+def stored(scene, path):
+    """Put features, matches and verified pairs in a database, images in reversed order."""
+    pycolmap = loaded()
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error, options.ransac.random_seed = 2.0, 0
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, HEIGHT)
+    with pycolmap.Database.open(path) as database:
+        database.write_camera(camera, use_camera_id=True)
+        for view in reversed(range(len(scene.keypoints))):
+            image = pycolmap.Image(name=f"{view:06d}.png", camera_id=1, image_id=100 - view)
+            database.write_image(image, use_image_id=True)
+            database.write_keypoints(100 - view, scene.keypoints[view].numpy())
+        for pair in scene.pairs:
+            ids = 100 - pair.first, 100 - pair.second
+            rows = pair.matches.numpy().astype(np.uint32)
+            database.write_matches(*ids, rows)
+            ends = [scene.keypoints[end].double().numpy() for end in (pair.first, pair.second)]
+            geometry = pycolmap.estimate_two_view_geometry(
+                camera, ends[0], camera, ends[1], rows, options
+            )
+            database.write_two_view_geometry(*ids, geometry)
+    return path
+
+
+def read(path, scene):
+    """Give matches and verified matches of each pair."""
+    with loaded().Database.open(path) as database:
+        return [
+            (
+                torch.from_numpy(database.read_matches(*ids).astype(np.int64)),
+                torch.from_numpy(geometry.inlier_matches.astype(np.int64)).reshape(-1, 2),
+            )
+            for pair in scene.pairs
+            for ids in [(100 - pair.first, 100 - pair.second)]
+            for geometry in [
+                database.read_two_view_geometry(*ids)
+                if database.exists_two_view_geometry(*ids)
+                else loaded().TwoViewGeometry()
+            ]
+        ]
+
+
+def test_pairs_that_were_verified_on_the_room_are_verified_on_what_turns(tmp_path, generator):
+    # So many features at rest that every pair is first verified on them.
+    scene = turntable(generator, turning=250, resting=300, count=5, span_deg=100.0)
+    path = stored(scene, tmp_path / "database.db")
+    on_room = 0
+    for pair, (_, verified) in zip(scene.pairs, read(path, scene), strict=True):
+        on_room += int((scene.thing[pair.first][verified[:, 0]] >= 250).double().mean() > 0.9)
+    assert on_room == len(scene.pairs)
+    assert leave_out_room(path, SETTINGS).room
+    used = 0
+    for pair, (matches, verified) in zip(scene.pairs, read(path, scene), strict=True):
+        for rows in (matches, verified):
+            both = pair.replace(matches=rows)
+            room = scene.thing[pair.first][rows[:, 0]] >= 250
+            assert not (room & scene.right(both)).any()
+        if len(verified):
+            assert len(verified) >= 15
+            used += 1
+            assert scene.right(pair.replace(matches=verified)).double().mean() > 0.95
+    assert used == len(scene.pairs)
+
+
+def test_a_rigid_scene_keeps_all_its_matches(tmp_path, generator):
+    scene = Captured(generator, seen_of_ball(generator, 300, orbit(5, 100.0)))
+    path = stored(scene, tmp_path / "database.db")
+    before = read(path, scene)
+    rest = leave_out_room(path, SETTINGS)
+    assert not rest.room
+    assert not any(resting.any() for resting in rest.features)
+    for one, other in zip(before, read(path, scene), strict=True):
+        assert torch.equal(one[0], other[0])
+        assert torch.equal(one[1], other[1])
