@@ -1,4 +1,5 @@
 import os
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -181,6 +182,7 @@ def lift():
 
     slant = (0.15, -0.1, 1.0)
 
+    @cache
     def make(height: float, textured: bool = True) -> SimpleNamespace:
         generator = torch.Generator().manual_seed(64)
         cameras = arc_cameras(9, width=120, height=90, focal_px=330.0, distance=3.0, span_deg=50.0)

@@ -1,3 +1,5 @@
+from functools import cache
+
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -12,6 +14,7 @@ from pimper_torch.sweep.sweep import Sweep
 
 @pytest.fixture(scope="session")
 def swept(lift):
+    @cache
     def make(height: float):
         lifted = lift(height)
         scene = lifted.scene

@@ -1,7 +1,9 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
+from pimper_torch.patches.warp import Warp
 from pimper_torch.records import SweptPatches
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
@@ -69,26 +71,54 @@ def test_fewer_views_suffice_and_too_few_are_none(lift):
     assert all((bucket.offset == 0).all() for bucket in none.buckets)
 
 
-def test_the_claimed_deviation_is_of_the_size_of_the_error(lift):
+@pytest.mark.parametrize("noise", [0.01, 0.04])
+def test_the_claimed_deviation_is_of_the_size_of_the_error(lift, noise):
     lifted = lift(0.4)
-    swept = sweep(lifted)
+    views, cameras, fitted = lifted.scene.views, lifted.scene.cameras, lifted.photometric
+    drawn = torch.randn(views.images.shape, generator=torch.Generator().manual_seed(0))
+    noisy = views.replace(images=views.images + noise * drawn)
+    seen = Warp()(noisy, cameras, fitted.patches)
+    buckets = []
+    for rough, smooth, found in zip(seen.buckets, lifted.seen.buckets, fitted.buckets, strict=True):
+        # What a factorization of these photographs would leave.
+        spread = (rough.gray - smooth.gray)[rough.valid & smooth.valid].std()
+        ended = found.convergence
+        ended = ended.replace(residual=torch.full_like(ended.residual, float(spread)))
+        buckets.append(found.replace(convergence=ended))
+    swept = Sweep()(noisy, cameras, seen, fitted.replace(buckets=tuple(buckets)))
     offsets, deviations = told(swept)
     error = (offsets + lifted.height) / (deviations / swept.averaged**0.5)
-    # Photographs without noise: the window's error is that of looking up between pixels.
-    assert 0.02 < float(error.abs().median()) < 3
+    # 0.6745: the median of a standard normal's absolute values. Measured 0.59 and 0.93:
+    # neighbouring samples share pixels, and are counted as if they shared more.
+    assert 0.5 < float(error.abs().median()) / 0.6745 < 1.1
 
 
-def test_heights_can_be_differentiated_by_the_photographs(lift):
+def test_heights_have_the_slope_of_the_photographs_differences(lift):
     lifted = lift(0.7)
     scene = lifted.scene
-    images = scene.views.images.clone().requires_grad_()
-    swept = Sweep()(
-        scene.views.replace(images=images), scene.cameras, lifted.seen, lifted.photometric
-    )
-    sum(bucket.offset.sum() for bucket in swept.buckets).backward()
-    assert images.grad is not None
-    assert images.grad.isfinite().all()
-    assert (images.grad.abs().amax(dim=(1, 2, 3)) > 0).all()
+    images = scene.views.images.double().requires_grad_()
+    generator = torch.Generator().manual_seed(3)
+    along = torch.randn(images.shape, generator=generator, dtype=torch.float64)
+    step = 1e-6
+
+    def swept(photographs):
+        views = scene.views.replace(images=photographs)
+        return Sweep()(views, scene.cameras, lifted.seen, lifted.photometric).buckets
+
+    total = slope = torch.zeros((), dtype=torch.float64)
+    sides = swept(images.detach() + step * along), swept(images.detach() - step * along)
+    for here, ahead, behind in zip(swept(images), *sides, strict=True):
+        weight = torch.randn(here.offset.shape, generator=generator, dtype=torch.float64)
+        # The parabola's three hypotheses are constant: a sample that changes them jumps.
+        jumped = (ahead.offset - behind.offset).abs() > 1e-3 * here.offset.abs().max()
+        assert jumped.double().mean() < 1e-3
+        weight = torch.where(jumped, 0, weight)
+        total = total + (weight * here.offset).sum()
+        slope = slope + (weight * (ahead.offset - behind.offset)).sum() / (2 * step)
+    (gradient,) = torch.autograd.grad(total, images)
+    assert (gradient.abs().amax(dim=(1, 2, 3)) > 0).all()
+    # Measured 0.3 %: the albedo is held, and has not quite converged in its two rounds.
+    assert_close((gradient * along).sum(), slope.detach(), rtol=0.01, atol=0)
 
 
 @pytest.mark.parametrize(
