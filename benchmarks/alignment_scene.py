@@ -40,7 +40,6 @@ CASES: dict[str, tuple[AlignConfig | None, RefineConfig]] = {
     "without k": (AlignConfig(curvature=False), RefineConfig()),
     "without offset": (AlignConfig(offset=False), RefineConfig()),
     "scale": (AlignConfig(method="scale"), RefineConfig()),
-    "robust smoothness": (AlignConfig(), RefineConfig(smoothness="robust")),
 }
 
 FAR = 3.0

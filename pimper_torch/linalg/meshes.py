@@ -1,6 +1,6 @@
-r"""Linear finite elements on triangle meshes: gradient, Laplacian and mass.
+r"""Linear finite elements on triangle meshes: Laplacian and mass.
 
-A function is its values at the vertices, linear on every face. With :math:`G` the gradient,
+A function is its values at the vertices, linear on every face. With :math:`G` its gradient,
 :math:`A` the areas of the faces and :math:`w` a weight of each, the Laplacian is
 :math:`L = G^T A\, w\, G`: that of a graph whose edges weigh half the cotangents of the angles
 opposite to them. The least-squares fit of heights to slopes :math:`p`,
@@ -49,13 +49,6 @@ def elements(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) 
         area=doubled.norm(dim=-1) / 2,
         count=len(vertices),
     )
-
-
-def gradient(
-    mesh: Elements, values: Float[Tensor, "vertex channel"]
-) -> Float[Tensor, "face channel 3"]:
-    """Give the gradient on every face, within its plane; a face without area has none, NaN."""
-    return values[mesh.faces].mT @ mesh.turned / (2 * mesh.area)[:, None, None]
 
 
 def cotangent_laplacian(

@@ -7,7 +7,7 @@ and G averaged over each face. The surface S is a place for every vertex, so tha
 coordinates are three right-hand sides of one system.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,11 +19,9 @@ from pimper_torch.linalg.meshes import (
     Elements,
     cotangent_laplacian,
     elements,
-    gradient,
     lumped_mass,
 )
 from pimper_torch.records import Record
-from pimper_torch.refinement.smoothness import charbonnier_weight
 
 # Fidelity, as a share of the usual, that ties what no patch supports to the flat facets: it
 # makes the system definite on an island without support, and is nothing elsewhere.
@@ -70,7 +68,6 @@ def assemble(
     lattice: Lattice,
     fidelity: Float[Tensor, " facet"],
     supported: Bool[Tensor, " vertex"],
-    stiffness: Float[Tensor, " face"] | None = None,
 ) -> System:
     """Assemble the normal equations of the energy.
 
@@ -79,7 +76,6 @@ def assemble(
         fidelity: Lambda of each facet, 1/length^2.
         supported: Where the union is known. Elsewhere the mass is (nearly) zero, and the
             smoothness term alone fills S in.
-        stiffness: Multiplies G on each face; ``None`` is 1.
 
     Constant to autograd: it holds the geometry of the flat facets only.
     """
@@ -88,8 +84,6 @@ def assemble(
     mass = lumped_mass(mesh, fidelity.double()[lattice.face_facet])
     mass = mass * (1 - weights) * torch.where(supported, 1, _TIE)
     seams = weights[lattice.faces].mean(dim=1)
-    if stiffness is not None:
-        seams = seams * stiffness
     rows, cols, values = cotangent_laplacian(mesh, seams, _LEAST_SHAPE)
     diagonal = torch.arange(mesh.count, device=mass.device)
     return System(
@@ -138,8 +132,6 @@ def plane_pull(
     lattice: Lattice,
     trends: Float[Tensor, "facet 3 3"],
     fitted: Bool[Tensor, " facet"],
-    stiffness: Float[Tensor, " face"] | None = None,
-    crease: float = float("inf"),
 ) -> Float[Tensor, "vertex 3"]:
     r"""Give the right-hand side that keeps S from sliding along itself.
 
@@ -157,16 +149,11 @@ def plane_pull(
         lattice: What the energy is integrated over.
         trends: J of every facet.
         fitted: Whether it was fitted.
-        stiffness: What multiplies G on each face; ``None`` is 1.
-        crease: Half the jump of slope at a seam beyond which the crease there pulls no harder,
-            in the way of :func:`~pimper_torch.refinement.smoothness.charbonnier_weight`.
     """
     weights = seam_weight(lattice.barycentric.double())
     gradients = _elements(lattice).turned
     slope = trends[lattice.face_facet]
     held = weights[lattice.faces].mean(dim=1)
-    if stiffness is not None:
-        held = held * stiffness
     pull = held[:, None, None] / 2 * (gradients @ slope.mT)
     total = trends.new_zeros(len(lattice.points), 3)
     total = total.index_add(0, lattice.faces.flatten(), pull.flatten(0, 1))
@@ -181,29 +168,8 @@ def plane_pull(
     opposite = (corners[..., None] != ends[:, None, None, :]).all(dim=-1)
     inward = (opposite[..., None] * gradients[faces]).sum(dim=2)
     jump = (slope[faces] @ inward[..., None])[..., 0].sum(dim=1)  # times the edge's length
-    length = inward[:, 0].norm(dim=1).clamp_min(torch.finfo(inward.dtype).tiny)
-    half = jump.norm(dim=1) / (2 * length)
-    weight = weights[ends].mean(dim=1) / 2 * charbonnier_weight(half, crease)
+    weight = weights[ends].mean(dim=1) / 2
     return total.index_add(0, ends.flatten(), (weight[:, None] * jump).repeat_interleave(2, dim=0))
-
-
-def face_slopes(lattice: Lattice, places: Float[Tensor, "vertex 3"]) -> Float[Tensor, "face 3 3"]:
-    """Give the gradient of places on every flat face: how it stretches and tilts the face.
-
-    Directions out of the face's plane give zero, and so do faces without area. Differentiable
-    in ``places``.
-    """
-    mesh = _elements(lattice)
-    area = mesh.area.clamp_min(torch.finfo(mesh.area.dtype).tiny)
-    return gradient(replace(mesh, area=area), places.double())
-
-
-def trend_deviation(
-    lattice: Lattice, places: Float[Tensor, "vertex 3"], trends: Float[Tensor, "facet 3 3"]
-) -> Float[Tensor, " face"]:
-    r"""Give :math:`|\nabla S - J|` of every face, J the trend of its facet within its plane."""
-    trend = trends[lattice.face_facet] @ face_slopes(lattice, lattice.points)
-    return (face_slopes(lattice, places) - trend).flatten(1).norm(dim=1)
 
 
 def _elements(lattice: Lattice) -> Elements:

@@ -1,7 +1,6 @@
 """Refinement: relief of all patches in, one joined surface out."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,14 +14,7 @@ from pimper_torch.geometry.lattice import Lattice, subdivide
 from pimper_torch.geometry.surfaces import face_edges, vertex_normals
 from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
-from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull, trend_deviation
-from pimper_torch.refinement.smoothness import reweighted
-
-# Robust smoothness has settled when vertices move by less than this share of their spacing.
-_SETTLED = 1e-3
-
-# Solves after which robust smoothness ends, settled or not; 5 to 15 are usual.
-_MOST_SOLVES = 40
+from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,11 +31,6 @@ class RefineConfig:
             the middle of an edge, 1.55 ``r`` at a vertex of the coarse mesh, nothing in the
             middle of a facet. Twice the radius is a quarter of lambda. The notebook
             ``02_refinement`` shows it.
-        smoothness: ``quadratic``, the published one, smooths whatever lies at a seam;
-            ``robust`` keeps creases and steps whose slope is off its facet's trend by more
-            than ``crease``, and is solved several times.
-        crease: Of robust smoothness: the slope, off the facet's trend, up to which it smooths
-            as the quadratic does, and beyond which it gives way; 0.1 is 6 degrees.
         hold_planes: Cancel what the energy's tension does to flat data, which it would
             shrink at the open rim and shift where G changes. False is the published energy.
         outlier_samples: How far, in samples, a patch may lie from the others before they
@@ -52,22 +39,13 @@ class RefineConfig:
 
     samples_per_vertex: float = 1.0
     smoothing_radius_samples: float = 1.0
-    smoothness: Literal["quadratic", "robust"] = "quadratic"
-    crease: float = 0.1
     hold_planes: bool = True
     outlier_samples: float = 4.0
 
     def __post_init__(self) -> None:
-        names = ("samples_per_vertex", "smoothing_radius_samples", "crease", "outlier_samples")
-        for name in names:
+        for name in ("samples_per_vertex", "smoothing_radius_samples", "outlier_samples"):
             value = getattr(self, name)
             require(value > 0, name, value, "above 0")
-        require(
-            self.hold_planes or self.smoothness == "quadratic",
-            "smoothness",
-            self.smoothness,
-            "quadratic where hold_planes is false, for without it slopes have no trend",
-        )
 
 
 class Refine(nn.Module):
@@ -76,14 +54,12 @@ class Refine(nn.Module):
     Minimises :math:`\int \lambda (1-G) |\cup S_\mu - S|^2 + G |\nabla S|^2` over the lattice
     of the coarse mesh, with places S as unknowns: one sparse factorization, three right-hand
     sides. See :mod:`~pimper_torch.refinement.energy` for the discretisation and for what
-    ``hold_planes`` adds to the published energy, :mod:`~pimper_torch.refinement.smoothness`
-    for robust smoothness, which takes a factorization for each of its solves, and
-    :mod:`~pimper_torch.fusion.union` for the union. Vertices that no patch supports are
+    ``hold_planes`` adds to the published energy, and :mod:`~pimper_torch.fusion.union` for the
+    union. Vertices that no patch supports are
     filled by the smoothness term and have confidence 0.
 
     Differentiable in depth, photometric normals, albedo and confidence; the coarse mesh and
-    the templates are constants. With robust smoothness gradients run through the last solve,
-    whose weights count as constants: what a change of depth does to the weights is missing.
+    the templates are constants.
     """
 
     def __init__(self, config: RefineConfig | None = None) -> None:
@@ -94,8 +70,7 @@ class Refine(nn.Module):
         """Refine the union of all patches.
 
         The convergence's residual is the root mean square distance between the union and
-        the surface, in scene units; its iterations are the solves, one for quadratic
-        smoothness.
+        the surface, in scene units, after one solve.
 
         Where no patch has valid relief anywhere, as under one light for all views, the
         surface is that of the facets, its seams smoothed, with confidence 0.
@@ -109,9 +84,7 @@ class Refine(nn.Module):
         if not bool(union.supported.any()):
             union = union.replace(supported=torch.ones_like(union.supported))
         points = lattice.points + union.heights[:, None] * directions
-        refined, solves, cause = smooth_seams(
-            lattice, points, union.supported, spacing, self.config
-        )
+        refined = smooth_seams(lattice, points, union.supported, spacing, self.config)
         vertices = refined.to(points)
         apart = (refined - points.double())[union.supported].detach()
         return Surface(
@@ -123,9 +96,9 @@ class Refine(nn.Module):
             albedo=about_mean(union.albedo, union.seen, face_edges(lattice.faces)[0]),
             confidence=union.confidence,
             convergence=Convergence(
-                iterations=torch.full((1,), solves, device=points.device),
+                iterations=torch.ones(1, dtype=torch.long, device=points.device),
                 residual=apart.square().sum(dim=-1).mean().sqrt()[None].to(points),
-                cause=torch.full((1,), int(cause), device=points.device),
+                cause=torch.full((1,), int(StopCause.CONVERGED), device=points.device),
             ),
         )
 
@@ -136,7 +109,7 @@ def smooth_seams(
     supported: Bool[Tensor, " vertex"],
     spacing: Float[Tensor, " facet"],
     config: RefineConfig,
-) -> tuple[Float[Tensor, "vertex 3"], int, StopCause]:
+) -> Float[Tensor, "vertex 3"]:
     """Minimise the energy over the lattice.
 
     Args:
@@ -144,40 +117,21 @@ def smooth_seams(
         points: The union: where the patches have each vertex.
         supported: Where they have it anywhere.
         spacing: Of each facet's vertices, scene units; the radius is counted in it.
-        config: Radius, smoothness and whether planes are held.
+        config: Radius and whether planes are held.
 
     Returns:
-        The places in float64, how many systems were solved, and why that ended.
+        The places in float64.
 
     Differentiable in ``points``; see :class:`Refine`.
     """
     fidelity = (config.smoothing_radius_samples * spacing.double()) ** -2
-    robust = config.smoothness == "robust"
-    trends, fitted = facet_trends(lattice, points, supported, len(spacing))
-    crease = config.crease if robust else torch.inf
-
-    def solve(stiffness: Float[Tensor, " face"]) -> Float[Tensor, "vertex 3"]:
-        system = assemble(lattice, fidelity, supported, stiffness)
-        rhs = system.mass[:, None] * points.double()
-        if config.hold_planes:
-            rhs = rhs + plane_pull(lattice, trends, fitted, stiffness, crease)
-        (found,) = solutions(system.rows, system.cols, system.values, rhs, what="the refinement")
-        return found
-
-    def deviation(places: Float[Tensor, "vertex 3"]) -> Float[Tensor, " face"]:
-        return trend_deviation(lattice, places, trends)
-
-    even = fidelity.new_ones(len(lattice.faces))
-    if not robust:
-        return solve(even), 1, StopCause.CONVERGED
-    return reweighted(
-        solve,
-        deviation,
-        even,
-        scale=config.crease,
-        tolerance=_SETTLED * spacing.double().median(),
-        limit=_MOST_SOLVES,
-    )
+    system = assemble(lattice, fidelity, supported)
+    rhs = system.mass[:, None] * points.double()
+    if config.hold_planes:
+        trends, fitted = facet_trends(lattice, points, supported, len(spacing))
+        rhs = rhs + plane_pull(lattice, trends, fitted)
+    (found,) = solutions(system.rows, system.cols, system.values, rhs, what="the refinement")
+    return found
 
 
 def _normals(
