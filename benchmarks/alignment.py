@@ -41,7 +41,6 @@ BUMP = (0.03, 0.008)
 METHODS: dict[str, AlignConfig] = {
     "bas-relief": AlignConfig(),
     "published": AlignConfig(offset=False, outlier=float("inf")),
-    "scale": AlignConfig(method="scale"),
 }
 
 

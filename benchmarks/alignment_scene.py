@@ -39,7 +39,6 @@ CASES: dict[str, tuple[AlignConfig | None, RefineConfig]] = {
     "without points between vertices": (AlignConfig(points=0.0), RefineConfig()),
     "without k": (AlignConfig(curvature=False), RefineConfig()),
     "without offset": (AlignConfig(offset=False), RefineConfig()),
-    "scale": (AlignConfig(method="scale"), RefineConfig()),
 }
 
 FAR = 3.0

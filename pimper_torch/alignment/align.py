@@ -1,7 +1,6 @@
 """Alignment: bas-relief transforms that make neighbouring patches agree."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -33,13 +32,10 @@ from pimper_torch.alignment.trust import (
     overlapping_seams,
     reliable_seams,
     trust_by_distance,
-    trust_by_sides,
 )
 from pimper_torch.config import require
 from pimper_torch.progress import report
 from pimper_torch.records import AlignVerdict, DepthPatches, Depths, PatchSet, Record
-
-Method = Literal["bas-relief", "scale"]
 
 # An arc over an edge whose middle stands out by 0.7 % of its length has this C; flatter
 # reliefs are not told apart.
@@ -58,11 +54,6 @@ class AlignConfig:
     """How patches are brought together.
 
     Attributes:
-        method: What of each relief is unknown. ``bas-relief``: tilt and scale, which is what
-            photometry leaves open. ``scale``: one scale a patch, as when components of a
-            surface are integrated apart and their relative scales are found from their
-            borders; overlap samples are then weighed against their mirror images across
-            the edge too.
         offset: Also let each patch move along its normal: 4 unknowns a patch instead of the
             published 3.
         curvature: Weight seams by the published ``k``; without it all weigh alike.
@@ -84,7 +75,6 @@ class AlignConfig:
             their weight, and quickly more beyond; depth edges run through some overlaps.
     """
 
-    method: Method = "bas-relief"
     offset: bool = True
     curvature: bool = True
     rounds: int = 3
@@ -258,8 +248,6 @@ class Align(nn.Module):
         )
         met = overlaps.met.flatten(1)
         prior = unit.new_full((4,), self.config.prior)
-        if self.config.method == "scale":
-            prior[:2] = torch.inf
         if not self.config.offset:
             prior[3] = torch.inf
         count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
@@ -335,9 +323,6 @@ class Align(nn.Module):
         """Lower the weight of samples and points that the transforms so far contradict."""
         config, met = self.config, pulls.weight > 0
         trust = trust_by_distance(distance, met, config.outlier)
-        if config.method == "scale":
-            shape = (len(distance), config.rows, config.columns)
-            trust = trust * trust_by_sides(distance.reshape(shape), met.reshape(shape)).flatten(1)
         points = pulls.points
         if points is not None:
             missed = (points.samples * transforms[points.facet]).sum(dim=-1) - points.heights

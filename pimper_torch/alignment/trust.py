@@ -9,9 +9,6 @@ from pimper_torch.records import AlignVerdict
 # Reliefs this close, in edge lengths, agree; only beyond it can a sample be an outlier.
 SAME_PLACE = 5e-3
 
-# How sharply one side of an edge is preferred: that of bilateral normal integration.
-_SIDES_SHARPNESS = 2.0
-
 # A seam whose samples keep less of their weight than this on average bears nobody out: it is
 # what a sample at the outlier's distance keeps.
 _RELIABLE = 0.25
@@ -39,24 +36,6 @@ def trust_by_distance(
             (Geman and McClure's function).
     """
     return (1 + (distance / (outlier * common_distance(distance, met))).square()) ** -2
-
-
-def trust_by_sides(
-    distance: Float[Tensor, "seam row column"], met: Bool[Tensor, "seam row column"]
-) -> Float[Tensor, "seam row column"]:
-    r"""Believe, of two samples that mirror each other across the edge, the one that agrees.
-
-    A depth edge beside a seam spoils one of its sides. With r the distances of a sample and
-    of its mirror image, in medians of all, a sample keeps
-    :math:`2 / (1 + e^{2 (r^2 - r_{mirror}^2)})`, at most 1: all of it where it is the better
-    one or its mirror image was not met.
-
-    Source: Cao, Santo, Shi, Okura, Matsushita: Bilateral normal integration, ECCV 2022, for
-    the weights, there between the two sides of a pixel.
-    """
-    away = (distance / common_distance(distance, met)).square()
-    worse = torch.where(met.flip(1), away - away.flip(1), 0).clamp_min(0)
-    return 2 * torch.sigmoid(-_SIDES_SHARPNESS * worse)
 
 
 def overlapping_seams(met: Bool[Tensor, "seam ray"]) -> Bool[Tensor, " seam"]:

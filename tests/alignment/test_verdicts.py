@@ -7,7 +7,6 @@ from pimper_torch.alignment.trust import (
     judge_patches,
     overlapping_seams,
     reliable_seams,
-    trust_by_sides,
 )
 from pimper_torch.records import AlignVerdict
 from pimper_torch.reporting import figures
@@ -114,20 +113,6 @@ def test_a_seam_is_reliable_where_enough_of_it_agrees():
     found = judge_patches(facets, overlapping, reliable_seams(trust, met), 7)
     wanted = [ALIGNED, ALIGNED, DISPUTED, DISPUTED, ALONE, ALONE, ALONE]
     assert found.tolist() == wanted
-
-
-def test_the_side_of_an_edge_that_agrees_is_believed():
-    distance = torch.full((1, 5, 4), 0.1)
-    distance[0, 4] = 1.0  # a depth edge beyond the last line
-    distance[0, 3, 2] = 0.2
-    met = torch.ones_like(distance, dtype=torch.bool)
-    trust = trust_by_sides(distance, met)
-    assert_close(trust[0, :3], torch.ones(3, 4))
-    assert trust[0, 4].max() < 1e-6
-    share = 2 / (1 + torch.tensor(2.0 * (4 - 1)).exp())
-    assert_close(trust[0, 3], torch.tensor([1.0, 1.0, float(share), 1.0]))
-    met[0, 0] = False  # nothing to compare with
-    assert_close(trust_by_sides(distance, met)[0, 4], torch.ones(4))
 
 
 def test_with_infinite_outlier_distance_nobody_is_disputed(facets_over, reliefs, generator):
