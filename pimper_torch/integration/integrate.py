@@ -6,14 +6,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from pimper_torch.config import require
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.reliefs import sample_raster
-from pimper_torch.geometry.surfaces import normals_from_slopes, slopes_from_normals
+from pimper_torch.geometry.surfaces import slopes_from_normals
 from pimper_torch.integration.filling import fill_smoothly
-from pimper_torch.integration.normal_map import integrate_normal_map
 from pimper_torch.linalg.poisson import integrate_weighted
 from pimper_torch.progress import track
 from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
@@ -26,9 +24,6 @@ _FILLED_WEIGHT = 1e-4
 # Uncertain slopes weigh no less than this: their neighbours are hardly better.
 _LEAST_CONFIDENCE = 0.05
 
-# Samples of patches that are solved together.
-_CHUNK_SAMPLES = 1_000_000
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IntegrateConfig:
@@ -40,13 +35,10 @@ class IntegrateConfig:
         iterations: Rounds of weighted least squares after the published integration, so
             that filled slopes stop pulling at measured ones and uncertain ones count less.
             0 is the published method.
-        discontinuities: Let relief jump inside a patch, instead of weighted least squares;
-            see :mod:`~pimper_torch.integration.discontinuities`. Takes many times as long.
     """
 
     max_tilt_deg: float = 75.0
     iterations: int = 8
-    discontinuities: bool = False
 
     def __post_init__(self) -> None:
         require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
@@ -77,13 +69,14 @@ class Integrate(nn.Module):
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
         buckets = []
         for templates, photometry in track(pairs):
-            given = photometry.normals_patch, photometry.valid, photometry.confidence
-            if self.config.discontinuities:
-                relief = integrate_torn(*given, templates.inside, templates.spacing, steepest)
-            else:
-                relief = integrate_normals(
-                    *given, templates.spacing, steepest, self.config.iterations
-                )
+            relief = integrate_normals(
+                photometry.normals_patch,
+                photometry.valid,
+                photometry.confidence,
+                templates.spacing,
+                steepest,
+                self.config.iterations,
+            )
             depth = through_corners(relief, templates, photometric.patches.coarse)
             buckets.append(_depths(depth, templates, photometry))
         return DepthPatches(photometric=photometric, buckets=tuple(buckets))
@@ -121,44 +114,6 @@ def integrate_normals(
         iterations,
     )
     return relief.to(normals)
-
-
-def integrate_torn(
-    normals: Float[Tensor, "patch height width 3"],
-    valid: Bool[Tensor, "patch height width"],
-    confidence: Float[Tensor, "patch height width"],
-    inside: Bool[Tensor, "patch height width"],
-    spacing: Float[Tensor, " patch"],
-    steepest: float,
-) -> Float[Tensor, "patch height width"]:
-    """Find the relief, of mean zero, that has the normals and may jump.
-
-    All patches stand one below the other in one raster, with an empty row between them.
-
-    Args:
-        normals: As for :func:`integrate_normals`.
-        valid: Likewise.
-        confidence: Likewise.
-        inside: Where there is to be relief; outside it is continued smoothly.
-        spacing: Between samples, in the units of the depth.
-        steepest: Limit of a slope's size.
-    """
-    gentle = normals_from_slopes(_slopes(normals, valid, steepest).double())
-    weight = torch.where(valid, confidence.double().clamp(_LEAST_CONFIDENCE, 1), 0)
-    chunk = max(1, _CHUNK_SAMPLES // valid[0].numel())
-    reliefs = []
-    for first in range(0, len(valid), chunk):
-        part = slice(first, first + chunk)
-        mask = pad(inside[part], (0, 0, 0, 1))
-        found = integrate_normal_map(
-            pad(gentle[part], (0, 0, 0, 0, 0, 1)).flatten(0, 1),
-            mask.flatten(0, 1),
-            weight=pad(weight[part], (0, 0, 0, 1)).flatten(0, 1),
-        )
-        reliefs.append(found.depth.reshape(mask.shape)[:, :-1])
-    known = inside.to(reliefs[0])
-    relief = fill_smoothly(torch.cat(reliefs)[:, None], known)[:, 0]
-    return (relief * spacing[:, None, None]).to(normals)
 
 
 def _slopes(

@@ -77,40 +77,6 @@ def test_holes_are_bridged_in_keeping_with_their_rim(two_facets, photographed):
     assert worst_misfit(depths, keep=lambda x, y: ~outside_hole(x, y)) < 0.005
 
 
-def ledge(x, y):
-    """Relief that jumps by up to 0.2 along x = 0 below y = -0.1, from where a slope joins both."""
-    return torch.where(x < 0, (y + 0.1).clamp(0, 0.2), 0)
-
-
-def slopes_of_ledge(x, y):
-    rising = (x < 0) & (y > -0.1) & (y < 0.1)
-    return torch.zeros_like(x), torch.where(rising, 1.0, 0).to(x)
-
-
-def test_relief_may_jump_inside_a_patch_if_it_is_allowed_to(two_facets, photographed):
-    seen = photographed(two_facets(2.0), slopes_of_ledge)
-    torn = Integrate(IntegrateConfig(discontinuities=True))(seen)
-    smooth = Integrate()(seen)
-
-    def off(depths):
-        """Spread of what is left, patch by patch; the plane of the facet is not at stake."""
-        spreads = []
-        for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
-            x, y, _ = templates.points_patch.unbind(dim=-1)
-            for patch in range(len(x)):
-                apart = relief.depth[patch] - ledge(x[patch], y[patch])
-                spreads.append(float(apart[templates.inside[patch]].std()))
-        return max(spreads)
-
-    assert off(torn) < 0.4 * off(smooth)
-    assert all(relief.depth.isfinite().all() for relief in torn.buckets)
-
-
-def test_where_nothing_jumps_both_ways_agree(two_facets, photographed):
-    seen = photographed(two_facets(2.0), slopes_of_bumps)
-    assert worst_misfit(Integrate(IntegrateConfig(discontinuities=True))(seen)) < 1e-3
-
-
 def test_a_patch_without_normals_stays_its_facet_and_says_so(two_facets, photographed):
     patches = two_facets(1.0)
     seen = photographed(patches, slopes_of_bumps, keep=lambda x, y: torch.zeros_like(x) > 0)
