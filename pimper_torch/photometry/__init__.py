@@ -14,7 +14,7 @@ from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.low_rank import low_rank_problem, random_left, singular_left
 from pimper_torch.photometry.manifolds import Cone, Free, SecondOrder
 from pimper_torch.photometry.restarts import Restarted, factorize_from_many
-from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Squares
+from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 
 __all__ = [
@@ -26,7 +26,6 @@ __all__ = [
     "FactorizeConfig",
     "Factors",
     "Free",
-    "GemanMcClure",
     "Restarted",
     "SecondOrder",
     "Solver",

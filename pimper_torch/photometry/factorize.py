@@ -25,7 +25,7 @@ from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.light_field import LightField, faces_lamp
 from pimper_torch.photometry.manifolds import Cone, Free, Manifold, SecondOrder
 from pimper_torch.photometry.mesh_light import light_of_mesh
-from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Loss, Squares
+from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, on_raster, rows_of
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
 from pimper_torch.photometry.starts import start_from_data, start_from_mesh
@@ -69,7 +69,6 @@ SOLVERS: dict[str, Solver] = {
 LOSSES: dict[str, Callable[[float], Loss]] = {
     "squares": lambda _: Squares(),
     "cauchy": Cauchy,
-    "geman-mcclure": GemanMcClure,
 }
 
 # A surface is right to so many samples, where it casts shadows.
@@ -102,8 +101,8 @@ class FactorizeConfig:
         light_pull: How strongly each patch's lights hold to those fitted to the mesh, in units
             of the patch's own data; 0 leaves them free, 1e6 fixes them.
         geometry_weight: How strongly normals hold to the coarse ones, in units of one view.
-        loss: How highlights and shadows lose weight: ``"cauchy"``; ``"geman-mcclure"``, more
-            sharply; ``"squares"``, not at all.
+        loss: How highlights and shadows lose weight: ``"cauchy"``, or ``"squares"``, not at
+            all.
         shadows: Whether samples that the lamp cannot reach past the surface are missing. Needs
             a surface that is nearly right.
         loss_scale: Of the loss, in standard deviations of the patch's residuals; Cauchy's
@@ -124,7 +123,7 @@ class FactorizeConfig:
     solver: Literal["variable-projection", "alternation", "balm", "descent"] = "variable-projection"
     light_pull: float = 1.0
     geometry_weight: float = 0.1
-    loss: Literal["squares", "cauchy", "geman-mcclure"] = "cauchy"
+    loss: Literal["squares", "cauchy"] = "cauchy"
     loss_scale: float = 2.385  # 95 % efficient on Gaussian noise
     shadows: bool = True
     min_views: int = 4

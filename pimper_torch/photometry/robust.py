@@ -53,38 +53,7 @@ class Cauchy:
         return weight * (2 * weight - 1)
 
 
-@dataclass(frozen=True, slots=True)
-class GemanMcClure:
-    r"""Geman & McClure's loss :math:`\tfrac12 r^2 / (1 + (r / s)^2)`: outliers cease to pull.
-
-    It has more bad minima than Cauchy's, and wants a good start.
-
-    Attributes:
-        scale: ``s`` in standard deviations of the residuals.
-
-    Source: Geman & McClure, Bulletin of the ISI 52(4), 1987.
-    """
-
-    scale: float = 3.79  # 95 % efficient on Gaussian noise
-
-    def __post_init__(self) -> None:
-        require(self.scale > 0, "scale", self.scale, "above 0")
-
-    def weights(
-        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*batch"]:
-        """Weigh residuals for iterated least squares, by 1 at 0."""
-        return cauchy_weights(residual, self.scale * deviation).square()
-
-    def curvatures(
-        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*batch"]:
-        """Give the second derivative of the loss, negative for outliers."""
-        root = cauchy_weights(residual, self.scale * deviation)
-        return root.square() * (4 * root - 3)
-
-
-Loss = Squares | Cauchy | GemanMcClure
+Loss = Squares | Cauchy
 
 
 def spread(

@@ -14,7 +14,7 @@ from pimper_torch.photometry.bilinear import (
 )
 from pimper_torch.photometry.certainty import refine_on_manifold
 from pimper_torch.photometry.descent import solve_descent
-from pimper_torch.photometry.robust import Cauchy, GemanMcClure
+from pimper_torch.photometry.robust import Cauchy
 from pimper_torch.photometry.starts import start_from_data
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 
@@ -125,9 +125,8 @@ def test_lights_that_are_held_stay(problem, solve):
     assert (solve(given, 40, 1e-6).lights - given.anchor).abs().max() > 1e-2
 
 
-@pytest.mark.parametrize("loss", [Cauchy(), GemanMcClure()])
 @SOLVERS
-def test_robust_weights_keep_outliers_out(problem, solve, loss, generator):
+def test_robust_weights_keep_outliers_out(problem, solve, generator):
     given, lights, shading = problem(views=20)
     gross = torch.rand(given.radiance.shape, generator=generator) < 0.1
     given = given.replace(
@@ -137,7 +136,7 @@ def test_robust_weights_keep_outliers_out(problem, solve, loss, generator):
         pull=torch.full_like(given.pull, 1e9),
     )
     plain = (solve(given, 100, 1e-6).shading - shading).norm(dim=1).median()
-    robust = solve(given.replace(loss=loss), 200, 1e-6)
+    robust = solve(given.replace(loss=Cauchy()), 200, 1e-6)
     assert (robust.shading - shading).norm(dim=1).median() < 0.02 * plain
     assert robust.weight[gross].max() < 0.1
 
