@@ -1,10 +1,11 @@
-"""Leave features of a room at rest out of the matches in COLMAP's database."""
+"""Leave features of a room at rest out of COLMAP's database."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
@@ -20,7 +21,9 @@ STILL_PX = 1.0
 
 
 def leave_out_room(database: Path, settings: MatchSettings) -> Rest:
-    """Find what is at rest while something else moves, and keep the matches of the latter.
+    """Find what is at rest while something else moves, and keep features and matches of the latter.
+
+    Pairs that were verified on what is at rest are verified anew.
 
     Args:
         database: With features, matches and verified pairs. Where nothing is at rest it stays
@@ -28,7 +31,7 @@ def leave_out_room(database: Path, settings: MatchSettings) -> Rest:
         settings: What counts as a match.
 
     Returns:
-        What was found, with features in the order of the photographs' names.
+        What was found, with the former features in the order of the photographs' names.
     """
     pycolmap = loaded()
 
@@ -44,8 +47,9 @@ def leave_out_room(database: Path, settings: MatchSettings) -> Rest:
             fewest=settings.min_inliers,
         )
         if rest.room:
-            for pair in matched.pairs:
-                _leave_out(stored, pair, rest, verifier, settings.min_inliers)
+            geometries = _read_geometries(stored) | verifier.found
+            _drop_features(stored, matched, rest)
+            _drop_matches(stored, matched, rest, geometries, settings.min_inliers)
     return rest
 
 
@@ -100,31 +104,58 @@ class _Verifier:
             pair.matches.numpy().astype(np.uint32),
             self.options,
         )
-        self.found[ends] = geometry
+        self.found[matched.ids[pair.first], matched.ids[pair.second]] = geometry
         return _among(pair.matches, _indices(geometry.inlier_matches))
 
 
-def _leave_out(stored: Any, pair: Pair, rest: Rest, verifier: _Verifier, fewest: int) -> None:  # noqa: ANN401
-    matched, ends = verifier.matched, (pair.first, pair.second)
-    moving = moving_matches(matched.keypoints, pair, rest, STILL_PX)
-    if moving.all():
-        return
-    ids = matched.ids[pair.first], matched.ids[pair.second]
-    kept = pair.matches[moving]
-    stored.delete_matches(*ids)
-    stored.write_matches(*ids, kept.numpy().astype(np.uint32))
-    geometry = verifier.found.get(ends)
-    if stored.exists_two_view_geometry(*ids):
-        geometry = geometry or stored.read_two_view_geometry(*ids)
-        stored.delete_two_view_geometry(*ids)
-    if geometry is None:
-        return
-    inliers = _indices(geometry.inlier_matches)
-    verified = pair.replace(matches=inliers)
-    inliers = inliers[moving_matches(matched.keypoints, verified, rest, STILL_PX)]
-    if len(inliers) >= fewest:
-        geometry.inlier_matches = inliers.numpy().astype(np.uint32)
-        stored.write_two_view_geometry(*ids, geometry)
+def _read_geometries(stored: Any) -> dict[tuple[int, int], Any]:  # noqa: ANN401 - see _read
+    pycolmap = loaded()
+
+    return {
+        tuple(pycolmap.pair_id_to_image_pair(pair_id)): geometry
+        for pair_id, geometry in zip(*stored.read_two_view_geometries(), strict=True)
+    }
+
+
+def _drop_features(stored: Any, matched: _Matched, rest: Rest) -> None:  # noqa: ANN401 - see _read
+    pycolmap = loaded()
+
+    descriptors = [stored.read_descriptors(image) for image in matched.ids]
+    stored.clear_descriptors()
+    for image, resting, described in zip(matched.ids, rest.features, descriptors, strict=True):
+        kept = (~resting).numpy()
+        stored.update_keypoints(image, np.array(stored.read_keypoints(image))[kept])
+        stored.write_descriptors(
+            image, pycolmap.FeatureDescriptors(described.type, described.data[kept])
+        )
+
+
+def _drop_matches(
+    stored: Any,  # noqa: ANN401 - see _read
+    matched: _Matched,
+    rest: Rest,
+    geometries: dict[tuple[int, int], Any],
+    fewest: int,
+) -> None:
+    number = [torch.cumsum(~resting, dim=0) - 1 for resting in rest.features]
+    stored.clear_matches()
+    stored.clear_two_view_geometries()
+
+    def kept(pair: Pair) -> npt.NDArray[np.uint32]:
+        moving = pair.matches[moving_matches(matched.keypoints, pair, rest, STILL_PX)]
+        first, second = moving.unbind(dim=1)
+        rows = torch.stack([number[pair.first][first], number[pair.second][second]], dim=1)
+        return rows.numpy().astype(np.uint32)
+
+    for pair in matched.pairs:
+        ids = matched.ids[pair.first], matched.ids[pair.second]
+        stored.write_matches(*ids, kept(pair))
+        if ids in geometries:
+            geometry = geometries[ids]
+            inliers = kept(pair.replace(matches=_indices(geometry.inlier_matches)))
+            if len(inliers) >= fewest:
+                geometry.inlier_matches = inliers
+                stored.write_two_view_geometry(*ids, geometry)
 
 
 def _options(settings: MatchSettings) -> Any:  # noqa: ANN401 - see _read
