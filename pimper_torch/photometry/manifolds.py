@@ -267,7 +267,7 @@ def second_order(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"
     """Give the nine harmonics up to the second order; see :class:`SecondOrder`.
 
     >>> second_order(torch.tensor([0.0, 0.0, -1.0]))
-    tensor([ 1.,  0.,  0., -1.,  0.,  -0.,  -0.,  0.,  1.])
+    tensor([ 1.,  0.,  0., -1.,  0., -0., -0.,  0.,  1.])
     """
     x, y, z = normals.unbind(dim=-1)
     root = math.sqrt(3)

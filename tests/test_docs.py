@@ -1,0 +1,157 @@
+"""What the documentation shows runs: examples of docstrings, code and commands of the README."""
+
+import doctest
+import functools
+import re
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+import tyro
+from torch import nn
+from torch.nn.functional import normalize
+
+import pimper_torch
+from pimper_torch.cli.main import main
+from pimper_torch.io import results
+from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.records import SparseScene, Views
+from pimper_torch.scenes import RenderedScene, render_shape, save_photographs, sparse_scene
+from pimper_torch.scenes.cameras import arc_cameras
+from pimper_torch.scenes.lights import wandering_lights
+from pimper_torch.scenes.noise import random_speckle
+from pimper_torch.scenes.shapes import Sphere
+
+PACKAGE = Path(pimper_torch.__file__).parent
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+COMMANDS = re.findall(r"^    (?:.*&& )?pimper (.+)$", README, flags=re.MULTILINE)
+
+
+def modules_with_examples() -> list[str]:
+    """List the modules that have an example which is meant to run."""
+    return [
+        ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if re.search(r">>> (?!.*# doctest: \+SKIP)", path.read_text(encoding="utf-8"))
+    ]
+
+
+@pytest.mark.parametrize("name", modules_with_examples())
+def test_examples_of_docstrings_give_what_they_show(name):
+    ran = doctest.testmod(import_module(name))
+    assert ran.attempted > 0
+    assert ran.failed == 0
+
+
+def photographed() -> tuple[RenderedScene, SparseScene]:
+    """Nine small photographs of a ball, and what structure from motion would make of them."""
+    generator = torch.Generator().manual_seed(18)
+    cameras = arc_cameras(9, width=56, height=42, focal_px=70.0, distance=4.0, span_deg=40.0)
+    lamps = wandering_lights(9, generator, distance=5.0, spread_deg=35.0)
+    texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
+    scene = render_shape(Sphere(), cameras, lamps.harmonics_world(), texture)
+    return scene, sparse_scene(scene, 30, generator)
+
+
+def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    scene, found = photographed()
+    save_photographs(scene.views, Path("photos"))
+
+    class Placed(nn.Module):
+        def __init__(self, config: object) -> None:
+            super().__init__()
+
+        def forward(self, views: Views, sparse_model: object = None) -> SparseScene:
+            assert views.names == found.views.names
+            return found.replace(views=views)
+
+    monkeypatch.setattr("pimper_torch.pipeline.Reconstruct", Placed)  # the longest stage
+    draw = results.draw_overview
+    monkeypatch.setattr(results, "draw_overview", lambda found, path: draw(found, path, 40))
+    return {}
+
+
+def a_matrix_and_patches(_: pytest.MonkeyPatch) -> dict[str, object]:
+    generator = torch.Generator().manual_seed(4)
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    normals = normalize(drawn(2, 50, 3), dim=-1)
+    lights, shading = drawn(2, 9, 4), harmonics(normals).mT
+    return {
+        "X": lights[0] @ shading[0],
+        "weight": torch.ones(9, 50, dtype=torch.float64),
+        "J": lights @ shading,
+        "D": torch.ones(2, 9, 50, dtype=torch.float64),
+        "N": shading,
+        "start": lights + 0.01 * drawn(2, 9, 4),
+        "c": torch.zeros(2, 9, dtype=torch.float64),
+    }
+
+
+def a_ball() -> tuple[torch.Tensor, torch.Tensor]:
+    side = torch.linspace(-1.05, 1.05, 40, dtype=torch.float64)
+    y, x = torch.meshgrid(side, side, indexing="ij")
+    normals = torch.stack([x, y, -(1 - x**2 - y**2).clamp_min(0).sqrt()], dim=-1)
+    return normals, x**2 + y**2 < 0.9
+
+
+def photographs_of_one_viewpoint(_: pytest.MonkeyPatch) -> dict[str, object]:
+    normals, mask = a_ball()
+    generator = torch.Generator().manual_seed(5)
+    lamps = torch.randn(12, 3, generator=generator, dtype=torch.float64) - torch.tensor([0, 0, 3.0])
+    albedo = 0.3 + 0.6 * (normals[..., 0] > 0)
+    shading = torch.einsum("hwx,lx->lhw", normals, normalize(lamps, dim=1))
+    return {"images": (albedo * shading.clamp_min(0))[:, None], "mask": mask}
+
+
+def a_normal_map(_: pytest.MonkeyPatch) -> dict[str, object]:
+    normals, mask = a_ball()
+    K = torch.tensor([[90.0, 0, 20], [0, 90, 20], [0, 0, 1]], dtype=torch.float64)
+    return {"normals": normals, "mask": mask, "K": K}
+
+
+# What each block of Python takes for granted, by a word of its own.
+GIVEN: dict[str, Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
+    "load_views": a_folder_of_photographs,
+    "factorize_from_many": a_matrix_and_patches,
+    "photometric_stereo(": photographs_of_one_viewpoint,
+    "integrate_normal_map": a_normal_map,
+}
+
+
+@pytest.mark.parametrize("word", GIVEN)
+@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
+def test_the_python_of_the_readme_runs(word, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (block,) = [block for block in BLOCKS if word in block]
+    names = GIVEN[word](monkeypatch)
+    exec(compile(block, f"README.md, {word}", "exec"), names)
+
+
+def test_every_block_of_python_in_the_readme_is_run():
+    assert len(BLOCKS) == len(GIVEN)
+
+
+class Understood(Exception):  # noqa: N818 - good news
+    """The command line was parsed."""
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_the_commands_of_the_readme_are_understood(line, monkeypatch):
+    understand = tyro.cli
+
+    def stop(function: Callable[..., object], **options: object) -> object:
+        @functools.wraps(function)
+        def instead(*arguments: object, **named: object) -> object:
+            raise Understood
+
+        return understand(instead, **options)
+
+    monkeypatch.setattr(tyro, "cli", stop)
+    with pytest.raises(Understood):
+        main(line.split())
