@@ -7,7 +7,6 @@ from pathlib import Path
 from torch import nn
 
 from pimper_torch.alignment.align import Align, AlignConfig
-from pimper_torch.bundle.adjust import Adjust, AdjustConfig
 from pimper_torch.coarse.adapt import Adapt, AdaptConfig
 from pimper_torch.coarse.enclose import Enclose, EncloseConfig
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
@@ -21,7 +20,6 @@ from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import (
-    Cameras,
     CoarseMesh,
     DepthPatches,
     Mesh,
@@ -46,13 +44,10 @@ class RoundsConfig:
             any, the published chain runs once: facets one by one, then joined.
         all_round: Whether the coarse mesh is made of what all views see, in place of the
             cloud's triangulation in one reference view.
-        bundle: Whether the cameras are adjusted, once, to albedo and light of the last round
-            but one; kept only if facets held out of it agree better.
     """
 
     scales: tuple[float, ...] = (0.25, 0.5, 1.0)
     all_round: bool = True
-    bundle: bool = False
 
     def __post_init__(self) -> None:
         positive = all(scale > 0 for scale in self.scales)
@@ -81,7 +76,6 @@ class PimperConfig:
     fuse: FuseConfig = field(default_factory=FuseConfig)
     mend: MendConfig = field(default_factory=MendConfig)
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
-    adjust: AdjustConfig = field(default_factory=AdjustConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
 
 
@@ -117,7 +111,6 @@ class Pimper(nn.Module):
         self.fuse: nn.Module = Fuse(config.fuse)
         self.mend: nn.Module = Mend(config.mend)
         self.adapt: nn.Module = Adapt(config.adapt)
-        self.adjust: nn.Module = Adjust(config.adjust)
         self.extract: nn.Module = Extract(config.extract)
 
     def forward(
@@ -139,48 +132,42 @@ class Pimper(nn.Module):
         with recorded(self, self.observer) as report:
             scene = self.reconstruct(views, sparse_model)
             chain = self._in_rounds if self.config.rounds.scales else self._published
-            cameras, patches, surface = chain(scene, mesh)
+            patches, surface = chain(scene, mesh)
             found = self.extract(surface)
         return Reconstruction(
             mesh=found,
-            scene=scene.replace(cameras=cameras),
+            scene=scene,
             coarse=patches.patches.coarse,
             patches=patches,
             report=tuple(report),
         )
 
-    def _published(
-        self, scene: SparseScene, mesh: Mesh | None
-    ) -> tuple[Cameras, DepthPatches, Surface]:
+    def _published(self, scene: SparseScene, mesh: Mesh | None) -> tuple[DepthPatches, Surface]:
         """Every facet by itself, then all joined."""
         coarse = self._coarse(scene, mesh)
         patches = self.decompose(coarse, scene.cameras)
         seen = self.warp(scene.views, scene.cameras, patches)
         depths = self.integrate(self.factorize(seen))
         aligned = self.align(depths)
-        return scene.cameras, aligned, self.refine(aligned)
+        return aligned, self.refine(aligned)
 
-    def _in_rounds(
-        self, scene: SparseScene, mesh: Mesh | None
-    ) -> tuple[Cameras, SweptPatches, Surface]:
+    def _in_rounds(self, scene: SparseScene, mesh: Mesh | None) -> tuple[SweptPatches, Surface]:
         """All facets together, coarse to fine: every round registers on the one before."""
-        views, cameras, settings = scene.views, scene.cameras, self.config.rounds
+        views, cameras = scene.views, scene.cameras
         coarse = self._coarse(scene, mesh)
         swept: SweptPatches | None = None
         surface: Surface | None = None
-        for number, scale in enumerate(settings.scales, start=1):
+        for scale in self.config.rounds.scales:
             if surface is not None:
                 coarse = self.adapt(swept, surface)
             patches = self.decompose(coarse, cameras, surface, scale)
             seen = self.warp(views, cameras, patches)
             photometric = self.factorize(seen)
-            if settings.bundle and number == max(1, len(settings.scales) - 1):
-                cameras = self.adjust(views, cameras, seen, photometric, scene.lenses).cameras
             swept = self.sweep(views, cameras, seen, photometric)
             surface = self.mend(self.fuse(swept))
         assert swept is not None  # there is a round at least
         assert surface is not None
-        return cameras, swept, surface
+        return swept, surface
 
     def _coarse(self, scene: SparseScene, mesh: Mesh | None) -> CoarseMesh:
         all_round = mesh is not None or self.config.rounds.all_round

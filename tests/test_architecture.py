@@ -29,7 +29,6 @@ ROOMS = [
     "coarse",
     "patches",
     "photometry",
-    "bundle",
     "sweep",
     "integration",
     "alignment",

@@ -65,17 +65,6 @@ def pyramid_level(
     return 0.5 * area.clamp_min(1).log2()
 
 
-def sample_pyramid(
-    pyramid: list[Float[Tensor, "channels _ _"]],
-    pixels: Float[Tensor, "patch height width 2"],
-    level: Float[Tensor, "patch height width"],
-) -> Float[Tensor, "patch channels height width"]:
-    """Look an image up on rasters; see :func:`look_up`."""
-    raster = level.shape
-    found = look_up(pyramid, pixels.reshape(-1, 2), level.reshape(-1))
-    return found.reshape(*raster, -1).movedim(-1, 1)
-
-
 def look_up(
     pyramid: list[Float[Tensor, "channels _ _"]],
     pixels: Float[Tensor, "sample 2"],

@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.pyramid import pyramid_level, sample_pyramid
+from pimper_torch.patches.pyramid import look_up, pyramid_level
 from pimper_torch.patches.warp import Warp, WarpConfig, missing_share
 from pimper_torch.records import CoarseMesh, Mesh
 
@@ -109,7 +109,8 @@ def test_a_fine_stripe_pattern_seen_from_afar_averages_out():
     level_1 = torch.nn.functional.avg_pool2d(stripes[None], 2)[0]
     rows, columns = torch.meshgrid(torch.arange(12.0), torch.arange(12.0), indexing="ij")
     pixels = (4 * torch.stack([columns, rows], dim=-1) + 8.5)[None]
-    sampled = sample_pyramid([stripes, level_1, level_2], pixels, pyramid_level(pixels))
+    level = pyramid_level(pixels)
+    sampled = look_up([stripes, level_1, level_2], pixels.reshape(-1, 2), level.flatten())
     assert_close(sampled, torch.full_like(sampled, 0.5))
 
 

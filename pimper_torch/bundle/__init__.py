@@ -1,1 +1,0 @@
-"""Cameras, adjusted afterwards to what the photographs show on the surface."""
