@@ -37,7 +37,9 @@ class Views(Record):
         return self.images.shape[0]
 
     def take(self, chosen: Sequence[int]) -> "Views":
-        """Keep some views, in the order given."""
+        """Keep some views, in the order given; all of them in their order are not copied."""
+        if list(chosen) == list(range(self.num_views)):
+            return self
         index = torch.tensor(chosen, dtype=torch.long, device=self.images.device)
         return self.replace(
             images=self.images[index],

@@ -63,9 +63,8 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
     Returns:
         The same views. Points that nothing agrees about are left out.
     """
-    pictures = _gray(views)
     for _ in range(settings.rounds):
-        undistorted, intrinsics = undistort(pictures, model.lenses)
+        undistorted, intrinsics = undistort(_gray(views), model.lenses)
         cameras = Cameras(
             intrinsics=intrinsics.double(),
             cam_from_world=model.cam_from_world,
@@ -82,9 +81,11 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
 
 def _gray(views: Views) -> Views:
     """Keep what patches are compared by: one channel, saturated where one of three is."""
-    clipped = views.images.detach().amax(dim=1, keepdim=True)
-    gray = views.images.detach().mean(dim=1, keepdim=True)
-    return views.replace(images=torch.where(clipped >= SATURATED, clipped, gray)).to("cpu")
+    gray = torch.empty_like(views.images[:, :1], device="cpu")
+    for one, image in zip(gray, views.images, strict=True):
+        brightest = image.detach().amax(dim=0)
+        one[0] = torch.where(brightest >= SATURATED, brightest, image.detach().mean(dim=0))
+    return views.replace(images=gray).to("cpu")
 
 
 def _renewed(

@@ -14,7 +14,7 @@ features in the place of the logarithm.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
@@ -147,7 +147,7 @@ def sight(
     """
     with torch.no_grad():
         pictures = _log_pictures(views)
-        window = _Window(settings.radius_px, like=pictures)
+        window = _Window(settings.radius_px, like=pictures.log)
         templates = _templates(pictures, cameras, tangents, window)
         parts = []
         for view in track(range(views.num_views)):
@@ -155,7 +155,7 @@ def sight(
             for some in torch.split(torch.nonzero(wanted)[:, 0], _AT_ONCE):
                 homographies = plane_homographies(tangents, cameras, view, some)
                 kept, pixels = _aligned(
-                    pictures[view], homographies, templates.take(some), window, settings
+                    pictures, view, homographies, templates.take(some), window, settings
                 )
                 parts.append((some[kept], torch.full_like(some[kept], view), pixels[kept]))
         if not parts:
@@ -173,35 +173,49 @@ def sight(
         return Sightings(point=point[order], view=view_[order], pixels=pixels[order])
 
 
-def _log_pictures(views: Views) -> Float[Tensor, "view 2 height width"]:
-    """Give logarithms of the gray radiance, and 1 where a pixel cannot be used."""
-    finite = views.images.isfinite().all(dim=1)
-    usable = views.inside & finite & (views.images.amax(dim=1) < SATURATED)
-    if views.masks is not None:
-        usable = usable & views.masks
-    gray = torch.where(usable, views.images.mean(dim=1), 0).float()
-    some = gray[:, ::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE]
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Pictures(Record):
+    """What patches are looked up in.
+
+    Attributes:
+        log: Of the gray radiance.
+        unusable: 1 where a pixel cannot be used.
+    """
+
+    log: Float[Tensor, "view height width"]
+    unusable: UInt8[Tensor, "view height width"]
+
+
+def _log_pictures(views: Views) -> _Pictures:
+    log = torch.empty_like(views.images[:, 0], dtype=torch.float32)
+    unusable = torch.empty_like(views.images[:, 0], dtype=torch.uint8)
+    inside = views.inside if views.masks is None else views.inside & views.masks
+    for index, image in enumerate(views.images):
+        usable = inside[index] & image.isfinite().all(dim=0) & (image.amax(dim=0) < SATURATED)
+        log[index] = torch.where(usable, image.mean(dim=0), 0)
+        unusable[index] = ~usable
+    some = log[:, ::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE]
     some = some[some > 0]
     floor = _DARK * some.median() if len(some) else torch.ones(())
-    return torch.stack([(gray + floor.clamp_min(1e-6)).log(), (~usable).float()], dim=1)
+    return _Pictures(log=log.add_(floor.clamp_min(1e-6)).log_(), unusable=unusable)
 
 
 def _templates(
-    pictures: Float[Tensor, "view 2 height width"],
+    pictures: _Pictures,
     cameras: Cameras,
     tangents: Tangents,
     window: _Window,
 ) -> _Templates:
     count = len(tangents.points_world)
-    patches = pictures.new_zeros(count, window.places.shape[1])
-    whole = torch.zeros(count, dtype=torch.bool, device=pictures.device)
-    for view in range(len(pictures)):
+    patches = pictures.log.new_zeros(count, window.places.shape[1])
+    whole = torch.zeros(count, dtype=torch.bool, device=pictures.log.device)
+    for view in range(len(pictures.log)):
         (some,) = torch.nonzero(tangents.reference == view, as_tuple=True)
         if len(some) == 0:
             continue
         homographies = plane_homographies(tangents, cameras, view, some)
-        patches[some] = _look_up(pictures[view, 0], homographies, window)
-        whole[some] = _complete(pictures[view, 1], homographies, window)
+        patches[some] = _look_up(pictures.log[view], homographies, window)
+        whole[some] = _complete(pictures.unusable[view], homographies, window)
     square = patches.reshape(count, window.side, window.side)
     down, right = torch.gradient(square, dim=(1, 2))
     slopes = torch.stack([window.freed(right.flatten(1)), window.freed(down.flatten(1))], dim=-1)
@@ -218,14 +232,15 @@ def _templates(
 
 
 def _aligned(
-    picture: Float[Tensor, "2 height width"],
+    pictures: _Pictures,
+    view: int,
     homographies: Float[Tensor, "point 3 3"],
     templates: _Templates,
     window: _Window,
     settings: SightingSettings,
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "point 2"]]:
     """Align one view's patches; tell which were found, and where."""
-    count = len(homographies)
+    count, log = len(homographies), pictures.log[view]
     shift = homographies.new_zeros(count, 2)
     deviation = homographies.new_full((count,), torch.inf)
     correlation = homographies.new_zeros(count)
@@ -234,9 +249,7 @@ def _aligned(
         if len(active) == 0:
             break
         some = templates.take(active)
-        patches = window.freed(
-            _look_up(picture[0], _shifted(homographies[active], shift[active]), window)
-        )
+        patches = window.freed(_look_up(log, _shifted(homographies[active], shift[active]), window))
         power = some.values.square().sum(dim=1).clamp_min(1e-12)
         common = (patches * some.values).sum(dim=1)
         left = patches / (common / power).clamp(*_CONTRAST)[:, None] - some.values
@@ -259,7 +272,7 @@ def _aligned(
     final = _shifted(homographies, torch.where(arrived[:, None], shift, 0))
     found = arrived & (correlation >= settings.min_correlation)
     found &= deviation <= settings.max_deviation_px
-    found &= _complete(picture[1], final, window)
+    found &= _complete(pictures.unusable[view], final, window)
     return found, final[:, :2, 2] / final[:, 2:, 2]
 
 
@@ -280,12 +293,12 @@ def _own(tangents: Tangents, cameras: Cameras) -> Float[Tensor, "point 2"]:
 
 
 def _complete(
-    unusable: Float[Tensor, "height width"],
+    unusable: UInt8[Tensor, "height width"],
     homographies: Float[Tensor, "point 3 3"],
     window: _Window,
 ) -> Bool[Tensor, " point"]:
     """Tell whose patches a view shows nearly all of."""
-    lacking = _look_up(unusable, homographies, window, mode="nearest", outside=1.0)
+    lacking = _look_up(unusable.float(), homographies, window, mode="nearest", outside=1.0)
     share = (lacking * window.root.square()).sum(dim=1) / window.total
     return share <= _MOST_LACKING
 

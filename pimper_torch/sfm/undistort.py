@@ -31,43 +31,62 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
         half; what touches a saturated pixel is saturated. Differentiable in the radiance. A
         view without distortion is left untouched.
     """
-    images, inside = [], []
+    images = torch.zeros_like(views.images)
+    valid = torch.zeros_like(views.images[:, 0], dtype=torch.bool)
+    grids: dict[Lens, _Grid | None] = {}
     for index in track(range(views.num_views)):
-        image, valid = _undistort_image(views, index, lenses[index])
-        images.append(image)
-        inside.append(valid)
+        lens = lenses[index]
+        if lens not in grids:
+            # The last alone, for grids are large.
+            grids = {lens: None if is_pinhole(lens) else _grid(lens, like=views.images)}
+        image, inside = _undistort_image(views, index, lens, grids[lens])
+        images[index, :, : lens.height, : lens.width] = image
+        valid[index, : lens.height, : lens.width] = inside
     intrinsics = torch.stack([pinhole_for(lens) for lens in lenses]).to(views.images)
-    valid = torch.stack(inside)
-    whole = bool((valid == views.inside).all())
     masks = views.masks
-    if masks is not None or not whole:
+    if masks is not None or not bool((valid == views.inside).all()):
         masks = valid
-    return views.replace(images=torch.stack(images), masks=masks), intrinsics
+    return views.replace(images=images, masks=masks), intrinsics
+
+
+_Grid = tuple[Float[Tensor, "1 height width 2"], Bool[Tensor, "height width"]]
+
+
+def _grid(lens: Lens, like: Tensor) -> _Grid:
+    """Give where pixels of the pinhole image are in the photograph, and which are in it at all."""
+    sources = photograph_pixels(lens).to(like)
+    size = sources.new_tensor([lens.width, lens.height])
+    within = ((sources >= 0) & (sources <= size)).all(dim=-1)  # false for NaN
+    # Half a pixel from the edge on, the edge's own pixel continues.
+    sources = torch.where(within[..., None], sources, 0.5).clamp_min(0.5)
+    return grid_from_pixels(torch.minimum(sources, size - 0.5), lens.width, lens.height)[
+        None
+    ], within
 
 
 def _undistort_image(
-    views: Views, index: int, lens: Lens
+    views: Views, index: int, lens: Lens, grid: _Grid | None
 ) -> tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]:
-    image, inside = views.images[index], views.inside[index]
-    mask = inside if views.masks is None else inside & views.masks[index]
-    if is_pinhole(lens):
-        return image, mask
-    height, width = image.shape[-2:]
-    sources = photograph_pixels(lens).to(image)
-    size = sources.new_tensor([lens.width, lens.height])
-    within = ((sources >= 0) & (sources <= size)).all(dim=-1)  # false for NaN
-    # Half a pixel from the edge on, the edge's own pixel continues; never the padding.
-    sources = torch.where(within[..., None], sources, 0.5).clamp_min(0.5)
-    grid = grid_from_pixels(torch.minimum(sources, size - 0.5), width, height)
-    saturated = (image >= SATURATED).to(image)
-    stacked = torch.cat([image, saturated, mask[None].to(image)])[None]
-    sampled = grid_sample(stacked, grid[None], mode="bilinear", align_corners=False)[0]
-    sampled = torch.where(within, sampled, 0)
-    padding = (0, width - lens.width, 0, height - lens.height)
-    sampled = torch.nn.functional.pad(sampled, padding)
-    count = len(image)
-    radiance, touched = sampled[:count], sampled[count:-1] > _TOUCHED
-    return torch.where(touched, radiance.clamp_min(1), radiance), sampled[-1] > 0.5
+    """Undistort one photograph, without padding; no grid for a lens without distortion."""
+    image = views.images[index, :, : lens.height, : lens.width]
+    mask = None if views.masks is None else views.masks[index, : lens.height, : lens.width]
+    if grid is None:
+        return image, torch.ones_like(image[0], dtype=torch.bool) if mask is None else mask
+    places, inside = grid
+    radiance = torch.where(inside, _sampled(image, places), 0)
+    saturated = image >= SATURATED
+    if bool(saturated.any()):
+        touched = _sampled(saturated.to(image), places) > _TOUCHED
+        radiance = torch.where(touched & inside, radiance.clamp_min(1), radiance)
+    if mask is not None:
+        inside = inside & (_sampled(mask[None].to(image), places)[0] > 0.5)
+    return radiance, inside
+
+
+def _sampled(
+    raster: Float[Tensor, "channel height width"], grid: Float[Tensor, "1 height width 2"]
+) -> Float[Tensor, "channel height width"]:
+    return grid_sample(raster[None], grid, mode="bilinear", align_corners=False)[0]
 
 
 def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:
