@@ -29,14 +29,15 @@ from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 COLMAP = ReconstructConfig(
     peak_threshold=0.0067,
     affine_shape=False,
-    domain_size_pooling=False,
-    guided_matching=False,
+    guided_pairs=0,
     max_error_px=4.0,
-    min_registration_points=30,
-    starts=1,
+    starts=0,
     track_rounds=0,
 )
 
+
+# Pairs a photograph: more than there are.
+ALL = 10_000
 
 COLUMNS = (
     "settings",
@@ -52,29 +53,34 @@ COLUMNS = (
     "bend %",
     "wall s",
     "CPU s",
+    "peak MB",
 )
 
 
 def variants() -> dict[str, ReconstructConfig]:
-    """Name the settings to compare: one change after another, from COLMAP's own to ours."""
+    """Name the settings to compare: COLMAP's own with one change, and ours with one change."""
     change = dataclasses.replace
     ours = ReconstructConfig()
-    features = change(ours, track_rounds=0)
+    first = change(ours, guided_pairs=0, starts=0, track_rounds=0)
+    guided = change(ours, starts=0, track_rounds=0)
     return {
         "COLMAP's": COLMAP,
-        "contrast 0.002": change(COLMAP, peak_threshold=0.002),
-        "contrast 0.001": change(COLMAP, peak_threshold=0.001),
-        "guided": change(COLMAP, guided_matching=True),
-        "0.002, affine": change(COLMAP, peak_threshold=0.002, affine_shape=True),
-        "0.002, DSP": change(COLMAP, peak_threshold=0.002, domain_size_pooling=True),
-        "0.002, affine, guided": change(features, max_error_px=4.0, starts=1),
-        "0.002, affine, guided, 2 px": change(features, starts=1),
-        "the same, at most 3 starts": features,
-        "ours: the same, tracks found again": ours,
-        "features, edge 20": change(features, edge_threshold=20.0),
-        "features, ratio 0.9": change(features, max_ratio=0.9),
-        "features, DSP": change(features, domain_size_pooling=True),
-        "features, 1 px": change(features, max_error_px=1.0),
+        "COLMAP's, contrast 0.002": change(COLMAP, peak_threshold=0.002),
+        "COLMAP's, affine": change(COLMAP, affine_shape=True),
+        "COLMAP's, all pairs guided": change(COLMAP, guided_pairs=ALL),
+        "COLMAP's, second pass": change(COLMAP, starts=ours.starts),
+        "0.002, affine, 2 px": first,
+        "the same, 2048 features": change(first, max_features=2048),
+        "the same, 4096 features": change(first, max_features=4096),
+        "the same, 3 pairs guided": change(first, guided_pairs=3),
+        "the same, 6 pairs guided": change(first, guided_pairs=6),
+        "the same, all pairs guided": change(first, guided_pairs=ALL),
+        "first model": guided,
+        "ours: tracks found again": ours,
+        "ours, no pair guided": change(ours, guided_pairs=0),
+        "ours, all pairs guided": change(ours, guided_pairs=ALL),
+        "ours, edge 20": change(guided, edge_threshold=20.0),
+        "ours, ratio 0.9": change(guided, max_ratio=0.9),
     }
 
 
@@ -119,7 +125,8 @@ def row(
     except PimperError as error:
         cells = [f"{type(error).__name__}: {str(error).split('.')[0]}", *[""] * 9]
     wall, processor = time.perf_counter() - wall, cpu_seconds() - processor
-    return " | ".join([*cells, f"{wall:.0f}", f"{processor:.0f}"])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return " | ".join([*cells, f"{wall:.0f}", f"{processor:.0f}", f"{peak:.0f}"])
 
 
 def figures(scene: SparseScene, reference: Path | None, truth: Capture | None) -> list[str]:

@@ -93,12 +93,15 @@ class Pimper(nn.Module):
     """
 
     def __init__(
-        self, config: PimperConfig | None = None, observer: Observer | None = None
+        self,
+        config: PimperConfig | None = None,
+        observer: Observer | None = None,
+        cache: Path | str | None = None,
     ) -> None:
         super().__init__()
         self.config = config = config or PimperConfig()
         self.observer = observer or Silent()
-        self.reconstruct: nn.Module = Reconstruct(config.reconstruct)
+        self.reconstruct: nn.Module = Reconstruct(config.reconstruct, cache)
         self.triangulate: nn.Module = Triangulate(config.triangulate)
         self.enclose: nn.Module = Enclose(config.enclose)
         self.decompose: nn.Module = Decompose(config.decompose)

@@ -1,7 +1,7 @@
 """What every method of the table is given: the same cameras, cloud and photographs."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pimper_torch.bench.config import BenchConfig
@@ -13,7 +13,13 @@ from pimper_torch.metrics.evaluate import prepared_surface
 from pimper_torch.metrics.similarity import pair_views
 from pimper_torch.records import Capture, CoarseMesh, Record, SparseScene
 from pimper_torch.scenes.write import render_scene
-from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.sfm.cache import ModelCache
+from pimper_torch.sfm.reconstruct import (
+    Reconstruct,
+    ReconstructConfig,
+    find_model,
+    placed_scene,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -54,18 +60,28 @@ def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
     return render_scene(name, folder, config.scene, processes=config.processes)
 
 
-def prepare(folder: Path, config: BenchConfig) -> Inputs:
+def prepare(folder: Path, config: BenchConfig, cache: Path | None = None) -> Inputs:
     """Read a rendered scene and find its cameras, from the files as a user would.
+
+    Args:
+        folder: Of the scene.
+        config: Of the bench.
+        cache: Folder where models are kept; the seconds of one from there are those that it
+            took to find.
 
     Raises:
         PimperError: Not such a folder, or structure from motion fails.
     """
     views = load_views(folder / "photos", masks=folder / "masks" if config.masks else None)
-    model = folder / "truth" / "sparse" if config.cameras == "true" else None
-    began = time.perf_counter()
-    settings = ReconstructConfig(track_rounds=0) if config.cameras == "features" else None
-    scene = Reconstruct(settings)(views, model)
-    seconds = 0.0 if model else time.perf_counter() - began
+    if config.cameras == "true":
+        scene, seconds = Reconstruct()(views, folder / "truth" / "sparse"), 0.0
+    else:
+        refined = ReconstructConfig()
+        settings = replace(refined, track_rounds=0) if config.cameras == "features" else refined
+        found = find_model(views, settings, ModelCache(folder=cache) if cache else None)
+        began = time.perf_counter()
+        scene = placed_scene(views, found.model)
+        seconds = found.seconds + time.perf_counter() - began
     coarse = Triangulate()(scene)
     capture = read_rendered(folder, maps=False, photographs=False)
     surface = prepared_surface(capture, config.evaluation)

@@ -49,6 +49,7 @@ def run_bench(
     *,
     observer: Observer | None = None,
     overwrite: bool = False,
+    cache: Path | None = None,
 ) -> Table:
     """Run methods on scenes, and write the table, its figures and all surfaces to a folder.
 
@@ -70,6 +71,7 @@ def run_bench(
         folder: New or empty.
         observer: Hears of every scene and method.
         overwrite: Replace a former result.
+        cache: Folder where the models of structure from motion are kept from run to run.
 
     Raises:
         ConfigError: No such method.
@@ -90,7 +92,7 @@ def run_bench(
         for scene in config.scenes:
             try:
                 measured, pictures = _scene(
-                    scene, methods, config, Path(workspace), staging, observer
+                    scene, methods, config, Path(workspace), staging, observer, cache
                 )
             except KeyboardInterrupt:
                 if not rows:
@@ -124,6 +126,7 @@ def _scene(
     workspace: Path,
     staging: Path,
     observer: Observer,
+    cache: Path | None,
 ) -> tuple[list[Row], list[SceneRow]]:
     """Run all methods on a scene; a scene without cameras has rows that say why."""
     name = Path(scene).stem
@@ -131,7 +134,7 @@ def _scene(
         rendered = scene_folder(scene, config, workspace)
     try:
         with _shown(observer, f"{name} sfm"):
-            inputs = prepare(rendered, config)
+            inputs = prepare(rendered, config, cache)
     except PimperError as error:
         return [row_of_failure(name, method, error) for method in methods], []
     cells = []

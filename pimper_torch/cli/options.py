@@ -27,6 +27,8 @@ class CommonOptions:
         device: Where everything after structure from motion runs.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         overwrite: Replace a former result in OUT.
+        cache: Folder where structure from motion is kept from run to run, so that a change of a
+            later stage costs only the later stages; none unless given.
     """
 
     preset: str = "default"
@@ -34,6 +36,7 @@ class CommonOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     max_size_px: int = 0
     overwrite: Flag = False
+    cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -38,7 +38,9 @@ def run(command: str, arguments: Sequence[str]) -> None:
     with Bars(console) as bars:
         views = _watched(bars, "read", lambda: _read(job))
         mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
-        result = Pimper(job.config, bars)(views.to(common.device), job.inputs.sparse, mesh)
+        result = Pimper(job.config, bars, common.cache)(
+            views.to(common.device), job.inputs.sparse, mesh
+        )
         _watched(bars, "write", lambda: _write(job, result))
     _conclude(Console(), job, result)
 

@@ -1,11 +1,5 @@
-"""COLMAP's structure from motion and its models of cameras.
+"""COLMAP's models: of cameras, and of what they see."""
 
-Photographs go by their number here: the file ``000007.png`` is view 7.
-"""
-
-import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,49 +13,6 @@ from pimper_torch.records import Lens
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.model import SparseModel
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FeatureSettings:
-    """What counts as a feature; the words are those of COLMAP's SIFT."""
-
-    peak_threshold: float
-    edge_threshold: float
-    max_features: int
-    affine_shape: bool
-    domain_size_pooling: bool
-    threads: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatchSettings:
-    """What counts as a match of two photographs."""
-
-    max_ratio: float
-    guided: bool
-    max_error_px: float
-    min_inliers: int
-    seed: int
-    threads: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MapSettings:
-    """How views are added to a model.
-
-    Attributes:
-        min_inliers: Points of the model that a new view must see.
-        pairs_count: Points that only two views see take part, too: they tie views with
-            little overlap, less exactly.
-        seed: Of everything random.
-        threads: -1 for all cores.
-    """
-
-    min_inliers: int
-    pairs_count: bool
-    seed: int
-    threads: int
-
-
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -74,131 +25,6 @@ CAMERA_MODELS = (
     "OPENCV_FISHEYE",
 )
 """COLMAP's camera models for ordinary lenses, written out to check settings without COLMAP."""
-
-
-def extract_features(
-    database: Path,
-    images: Path,
-    masks: Path | None,
-    files: Sequence[str],
-    *,
-    camera_model: str,
-    shared_camera: bool,
-    settings: FeatureSettings,
-) -> list[int]:
-    """Find features on the CPU and put them in the database.
-
-    Args:
-        database: Made if it does not exist.
-        images: Folder of 8-bit photographs.
-        masks: Folder of masks, ``NAME.png`` beside ``NAME``; features lie where they are
-            not black.
-        files: Names in ``images``.
-        camera_model: COLMAP's name.
-        shared_camera: One camera for all photographs instead of one each.
-        settings: What counts as a feature.
-
-    Returns:
-        How many features each file has.
-    """
-    pycolmap = loaded()
-
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = settings.threads
-    options.sift.peak_threshold = settings.peak_threshold
-    options.sift.edge_threshold = settings.edge_threshold
-    options.sift.max_num_features = settings.max_features
-    options.sift.estimate_affine_shape = settings.affine_shape
-    options.sift.domain_size_pooling = settings.domain_size_pooling
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = camera_model
-    if masks is not None:
-        reader.mask_path = str(masks)
-    mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
-    with quiet():
-        pycolmap.extract_features(
-            database,
-            images,
-            list(files),
-            camera_mode=mode,
-            reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
-        with pycolmap.Database.open(database) as stored:
-            image_ids = {image.name: image.image_id for image in stored.read_all_images()}
-            return [
-                stored.num_keypoints_for_image(image_ids[file]) if file in image_ids else 0
-                for file in files
-            ]
-
-
-def set_focals(database: Path, focals_px: dict[str, float]) -> None:
-    """Tell COLMAP the focal lengths that are known before SfM.
-
-    Args:
-        database: With its images.
-        focals_px: By file. A camera shared by several photographs gets their median.
-    """
-    pycolmap = loaded()
-
-    with pycolmap.Database.open(database) as stored:
-        known: dict[int, list[float]] = {}
-        for image in stored.read_all_images():
-            if image.name in focals_px:
-                known.setdefault(image.camera_id, []).append(focals_px[image.name])
-        for camera in stored.read_all_cameras():
-            if camera.camera_id not in known:
-                continue
-            params = np.array(camera.params)
-            params[list(camera.focal_length_idxs())] = np.median(known[camera.camera_id])
-            camera.params = params
-            camera.has_prior_focal_length = True
-            stored.update_camera(camera)
-
-
-def match_features(database: Path, settings: MatchSettings) -> None:
-    """Match every photograph with every other and verify the matches."""
-    pycolmap = loaded()
-
-    options = pycolmap.FeatureMatchingOptions()
-    options.use_gpu = False
-    options.num_threads = settings.threads
-    options.guided_matching = settings.guided
-    options.sift.max_ratio = settings.max_ratio
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = settings.min_inliers
-    verification.ransac.max_error = settings.max_error_px
-    verification.ransac.random_seed = settings.seed
-    with quiet():
-        pycolmap.match_exhaustive(
-            database,
-            matching_options=options,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
-
-
-def map_views(database: Path, images: Path, settings: MapSettings) -> list[SparseModel]:
-    """Grow models from the best pair of views on, until no view can be added.
-
-    Returns:
-        One model a component, the one with most views first. Names are files of ``images``.
-    """
-    pycolmap = loaded()
-
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 3
-    options.extract_colors = False
-    options.num_threads = settings.threads
-    options.random_seed = settings.seed
-    options.mapper.abs_pose_min_num_inliers = settings.min_inliers
-    options.triangulation.ignore_two_view_tracks = not settings.pairs_count
-    with tempfile.TemporaryDirectory(dir=database.parent) as output, quiet():
-        found = pycolmap.incremental_mapping(database, images, output, options)
-    models = [model_of(reconstruction) for reconstruction in found.values()]
-    return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))
 
 
 def read_model(folder: Path) -> SparseModel:

@@ -13,7 +13,7 @@ from torch import Tensor
 from pimper_torch.progress import track
 from pimper_torch.sfm.at_rest import Keypoints, Pair, Rest, find_rest, moving_matches
 from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.colmap import MatchSettings
+from pimper_torch.sfm.matching import MatchSettings
 
 # Measured on 24 rendered photographs of 640x480: 99 % of the matches of a room at rest are
 # shorter, and 0.4 % of those of a turning mug.

@@ -1,9 +1,9 @@
 """Structure from motion: photographs to cameras and a sparse cloud."""
 
-import tempfile
+import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -11,20 +11,20 @@ from torch import nn
 
 from pimper_torch.config import require
 from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
-from pimper_torch.progress import track
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm import colmap
+from pimper_torch.sfm.binding import thread_count
+from pimper_torch.sfm.cache import KeptModel, ModelCache, model_key
+from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
-from pimper_torch.sfm.model import (
-    SparseModel,
-    drop_weak_views,
-    list_some,
-    match_names,
-    select_views,
-)
-from pimper_torch.sfm.photographs import write_photographs
+from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.features import FeatureSettings, find_features
+from pimper_torch.sfm.mapping import MapSettings
+from pimper_torch.sfm.matching import MatchSettings
+from pimper_torch.sfm.model import SparseModel, list_some, select_views
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
+from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
 from pimper_torch.sfm.scene import assemble_scene
+from pimper_torch.sfm.workspace import workspace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,16 +39,17 @@ class ReconstructConfig:
         edge_threshold: Ratio of curvatures above which a feature counts as an edge.
         max_features: Most features in a photograph; those at coarse scales are kept.
         affine_shape: Adapt features to slanted surfaces.
-        domain_size_pooling: Average descriptors over scales.
         max_ratio: Of the distances to the best and the second best match.
-        guided_matching: Look for more matches along the epipolar lines.
+        guided_pairs: Of each photograph, those with most matches, in which more are looked for
+            along the epipolar lines.
         max_error_px: Distance from the epipolar line up to which a match is verified.
         min_matches: Verified matches below which a pair of photographs does not count.
         min_registration_points: Points of the model that a view must see to be added, and
             to stay in it.
-        starts: Most runs of the mapper, each with other random numbers; the first that
-            registers every view ends them. Else the one with most views, then most points,
-            is kept, after one more run that also counts points that only two views see.
+        starts: Most runs of the mapper after guided matching of more pairs, where photographs
+            stayed unregistered or contradict their matches; each has other random numbers, and
+            the last also counts points that only two views see. 0 is content with the first
+            model.
         min_share: Of the photographs that the largest component must hold when the model
             splits.
         track_rounds: Of finding the points again in every view, by aligning what photographs
@@ -63,9 +64,8 @@ class ReconstructConfig:
     edge_threshold: float = 10.0
     max_features: int = 8192
     affine_shape: bool = True
-    domain_size_pooling: bool = False
     max_ratio: float = 0.8
-    guided_matching: bool = True
+    guided_pairs: int = 6
     max_error_px: float = 2.0
     min_matches: int = 15
     min_registration_points: int = 30
@@ -77,10 +77,10 @@ class ReconstructConfig:
 
     def __post_init__(self) -> None:
         require(
-            self.camera_model in colmap.CAMERA_MODELS,
+            self.camera_model in CAMERA_MODELS,
             "camera_model",
             self.camera_model,
-            "one of " + ", ".join(colmap.CAMERA_MODELS),
+            "one of " + ", ".join(CAMERA_MODELS),
         )
         require(self.peak_threshold > 0, "peak_threshold", self.peak_threshold, "more than 0")
         require(self.edge_threshold > 0, "edge_threshold", self.edge_threshold, "more than 0")
@@ -94,11 +94,56 @@ class ReconstructConfig:
             self.min_registration_points,
             "at least 6",
         )
-        require(self.starts >= 1, "starts", self.starts, "at least 1")
+        require(self.guided_pairs >= 0, "guided_pairs", self.guided_pairs, "0 or more")
+        require(self.starts >= 0, "starts", self.starts, "0 or more")
         require(0 < self.min_share <= 1, "min_share", self.min_share, "in (0, 1]")
         require(self.track_rounds >= 0, "track_rounds", self.track_rounds, "0 or more")
         require(self.threads >= 0, "threads", self.threads, "0 for all cores, or a number of them")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
+
+    @property
+    def features(self) -> FeatureSettings:
+        """What counts as a feature."""
+        return FeatureSettings(
+            camera_model=self.camera_model,
+            shared_camera=self.shared_camera,
+            peak_threshold=self.peak_threshold,
+            edge_threshold=self.edge_threshold,
+            max_features=self.max_features,
+            affine_shape=self.affine_shape,
+            threads=self.threads or -1,
+        )
+
+    @property
+    def registration(self) -> RegistrationSettings:
+        """How photographs are registered."""
+        return RegistrationSettings(
+            matching=MatchSettings(
+                max_ratio=self.max_ratio,
+                guided=False,
+                max_error_px=self.max_error_px,
+                min_inliers=self.min_matches,
+                seed=self.seed,
+                threads=self.threads or -1,
+            ),
+            mapping=MapSettings(
+                min_inliers=self.min_registration_points,
+                pairs_count=False,
+                seed=self.seed,
+                threads=self.threads or -1,
+            ),
+            guided_pairs=self.guided_pairs,
+            starts=self.starts,
+        )
+
+    @property
+    def tracks(self) -> TrackSettings:
+        """How tracks are refined."""
+        return TrackSettings(
+            rounds=self.track_rounds,
+            fewest_points=self.min_registration_points,
+            threads=self.threads or -1,
+        )
 
 
 class Reconstruct(nn.Module):
@@ -111,11 +156,19 @@ class Reconstruct(nn.Module):
     whatever the model comes in.
 
     A constant to autograd.
+
+    Args:
+        config: How.
+        cache: Folder where models are kept and looked for, see
+            :class:`~pimper_torch.sfm.cache.ModelCache`; without, every call finds its own.
     """
 
-    def __init__(self, config: ReconstructConfig | None = None) -> None:
+    def __init__(
+        self, config: ReconstructConfig | None = None, cache: Path | str | None = None
+    ) -> None:
         super().__init__()
         self.config = config or ReconstructConfig()
+        self.cache = None if cache is None else ModelCache(folder=Path(cache))
 
     def forward(self, views: Views, sparse_model: Path | str | None = None) -> SparseScene:
         """Place the photographs.
@@ -130,166 +183,99 @@ class Reconstruct(nn.Module):
             ReconstructionError: Fewer than 3 views found their place, or the model split.
             InputError: Radiance that is not finite, one camera is to be shared by photographs
                 of unlike sizes, or the given model does not belong to the photographs.
+            OutputError: The cache cannot be written.
         """
         _require_finite(views)
         if sparse_model is None:
-            model = self._structure_from_motion(views)
-        else:
-            model = self._existing_model(views, Path(sparse_model))
-        missing = [name for name in views.names if name not in model.names]
-        if missing:
-            warnings.warn(
-                f"{model.num_views} of {views.num_views} photographs found their place; left "
-                f"out: {', '.join(missing)}.",
-                PimperWarning,
-                stacklevel=2,
-            )
-        return assemble_scene(views, model)
+            return placed_scene(views, find_model(views, self.config, self.cache).model)
+        return placed_scene(views, existing_model(views, Path(sparse_model)))
 
-    def _existing_model(self, views: Views, folder: Path) -> SparseModel:
-        model = match_names(colmap.read_model(folder), views.names, folder)
-        if model.num_views < 3:
-            raise ReconstructionError(
-                f"The COLMAP model in {folder} holds {model.num_views} of {views.num_views} "
-                f"photographs ({', '.join(model.names)}); at least 3 are needed. Use a model that "
-                "holds more of them, or leave it out to run structure from motion."
-            )
-        return _follow_resize(model, views)
 
-    def _structure_from_motion(self, views: Views) -> SparseModel:
-        config = self.config
-        if views.num_views < 3:
-            raise ReconstructionError(
-                f"Structure from motion was given {views.num_views} photographs; at least 3 are "
-                "needed, and 10 to 50 are usual. Add photographs from other viewpoints."
-            )
-        if config.shared_camera:
-            _require_one_size(views)
-        with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
-            place = Path(folder)
-            files = self._find_features(views, place)
-            self._match(place)
-            models = self._map(place, views.num_views)
-        names = dict(zip(files, views.names, strict=True))
-        models = [
-            model.replace(names=tuple(names[file] for file in model.names)) for model in models
-        ]
-        parts = [model.names for model in models]
-        model = models[choose_component(parts, views.names, config.min_share)]
-        placed = [model.names.index(name) for name in views.names if name in model.names]
-        model = select_views(model, placed)
-        return refine_tracks(
-            views.take([views.names.index(name) for name in model.names]),
-            model,
-            TrackSettings(
-                rounds=config.track_rounds,
-                fewest_points=config.min_registration_points,
-                threads=config.threads or -1,
-            ),
+def placed_scene(views: Views, model: SparseModel) -> SparseScene:
+    """Put photographs beside their cameras and cloud; warn of those that the model lacks."""
+    missing = [name for name in views.names if name not in model.names]
+    if missing:
+        warnings.warn(
+            f"{model.num_views} of {views.num_views} photographs found their place; left "
+            f"out: {', '.join(missing)}.",
+            PimperWarning,
+            stacklevel=3,
         )
+    return assemble_scene(views, model)
 
-    def _find_features(self, views: Views, place: Path) -> tuple[str, ...]:
-        config = self.config
-        images, masks, database = place / "images", place / "masks", place / "database.db"
-        images.mkdir()
-        masks.mkdir()
-        files = write_photographs(views, images, masks)
-        settings = colmap.FeatureSettings(
-            peak_threshold=config.peak_threshold,
-            edge_threshold=config.edge_threshold,
-            max_features=config.max_features,
-            affine_shape=config.affine_shape,
-            domain_size_pooling=config.domain_size_pooling,
-            threads=config.threads or -1,
+
+def find_model(views: Views, config: ReconstructConfig, cache: ModelCache | None) -> KeptModel:
+    """Take a model from the cache, or run :func:`structure_from_motion` and keep what it finds.
+
+    The number of threads is no part of the key.
+    """
+    key = model_key(views, replace(config, threads=0)) if cache else ""
+    kept = cache.find(key) if cache else None
+    if kept is None:
+        began = time.perf_counter()
+        model = structure_from_motion(views, config)
+        kept = KeptModel(model=model, seconds=time.perf_counter() - began)
+        if cache:
+            cache.keep(key, kept)
+    return kept
+
+
+def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseModel:
+    """Find features, match them, grow a model and find its points again in every view.
+
+    Args:
+        views: At least 3.
+        config: How.
+
+    Returns:
+        The model of the registered views, in the photographs' order and under their names.
+
+    Raises:
+        ReconstructionError: Fewer than 3 views found their place, or the model split.
+        InputError: One camera is to be shared by photographs of unlike sizes.
+    """
+    if views.num_views < 3:
+        raise ReconstructionError(
+            f"Structure from motion was given {views.num_views} photographs; at least 3 are "
+            "needed, and 10 to 50 are usual. Add photographs from other viewpoints."
         )
-        counts = colmap.extract_features(
-            database,
-            images,
-            None if views.masks is None else masks,
-            files,
-            camera_model=config.camera_model,
-            shared_camera=config.shared_camera,
-            settings=settings,
-        )
+    if config.shared_camera:
+        _require_one_size(views)
+    with workspace(views, thread_count(config.threads or -1)) as space:
+        counts = find_features(space, config.features, _known_focals(views))
         _require_features(counts, views.names)
-        known = {
-            file: float(focal)
-            for file, focal in zip(files, views.focals_px, strict=True)
-            if torch.isfinite(focal) and focal > 0
-        }
-        colmap.set_focals(database, known)
-        return files
+        found = register(space, config.registration)
+    names = dict(zip(space.files, views.names, strict=True))
+    model = _chosen(found, names, config.min_share)
+    numbers = [views.names.index(name) for name in model.names]
+    return refine_tracks(views.take(numbers), model, config.tracks)
 
-    def _match(self, place: Path) -> None:
-        config = self.config
-        settings = colmap.MatchSettings(
-            max_ratio=config.max_ratio,
-            guided=config.guided_matching,
-            max_error_px=config.max_error_px,
-            min_inliers=config.min_matches,
-            seed=config.seed,
-            threads=config.threads or -1,
+
+def _chosen(found: Registration, names: dict[str, str], min_share: float) -> SparseModel:
+    """Choose among the models and put its views in the photographs' order."""
+    models = [
+        model.replace(names=tuple(names[file] for file in model.names)) for model in found.models
+    ]
+    photographs = tuple(names.values())
+    model = models[choose_component([one.names for one in models], photographs, min_share)]
+    misplaced = [names[file] for file in found.misplaced if names[file] in model.names]
+    if misplaced:
+        warnings.warn(
+            f"{len(misplaced)} of {model.num_views} photographs contradict most matches with those "
+            f"they share most with, and may be misplaced: {list_some(misplaced, most=20)}. Look "
+            "for sides that look alike; add photographs between these and their neighbours.",
+            PimperWarning,
+            stacklevel=4,
         )
-        colmap.match_features(place / "database.db", settings)
-
-    def _map(self, place: Path, num_views: int) -> list[SparseModel]:
-        best: list[SparseModel] = []
-        for start in track(range(self.config.starts)):
-            best = max(best, self._map_once(place, start, pairs=False), key=_most)
-            if _most(best)[0] == num_views:
-                break
-        else:
-            # Points of two views make poses less exact where all views register without them:
-            # median error 0.19 instead of 0.13 degrees on 24 photographs of a skull.
-            tied = self._map_once(place, 0, pairs=True)
-            best = tied if _most(tied)[0] > _most(best)[0] else best
-        return best
-
-    def _map_once(self, place: Path, start: int, *, pairs: bool) -> list[SparseModel]:
-        config = self.config
-        settings = colmap.MapSettings(
-            min_inliers=config.min_registration_points,
-            pairs_count=pairs,
-            seed=config.seed + start,
-            threads=config.threads or -1,
-        )
-        found = colmap.map_views(place / "database.db", place / "images", settings)
-        return [drop_weak_views(model, config.min_registration_points) for model in found]
-
-
-def _most(models: Sequence[SparseModel]) -> tuple[int, int]:
-    sizes = [(model.num_views, len(model.points_world)) for model in models]
-    return max(sizes, default=(0, 0))
-
-
-def _follow_resize(model: SparseModel, views: Views) -> SparseModel:
-    sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
-    lenses, scales = [], []
-    cameras: dict[tuple[int, int, int], int] = {}
-    fresh = 1 + max(lens.camera for lens in model.lenses)
-    for name, lens in zip(model.names, model.lenses, strict=True):
-        width, height = sizes[name]
-        scale = width / lens.width, height / lens.height
-        # Rounding a side to whole pixels changes the shape by less than this.
-        if abs(scale[0] / scale[1] - 1) > max(0.01, 2 / min(width, height)):
-            raise InputError(
-                f"{name} is {width}x{height}, but the COLMAP model's camera for it is "
-                f"{lens.width}x{lens.height}, which is another shape. Give the photographs the "
-                "model was made from, resized if you like, but neither cropped nor turned."
-            )
-        # Photographs of one camera that were resized differently no longer share it; the
-        # first of them keep its number.
-        known = {number for number, *_ in cameras}
-        if lens.camera not in known:
-            cameras[lens.camera, width, height] = lens.camera
-        camera = cameras.setdefault((lens.camera, width, height), fresh + len(cameras))
-        lenses.append(colmap.rescale_lens(lens, width, height).replace(camera=camera))
-        scales.append(scale)
-    factors = torch.tensor(scales, dtype=torch.float64)
-    return model.replace(
-        lenses=tuple(lenses),
-        observation_pixels=model.observation_pixels * factors[model.observation_view],
+    return select_views(
+        model, [model.names.index(name) for name in photographs if name in model.names]
     )
+
+
+def _known_focals(views: Views) -> list[float | None]:
+    return [
+        float(focal) if torch.isfinite(focal) and focal > 0 else None for focal in views.focals_px
+    ]
 
 
 def _require_finite(views: Views) -> None:

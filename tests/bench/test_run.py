@@ -104,7 +104,7 @@ def staged(monkeypatch, ball):
         "absent": failing(MissingProgramError("get it somewhere")),
     }
     monkeypatch.setattr(runner, "scene_folder", lambda scene, config, workspace: workspace)
-    monkeypatch.setattr(runner, "prepare", lambda folder, config: ball)
+    monkeypatch.setattr(runner, "prepare", lambda folder, config, cache: ball)
     monkeypatch.setattr(runner, "method_named", methods.__getitem__)
     return methods
 
@@ -148,11 +148,11 @@ def test_what_was_complete_before_an_interruption_is_kept(staged, tmp_path, monk
     usual = runner.prepare
     calls = []
 
-    def prepare(folder, config):
+    def prepare(folder, config, cache):
         calls.append(folder)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return usual(folder, config)
+        return usual(folder, config, cache)
 
     monkeypatch.setattr(runner, "prepare", prepare)
     config = BenchConfig(samples=3000, scenes=("one", "two"), methods=("exact",))
@@ -163,7 +163,7 @@ def test_what_was_complete_before_an_interruption_is_kept(staged, tmp_path, monk
 
 
 def test_an_interruption_in_the_first_scene_leaves_nothing(staged, tmp_path, monkeypatch):
-    def prepare(folder, config):
+    def prepare(folder, config, cache):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(runner, "prepare", prepare)
@@ -173,7 +173,7 @@ def test_an_interruption_in_the_first_scene_leaves_nothing(staged, tmp_path, mon
 
 
 def test_a_scene_without_cameras_has_a_row_for_every_method(staged, tmp_path, monkeypatch):
-    def prepare(folder, config):
+    def prepare(folder, config, cache):
         raise ReconstructionError("no view was registered")
 
     monkeypatch.setattr(runner, "prepare", prepare)

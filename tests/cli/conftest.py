@@ -28,8 +28,8 @@ def chain(reconstruction, monkeypatch):
     class Chain:
         given = None
 
-        def __init__(self, config, observer):
-            self.config, self.observer = config, observer
+        def __init__(self, config, observer, cache):
+            self.config, self.observer, self.cache = config, observer, cache
 
         def __call__(self, views, sparse_model=None, mesh=None):
             Chain.given = (self.config, views, sparse_model)

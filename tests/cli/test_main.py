@@ -88,7 +88,7 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
     [
         (["--preset", "papre"], "Did you mean `paper`?"),
         (["--preset", "nowhere/mine.yaml"], "there is no such file"),
-        (["--reconstruct.starts", "0"], "starts is 0; needed: at least 1"),
+        (["--reconstruct.starts", "-1"], "starts is -1; needed: 0 or more"),
         (["--max-size-px", "-3"], "max_size_px is -3"),
         (["--masks", "nowhere"], "nowhere: found nothing; needed: a folder"),
     ],

@@ -20,10 +20,12 @@ from pimper_torch.scenes.meshes import icosphere
 RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
-        "--preset {preset} --reference view_002 --max-size-px 48 --overwrite"
+        "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
+        "--cache {out}_kept"
     ],
     "demo": [
-        "-o {out} --preset fast --reference 38 --device cpu --max-size-px 60 --overwrite",
+        "-o {out} --preset fast --reference 38 --device cpu --max-size-px 60 --overwrite "
+        "--cache {out}_kept",
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
@@ -41,7 +43,7 @@ RUNS = {
     ],
     "bench": [
         "--out {out} --scale quick --scenes {scene} --methods smoothed --masks --cameras true "
-        "--seed 2 --samples 500 --processes 1 --overwrite",
+        "--seed 2 --samples 500 --processes 1 --overwrite --cache {out}_kept",
         "-o {out} --no-masks --scenes {scene} --methods smoothed --cameras true --samples 500",
     ],
     "convert": [

@@ -2,8 +2,8 @@ import numpy as np
 import torch
 
 from pimper_torch.sfm.binding import loaded
-from pimper_torch.sfm.colmap import MatchSettings
 from pimper_torch.sfm.leave_out import leave_out_room
+from pimper_torch.sfm.matching import MatchSettings
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
 
 SETTINGS = MatchSettings(

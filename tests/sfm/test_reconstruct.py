@@ -18,9 +18,9 @@ from pimper_torch.errors import (
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Views
-from pimper_torch.sfm.photographs import write_photographs
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.sfm.scene import write_model
+from pimper_torch.sfm.workspace import workspace
 
 
 def blank(sizes: list[tuple[int, int]]) -> Views:
@@ -168,7 +168,8 @@ def test_photographs_of_noise_that_do_not_match_are_refused(generator):
         ("camera_model", "SIMPLE_RADAL"),
         ("peak_threshold", 0.0),
         ("max_ratio", 1.5),
-        ("starts", 0),
+        ("starts", -1),
+        ("guided_pairs", -1),
         ("min_share", 0.0),
         ("threads", -1),
     ],
@@ -178,24 +179,20 @@ def test_an_impossible_setting_is_refused(field, value):
         ReconstructConfig(**{field: value})
 
 
-def test_photographs_are_written_as_srgb_without_padding_and_masks_beside(tmp_path):
+def test_photographs_are_written_as_srgb_without_padding_and_masks_beside():
     views = blank([(4, 3), (2, 3)])
     images = views.images.clone()
     images[0] = 0.21586  # sRGB 128/255
     images[1, :, :, 2:] = 1.0  # what lies in the padding must not be written
     masks = torch.zeros(2, 3, 4, dtype=torch.bool)
     masks[:, :, 0] = True
-    for folder in ("images", "masks"):
-        (tmp_path / folder).mkdir()
-    names = write_photographs(
-        views.replace(images=images, masks=masks), tmp_path / "images", tmp_path / "masks"
-    )
-    first = np.asarray(Image.open(tmp_path / "images" / names[0]))
-    second = np.asarray(Image.open(tmp_path / "images" / names[1]))
-    mask = np.asarray(Image.open(tmp_path / "masks" / f"{names[1]}.png"))
-    assert first.shape == (3, 4, 3)
+    with workspace(views.replace(images=images, masks=masks), threads=2) as space:
+        first, second = (np.asarray(Image.open(space.images / file)) for file in space.files)
+        mask = np.asarray(Image.open(space.masks / f"{space.files[1]}.png"))
+    assert not space.folder.exists()
+    assert first.shape == (3, 4)
     assert (first == 128).all()
-    assert second.shape == (3, 2, 3)
+    assert second.shape == (3, 2)
     assert (second == 0).all()
     assert mask.tolist() == [[255, 0]] * 3
 

@@ -1,0 +1,104 @@
+"""SIFT features of photographs, found by COLMAP on the CPU."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pimper_torch.progress import track
+from pimper_torch.sfm.binding import loaded, quiet, thread_count
+from pimper_torch.sfm.workspace import Workspace
+
+# Photographs in which a thread finds features between two reports of progress.
+_PER_THREAD = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeatureSettings:
+    """What counts as a feature; the words are those of COLMAP's SIFT.
+
+    Attributes:
+        camera_model: COLMAP's name.
+        shared_camera: One camera for all photographs instead of one each.
+        peak_threshold: Contrast.
+        edge_threshold: Ratio of curvatures.
+        max_features: In a photograph.
+        affine_shape: Adapt features to slanted surfaces.
+        threads: -1 for all cores.
+    """
+
+    camera_model: str
+    shared_camera: bool
+    peak_threshold: float
+    edge_threshold: float
+    max_features: int
+    affine_shape: bool
+    threads: int
+
+
+def find_features(
+    space: Workspace, settings: FeatureSettings, focals_px: Sequence[float | None]
+) -> list[int]:
+    """Find features and put them in the database, with one camera or one a photograph.
+
+    Args:
+        space: Without a database, which is made. Where it has masks, features lie where they
+            are not black.
+        settings: What counts as a feature.
+        focals_px: Focal length of each photograph where it is known before. A camera shared by
+            several photographs gets their median.
+
+    Returns:
+        How many features each photograph has.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = settings.threads
+    options.sift.peak_threshold = settings.peak_threshold
+    options.sift.edge_threshold = settings.edge_threshold
+    options.sift.max_num_features = settings.max_features
+    options.sift.estimate_affine_shape = settings.affine_shape
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = settings.camera_model
+    if space.masked:
+        reader.mask_path = str(space.masks)
+    shared = pycolmap.CameraMode.SINGLE if settings.shared_camera else pycolmap.CameraMode.PER_IMAGE
+    with quiet():
+        pycolmap.Database.open(space.database).close()
+        pycolmap.import_images(space.database, space.images, shared, list(space.files), reader)
+        with pycolmap.Database.open(space.database) as stored:
+            _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
+        step = _PER_THREAD * thread_count(settings.threads)
+        starts = range(0, len(space.files), step)
+        for start in track(starts):
+            pycolmap.extract_features(
+                space.database,
+                space.images,
+                list(space.files[start : start + step]),
+                camera_mode=shared,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+        with pycolmap.Database.open(space.database) as stored:
+            image_ids = {image.name: image.image_id for image in stored.read_all_images()}
+            return [stored.num_keypoints_for_image(image_ids[file]) for file in space.files]
+
+
+def _set_focals(stored: Any, focals_px: dict[str, float | None]) -> None:  # noqa: ANN401 - no types
+    known: dict[int, list[float]] = {}
+    for image in stored.read_all_images():
+        focal = focals_px[image.name]
+        if focal is not None:
+            known.setdefault(image.camera_id, []).append(focal)
+    for camera in stored.read_all_cameras():
+        if camera.camera_id not in known:
+            continue
+        params = np.array(camera.params)
+        params[list(camera.focal_length_idxs())] = np.median(known[camera.camera_id])
+        camera.params = params
+        camera.has_prior_focal_length = True
+        stored.update_camera(camera)

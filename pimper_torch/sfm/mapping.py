@@ -1,0 +1,48 @@
+"""Models grown from verified matches."""
+
+import tempfile
+from dataclasses import dataclass
+
+from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm.colmap import model_of
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.workspace import Workspace
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapSettings:
+    """How views are added to a model.
+
+    Attributes:
+        min_inliers: Points of the model that a new view must see.
+        pairs_count: Points that only two views see take part, too: they tie views with
+            little overlap, less exactly.
+        seed: Of everything random.
+        threads: -1 for all cores.
+    """
+
+    min_inliers: int
+    pairs_count: bool
+    seed: int
+    threads: int
+
+
+def map_views(space: Workspace, settings: MapSettings) -> list[SparseModel]:
+    """Grow models from the best pair of views on, until no view can be added.
+
+    Returns:
+        One model a component, the one with most views first. Names are files of ``space``.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = 3
+    options.extract_colors = False
+    options.num_threads = settings.threads
+    options.random_seed = settings.seed
+    options.mapper.abs_pose_min_num_inliers = settings.min_inliers
+    options.triangulation.ignore_two_view_tracks = not settings.pairs_count
+    with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
+        found = pycolmap.incremental_mapping(space.database, space.images, output, options)
+    models = [model_of(reconstruction) for reconstruction in found.values()]
+    return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))

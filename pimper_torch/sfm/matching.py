@@ -1,0 +1,169 @@
+"""Features matched between pairs of photographs, and verified by an epipolar geometry."""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.progress import track
+from pimper_torch.records import Record
+from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm.workspace import Workspace
+
+# Photographs a side of a tile of pairs. COLMAP prepares the search in a photograph once a tile;
+# tiles of 8 by 8 cost a tenth more than all pairs at once and tell how far matching has come.
+_TILE = 8
+
+PhotographPair = tuple[int, int]
+"""Numbers of two photographs, the lower one first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchSettings:
+    """What counts as a match of two photographs.
+
+    Attributes:
+        max_ratio: Of the distances to the best and the second best descriptor.
+        guided: Look for more matches along the epipolar lines.
+        max_error_px: Distance from the epipolar line.
+        min_inliers: Verified matches below which a pair does not count.
+        seed: Of everything random.
+        threads: -1 for all cores.
+    """
+
+    max_ratio: float
+    guided: bool
+    max_error_px: float
+    min_inliers: int
+    seed: int
+    threads: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class VerifiedPair(Record):
+    """Matches of two photographs that one epipolar geometry explains.
+
+    Attributes:
+        views: Numbers of the photographs.
+        first: Pixels in the first.
+        second: Pixels in the second.
+    """
+
+    views: PhotographPair
+    first: Float[Tensor, "match 2"]
+    second: Float[Tensor, "match 2"]
+
+    @property
+    def num_matches(self) -> int:
+        """How many matches there are."""
+        return len(self.first)
+
+
+def match_pairs(space: Workspace, pairs: Sequence[PhotographPair], settings: MatchSettings) -> None:
+    """Match pairs of photographs anew and verify the matches.
+
+    Args:
+        space: With features.
+        pairs: Their former matches are forgotten.
+        settings: What counts as a match.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = settings.threads
+    options.guided_matching = settings.guided
+    options.sift.max_ratio = settings.max_ratio
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers = settings.min_inliers
+    verification.ransac.max_error = settings.max_error_px
+    verification.ransac.random_seed = settings.seed
+    pairing = pycolmap.ImportedPairingOptions()
+    _forget(space, pairs)
+    with quiet(), tempfile.TemporaryDirectory(dir=space.folder) as folder:
+        pairing.match_list_path = Path(folder) / "pairs.txt"
+        for some in track(list(tiles(pairs))):
+            lines = (f"{space.files[first]} {space.files[second]}\n" for first, second in some)
+            pairing.match_list_path.write_text("".join(lines), encoding="ascii")
+            pycolmap.match_image_pairs(
+                space.database, options, pairing, verification, pycolmap.Device.cpu
+            )
+
+
+def all_pairs(count: int) -> list[PhotographPair]:
+    """List every pair of so many photographs."""
+    return list(combinations(range(count), 2))
+
+
+def tiles(pairs: Sequence[PhotographPair]) -> Iterator[list[PhotographPair]]:
+    """Group pairs so that those of a group share few photographs.
+
+    >>> [len(some) for some in tiles(all_pairs(20))]
+    [28, 64, 32, 28, 32, 6]
+    """
+    groups: dict[PhotographPair, list[PhotographPair]] = {}
+    for first, second in pairs:
+        groups.setdefault((first // _TILE, second // _TILE), []).append((first, second))
+    yield from (groups[key] for key in sorted(groups))
+
+
+def strongest(counts: dict[PhotographPair, int], num_views: int, most: int) -> list[PhotographPair]:
+    """List, without repetition, the pairs with most matches of each photograph.
+
+    Args:
+        counts: Verified matches of each pair.
+        num_views: How many photographs there are.
+        most: Pairs a photograph.
+    """
+    chosen: set[PhotographPair] = set()
+    for view in range(num_views):
+        mine = [pair for pair in counts if view in pair]
+        chosen.update(sorted(mine, key=lambda pair: (-counts[pair], pair))[:most])
+    return sorted(chosen)
+
+
+def verified_pairs(space: Workspace) -> list[VerifiedPair]:
+    """Read the matches that were verified, pair by pair."""
+    with quiet(), loaded().Database.open(space.database) as stored:
+        number = _numbers(stored, space)
+        pixels = {
+            image: torch.from_numpy(
+                np.array(stored.read_keypoints(image))[:, :2].astype(np.float64)
+            )
+            for image in number
+        }
+        found = []
+        for pair_id, geometry in zip(*stored.read_two_view_geometries(), strict=True):
+            ends = loaded().pair_id_to_image_pair(pair_id)
+            rows = torch.from_numpy(np.array(geometry.inlier_matches).astype(np.int64))
+            rows = rows.reshape(-1, 2)
+            if len(rows):
+                first, second = (
+                    (number[image], pixels[image][rows[:, side]]) for side, image in enumerate(ends)
+                )
+                low, high = sorted((first, second), key=lambda end: end[0])
+                found.append(VerifiedPair(views=(low[0], high[0]), first=low[1], second=high[1]))
+        return found
+
+
+def _forget(space: Workspace, pairs: Sequence[PhotographPair]) -> None:
+    with quiet(), loaded().Database.open(space.database) as stored:
+        image_of = {number: image for image, number in _numbers(stored, space).items()}
+        for pair in pairs:
+            ends = [image_of[view] for view in pair]
+            if stored.exists_matches(*ends):
+                stored.delete_matches(*ends)
+            if stored.exists_two_view_geometry(*ends):
+                stored.delete_two_view_geometry(*ends)
+
+
+def _numbers(stored: Any, space: Workspace) -> dict[int, int]:  # noqa: ANN401 - pycolmap is untyped
+    number = {file: index for index, file in enumerate(space.files)}
+    return {image.image_id: number[image.name] for image in stored.read_all_images()}

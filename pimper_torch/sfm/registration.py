@@ -1,0 +1,143 @@
+"""Photographs with features registered in one model: quickly first, thoroughly where that fails."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from pimper_torch.progress import track
+from pimper_torch.sfm.agreement import misplaced_views
+from pimper_torch.sfm.mapping import MapSettings, map_views
+from pimper_torch.sfm.matching import (
+    MatchSettings,
+    PhotographPair,
+    VerifiedPair,
+    all_pairs,
+    match_pairs,
+    strongest,
+    verified_pairs,
+)
+from pimper_torch.sfm.model import SparseModel, drop_weak_views
+from pimper_torch.sfm.workspace import Workspace
+
+# Distances that verify a match, at which it still agrees with a model: the lens is the model's.
+_AGREEING = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegistrationSettings:
+    """How photographs are registered.
+
+    Attributes:
+        matching: What counts as a match; ``guided`` is set by the pass.
+        mapping: How views are added to a model; ``pairs_count`` and further seeds are set by the
+            pass.
+        guided_pairs: Strongest pairs of each photograph that are matched along epipolar lines,
+            too, before the first model.
+        starts: Most runs of the mapper in the thorough pass; 0 leaves it out.
+    """
+
+    matching: MatchSettings
+    mapping: MapSettings
+    guided_pairs: int
+    starts: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Registration:
+    """What came of one run of the mapper.
+
+    Attributes:
+        models: One a component, the one with most views first.
+        missing: Files that the first model lacks; all without a model.
+        misplaced: Files of the first model whose strongest pairs contradict it.
+    """
+
+    models: tuple[SparseModel, ...]
+    missing: tuple[str, ...]
+    misplaced: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """True where every photograph is registered and none is misplaced."""
+        return not self.missing and not self.misplaced
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Order registrations: by views that are not misplaced, then points."""
+        if not self.models:
+            return 0, 0
+        model = self.models[0]
+        return model.num_views - len(self.misplaced), len(model.points_world)
+
+
+def register(space: Workspace, settings: RegistrationSettings) -> Registration:
+    """Match all pairs and grow a model; repeat thoroughly what stays unregistered or contradicts.
+
+    The thorough pass matches along epipolar lines: pairs of missing photographs, or all where
+    some are misplaced. Then it starts the mapper several times, with other random numbers, and at
+    last lets points count that only two views see. The first complete model ends it.
+
+    Args:
+        space: With features.
+        settings: How.
+
+    Returns:
+        The best of all runs.
+    """
+    pairs = all_pairs(len(space.files))
+    verified = _matched(space, pairs, settings, guided=False)
+    if settings.guided_pairs:
+        counts = {pair.views: pair.num_matches for pair in verified}
+        some = strongest(counts, len(space.files), settings.guided_pairs)
+        verified = _matched(space, some, settings, guided=True)
+    best = _mapped(space, verified, settings, settings.mapping)
+    if best.complete or not settings.starts:
+        return best
+    missing = {space.files.index(file) for file in best.missing}
+    again = pairs if best.misplaced else [pair for pair in pairs if missing & set(pair)]
+    verified = _matched(space, again, settings, guided=True)
+    for mapping in track(_starts(settings)):
+        found = _mapped(space, verified, settings, mapping)
+        best = max(best, found, key=lambda one: one.rank)
+        if best.complete:
+            break
+    return best
+
+
+def _starts(settings: RegistrationSettings) -> list[MapSettings]:
+    """Give the mapper other random numbers each time.
+
+    Points of two views make poses less exact where all views register without them (median error
+    0.19 instead of 0.13 degrees on 24 photographs of a skull): they come last.
+    """
+    mapping = settings.mapping
+    seeds = range(mapping.seed, mapping.seed + settings.starts)
+    return [replace(mapping, seed=seed) for seed in seeds] + [replace(mapping, pairs_count=True)]
+
+
+def _matched(
+    space: Workspace,
+    pairs: Sequence[PhotographPair],
+    settings: RegistrationSettings,
+    *,
+    guided: bool,
+) -> list[VerifiedPair]:
+    """Match some pairs anew; give all that are verified then."""
+    match_pairs(space, pairs, replace(settings.matching, guided=guided))
+    return verified_pairs(space)
+
+
+def _mapped(
+    space: Workspace,
+    verified: Sequence[VerifiedPair],
+    settings: RegistrationSettings,
+    mapping: MapSettings,
+) -> Registration:
+    found = [drop_weak_views(model, mapping.min_inliers) for model in map_views(space, mapping)]
+    models = tuple(sorted(found, key=lambda model: (-model.num_views, -len(model.points_world))))
+    registered = models[0].names if models else ()
+    limit = _AGREEING * settings.matching.max_error_px
+    return Registration(
+        models=models,
+        missing=tuple(file for file in space.files if file not in registered),
+        misplaced=misplaced_views(models[0], space.files, verified, limit) if models else (),
+    )

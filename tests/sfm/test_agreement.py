@@ -1,0 +1,92 @@
+"""Views that the pairs with most matches contradict."""
+
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.projection import project
+from pimper_torch.sfm.agreement import agreement, epipolar_geometry, misplaced_views
+from pimper_torch.sfm.colmap import distort
+from pimper_torch.sfm.matching import VerifiedPair, all_pairs
+from tests.sfm import ball
+
+
+def bent(model):
+    """Give the model's cameras a lens that bends."""
+    lens = model.lenses[0].replace(params=(*model.lenses[0].params[:3], 0.3))
+    return model.replace(lenses=(lens,) * model.num_views)
+
+
+def pairs_of(model, points, counts=None):
+    """Match points exactly; ``counts`` of them in some pairs, all in the others."""
+    pixels = []
+    for view, lens in enumerate(model.lenses):
+        frame = model.cam_from_world[view]
+        pixels.append(distort(lens, points @ frame[:3, :3].mT + frame[:3, 3]))
+    found = []
+    for first, second in all_pairs(model.num_views):
+        count = (counts or {}).get((first, second), len(points))
+        ends = pixels[first][:count], pixels[second][:count]
+        found.append(VerifiedPair(views=(first, second), first=ends[0], second=ends[1]))
+    return found
+
+
+def scene(generator):
+    points = ball.points_on_the_ball(60, generator)
+    model = bent(ball.model_of(ball.cameras_on_an_arc(), points, generator, noise_px=0.0))
+    return model, points
+
+
+def turned(model, view, angle=0.6):
+    """Put a view elsewhere on the arc: it looks at the ball as before."""
+    turn = torch.zeros(3, 3, dtype=torch.float64)
+    turn[0, 2], turn[2, 0] = angle, -angle
+    moved = rigid(torch.linalg.matrix_exp(turn)[None], torch.zeros(1, 3).double())[0]
+    poses = model.cam_from_world.clone()
+    poses[view] = poses[view] @ moved
+    return model.replace(cam_from_world=poses)
+
+
+def test_the_epipolar_geometry_is_that_of_the_cameras(generator):
+    cameras, points = ball.cameras_on_an_arc(), ball.points_on_the_ball(20, generator)
+    model = ball.model_of(cameras, points, generator, noise_px=0.0)
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    ones = torch.ones(20, 1, dtype=torch.float64)
+    first, second = (torch.cat([pixels[view], ones], dim=1) for view in (1, 4))
+    F = epipolar_geometry(model, (1, 4))
+    assert_close((second * (first @ F.mT)).sum(dim=1) / F.norm(), torch.zeros(20).double())
+
+
+def test_exact_matches_agree_with_their_model_through_a_bent_lens(generator):
+    model, points = scene(generator)
+    pairs = pairs_of(model, points)
+    assert all(agreement(model, pair, 0.01) == 1 for pair in pairs)
+    assert misplaced_views(model, model.names, pairs, 0.01) == ()
+
+
+def test_a_view_put_elsewhere_is_told_from_its_neighbours(generator):
+    model, points = scene(generator)
+    pairs = pairs_of(model, points)
+    assert misplaced_views(turned(model, 3), model.names, pairs, 4.0) == ("3.png",)
+
+
+def test_pairs_with_few_matches_do_not_judge(generator):
+    model, points = scene(generator)
+    pairs = [
+        pair.replace(first=pair.first.flip(0)) if pair.views in ((0, 4), (0, 5)) else pair
+        for pair in pairs_of(model, points, {(0, 4): 20, (0, 5): 20})
+    ]
+    assert agreement(model, pairs[4], 4.0) < 0.5
+    assert misplaced_views(model, model.names, pairs, 4.0) == ()
+
+
+def test_photographs_that_the_model_lacks_do_not_judge(generator):
+    model, points = scene(generator)
+    files = ("x.png", *model.names)
+    pairs = [
+        pair.replace(views=(pair.views[0] + 1, pair.views[1] + 1))
+        for pair in pairs_of(model, points)
+    ]
+    stray = pairs[0].replace(views=(0, 1), first=pairs[0].first.flip(0))
+    assert misplaced_views(model, files, [stray, *pairs], 4.0) == ()
+    assert misplaced_views(turned(model, 5), files, [stray, *pairs], 4.0) == ("5.png",)
