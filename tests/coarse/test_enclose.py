@@ -51,9 +51,9 @@ def photographed(cameras):
 
 @pytest.fixture(scope="module")
 def round_about():
-    """A ball seen from 24 places all round."""
-    place = torch.arange(24, dtype=torch.float64)
-    height = 1 - (2 * place + 1) / 24
+    """A ball seen from 12 places all round."""
+    place = torch.arange(12, dtype=torch.float64)
+    height = 1 - (2 * place + 1) / 12
     azimuth = place * torch.pi * (3 - 5**0.5)
     ring = (1 - height.square()).sqrt()
     eyes = 4 * torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), height], dim=-1)
