@@ -7,7 +7,7 @@ near the axis of a turn. But there one epipolar geometry explains them together 
 that move. No geometry explains a room at rest together with an object that turns.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -76,7 +76,7 @@ Verify = Callable[[Pair], Bool[Tensor, " match"]]
 
 def find_rest(
     keypoints: Keypoints,
-    pairs: Sequence[Pair],
+    pairs: Iterable[Pair],
     verify: Verify,
     *,
     still_px: float,
@@ -101,9 +101,10 @@ def find_rest(
         fewest: Matches below which a pair does not vote.
     """
     votes = [torch.zeros(len(one), dtype=torch.long) for one in keypoints]  # for rest
-    num_still = num_moving = num_violating = moving_pairs = 0
+    num_matches = num_still = num_moving = num_violating = moving_pairs = 0
     for pair in pairs:
         still = is_still(keypoints, pair, still_px)
+        num_matches += len(still)
         num_still += int(still.sum())
         far = ~is_still(keypoints, pair, _CLEARLY * still_px)
         if still.sum() < fewest or far.sum() < fewest:
@@ -123,7 +124,7 @@ def find_rest(
     share = num_violating / max(num_moving, 1)
     return Rest(
         features=tuple((one > 0) & (share > _CONTRADICTION) for one in votes),
-        still_share=num_still / max(sum(len(pair.matches) for pair in pairs), 1),
+        still_share=num_still / max(num_matches, 1),
         moving_pairs=moving_pairs,
         violating_share=share,
     )
