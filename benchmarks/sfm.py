@@ -1,10 +1,11 @@
 """Compare settings of structure from motion on folders of photographs.
 
-Run as ``python benchmarks/sfm.py PHOTOS [PHOTOS ...]``; prints Markdown tables. With
-``--reference MODEL``, a COLMAP model whose images have the photographs' names, each view's
-rotation is compared with the model's; a view more than 2 degrees off counts as wrong. With
-``--truth FOLDER``, as ``pimper render`` writes it, focal lengths and the places of the object's
-points are compared: where exact rays put them, after the similarity on cameras and after the best.
+Run as ``python benchmarks/sfm.py PHOTOS [PHOTOS ...]``; prints Markdown tables, and below each
+what the runs warned of. With ``--reference MODEL``, a COLMAP model whose images have the
+photographs' names, each view's rotation is compared with the model's; a view more than 2 degrees
+off counts as wrong. With ``--truth FOLDER``, as ``pimper render`` writes it, focal lengths and the
+places of the object's points are compared: where exact rays put them, after the similarity on
+cameras and after the best.
 """
 
 import argparse
@@ -90,22 +91,27 @@ def main() -> None:
     parser.add_argument("photos", nargs="+", type=Path, help="folders of photographs")
     parser.add_argument("--reference", type=Path, help="COLMAP model to compare poses with")
     parser.add_argument("--truth", type=Path, help="folder of a rendered scene to compare with")
+    parser.add_argument("--masks", type=Path, help="folder of masks, white on the object")
     parser.add_argument("--max-size", type=int, default=0, help="longest side in pixels")
     parser.add_argument("--only", nargs="*", default=[], help="parts of the variants' names")
     options = parser.parse_args()
-    warnings.simplefilter("ignore", PimperWarning)
     truth = None
     if options.truth is not None:
         truth = read_rendered(options.truth, maps=False, photographs=False)
     for folder in options.photos:
-        views = load_views(folder, max_size_px=options.max_size)
+        views = load_views(folder, max_size_px=options.max_size, masks=options.masks)
         width, height = views.sizes_px.amax(dim=0).tolist()
         say(f"\n{folder.name}: {views.num_views} photographs, {width}x{height}\n")
         say("| " + " | ".join(COLUMNS) + " |")
         say("|---|" + "--:|" * (len(COLUMNS) - 1))
+        told = []
         for name, config in variants().items():
             if not options.only or any(part in name for part in options.only):
-                say(f"| {name} | {row(views, config, options.reference, truth)} |")
+                with warnings.catch_warnings(record=True) as caught:
+                    warnings.simplefilter("always", PimperWarning)
+                    say(f"| {name} | {row(views, config, options.reference, truth)} |")
+                told += [f"{name}: {warning.message}" for warning in caught]
+        say("".join(f"\n{line}\n" for line in told))
 
 
 def say(line: str) -> None:

@@ -2,42 +2,102 @@
 
 from collections.abc import Sequence
 
-from pimper_torch.errors import ReconstructionError
-from pimper_torch.sfm.model import list_some
+import torch
 
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.geometry.projection import triangulation_angles
+from pimper_torch.sfm.at_rest import Rest
+from pimper_torch.sfm.model import SparseModel, list_some
+
+FEWEST_VIEWS = 3
+# Points seen under less are of no use to the coarse surface (`enclose.min_angle_deg`).
+LEAST_ANGLE_DEG = 4.0
 ADVICE = (
     "Neighbouring photographs should overlap by two thirds and differ by less than about 20 "
     "degrees in viewpoint: add photographs between those that did not register, or give an "
     "existing COLMAP model. Lowering `reconstruct.peak_threshold` finds fainter features."
 )
+MOVE = (
+    "Where the object turned before a camera that stood still, give masks of the object "
+    "(`--masks`), or put a plain cloth behind and below it, so that nothing at rest has features; "
+    "or leave the object where it is and move the camera round it."
+)
+
+
+def count_spread_views(model: SparseModel, fewest: int) -> int:
+    """Count the views that see enough points under a triangulation angle that tells depth.
+
+    Args:
+        model: Any.
+        fewest: Points that a view must see whose widest angle between rays is 4 degrees or more.
+    """
+    centers = invert_rigid(model.cam_from_world)[:, :3, 3]
+    angles = triangulation_angles(model.points_world, model.observed, centers)
+    wide = torch.rad2deg(angles) >= LEAST_ANGLE_DEG
+    seen = model.observed[wide].sum(dim=0)
+    return int((seen >= fewest).sum())
+
+
+def require_motion(rest: Rest, num_views: int) -> None:
+    """Refuse photographs in which nothing moves.
+
+    Raises:
+        ReconstructionError: Most matches lie still, and nowhere do enough others move.
+    """
+    if rest.nothing_moves:
+        raise ReconstructionError(
+            f"Nothing moves in {num_views} photographs: {rest.still_share:.0%} of the matches lie "
+            "at the same pixel, and in no pair do enough others agree on a motion. Camera and "
+            f"background were at rest, and an object that turned has too little texture. {MOVE}"
+        )
 
 
 def choose_component(
-    components: Sequence[tuple[str, ...]], names: Sequence[str], min_share: float
+    components: Sequence[tuple[str, ...]],
+    spread: Sequence[int],
+    names: Sequence[str],
+    min_share: float,
 ) -> int:
-    """Choose the component to keep: the one with most views, if it is a clear majority.
+    """Choose the component to keep: the one with most views that see depth.
 
     Args:
         components: Names of the views in each component; they may overlap.
+        spread: How many views of each see enough points under real triangulation angles, see
+            :func:`count_spread_views`.
         names: Of all photographs.
         min_share: Of the photographs that the chosen component must have when another one
             holds at least 3 views that it lacks.
 
     Returns:
-        Index of the component; the first of equals.
+        Index of the component; of equals the one with most views, then the first.
 
     Raises:
-        ReconstructionError: Fewer than 3 views registered, or there is no clear majority.
+        ReconstructionError: Fewer than 3 views registered or see depth, or there is no clear
+            majority.
     """
-    largest = max(range(len(components)), key=lambda index: len(components[index]), default=-1)
+    order = range(len(components))
+    largest = max(order, key=lambda index: (spread[index], len(components[index])), default=-1)
     kept = components[largest] if components else ()
-    if len(kept) < 3:
+    if len(kept) < FEWEST_VIEWS:
         missing = [name for name in names if name not in kept]
         raise ReconstructionError(
             f"Structure from motion registered {len(kept)} of {len(names)} photographs; at least "
-            f"3 are needed. Not registered: {list_some(missing, most=20)}. {ADVICE}"
+            f"{FEWEST_VIEWS} are needed. Not registered: {list_some(missing, most=20)}. {ADVICE}"
         )
-    rivals = [part for part in components if len(set(part) - set(kept)) >= 3]
+    if spread[largest] < FEWEST_VIEWS:
+        raise ReconstructionError(
+            f"Structure from motion registered {len(kept)} of {len(names)} photographs, but only "
+            f"{spread[largest]} of them see enough points under triangulation angles of "
+            f"{LEAST_ANGLE_DEG:.0f} degrees or more; at least {FEWEST_VIEWS} are needed. The "
+            "cameras were found in nearly one place: they stood still, or they were registered on "
+            f"a background at rest. {MOVE}"
+        )
+    rivals = [
+        part
+        for part, depth in zip(components, spread, strict=True)
+        if depth >= FEWEST_VIEWS and len(set(part) - set(kept)) >= 3
+    ]
     if rivals and len(kept) < min_share * len(names):
         parts = "; ".join(
             f"{len(part)} photographs ({list_some(part, most=12)})" for part in (kept, *rivals)

@@ -231,7 +231,8 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
         The model of the registered views, in the photographs' order and under their names.
 
     Raises:
-        ReconstructionError: Fewer than 3 views found their place, or the model split.
+        ReconstructionError: Fewer than 3 views found their place, the model split, or nothing
+            moves from photograph to photograph.
         InputError: One camera is to be shared by photographs of unlike sizes.
     """
     if views.num_views < 3:
@@ -257,7 +258,8 @@ def _chosen(found: Registration, names: dict[str, str], min_share: float) -> Spa
         model.replace(names=tuple(names[file] for file in model.names)) for model in found.models
     ]
     photographs = tuple(names.values())
-    model = models[choose_component([one.names for one in models], photographs, min_share)]
+    parts = [model.names for model in models]
+    model = models[choose_component(parts, found.spread, photographs, min_share)]
     misplaced = [names[file] for file in found.misplaced if names[file] in model.names]
     if misplaced:
         warnings.warn(

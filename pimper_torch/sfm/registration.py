@@ -1,10 +1,14 @@
 """Photographs with features registered in one model: quickly first, thoroughly where that fails."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from pimper_torch.errors import PimperWarning
 from pimper_torch.progress import track
 from pimper_torch.sfm.agreement import misplaced_views
+from pimper_torch.sfm.components import FEWEST_VIEWS, count_spread_views, require_motion
+from pimper_torch.sfm.leave_out import leave_out_room
 from pimper_torch.sfm.mapping import MapSettings, map_views
 from pimper_torch.sfm.matching import (
     MatchSettings,
@@ -46,31 +50,37 @@ class Registration:
     """What came of one run of the mapper.
 
     Attributes:
-        models: One a component, the one with most views first.
+        models: One a component, the one with most views that see depth first.
+        spread: How many views of each see depth, see
+            :func:`~pimper_torch.sfm.components.count_spread_views`.
         missing: Files that the first model lacks; all without a model.
         misplaced: Files of the first model whose strongest pairs contradict it.
     """
 
     models: tuple[SparseModel, ...]
+    spread: tuple[int, ...]
     missing: tuple[str, ...]
     misplaced: tuple[str, ...]
 
     @property
     def complete(self) -> bool:
-        """True where every photograph is registered and none is misplaced."""
-        return not self.missing and not self.misplaced
+        """True where every photograph is registered, none misplaced, and some see depth."""
+        return not self.missing and not self.misplaced and self.spread[0] >= FEWEST_VIEWS
 
     @property
-    def rank(self) -> tuple[int, int]:
-        """Order registrations: by views that are not misplaced, then points."""
+    def rank(self) -> tuple[bool, int, int]:
+        """Order registrations: those that see depth, by views not misplaced, then points."""
         if not self.models:
-            return 0, 0
+            return False, 0, 0
         model = self.models[0]
-        return model.num_views - len(self.misplaced), len(model.points_world)
+        placed = model.num_views - len(self.misplaced)
+        return self.spread[0] >= FEWEST_VIEWS, placed, len(model.points_world)
 
 
 def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     """Match all pairs and grow a model; repeat thoroughly what stays unregistered or contradicts.
+
+    Features of a room at rest, before which an object turns, are left out after the first matching.
 
     The thorough pass matches along epipolar lines: pairs of missing photographs, or all where
     some are misplaced. Then it starts the mapper several times, with other random numbers, and at
@@ -82,25 +92,44 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
 
     Returns:
         The best of all runs.
+
+    Raises:
+        ReconstructionError: Nothing moves from photograph to photograph.
     """
     pairs = all_pairs(len(space.files))
-    verified = _matched(space, pairs, settings, guided=False)
+    match_pairs(space, pairs, replace(settings.matching, guided=False))
+    _leave_out_room(space, settings)
+    verified = verified_pairs(space)
     if settings.guided_pairs:
         counts = {pair.views: pair.num_matches for pair in verified}
         some = strongest(counts, len(space.files), settings.guided_pairs)
-        verified = _matched(space, some, settings, guided=True)
+        verified = _guided(space, some, settings)
     best = _mapped(space, verified, settings, settings.mapping)
     if best.complete or not settings.starts:
         return best
     missing = {space.files.index(file) for file in best.missing}
     again = pairs if best.misplaced else [pair for pair in pairs if missing & set(pair)]
-    verified = _matched(space, again, settings, guided=True)
+    verified = _guided(space, again, settings)
     for mapping in track(_starts(settings)):
         found = _mapped(space, verified, settings, mapping)
         best = max(best, found, key=lambda one: one.rank)
         if best.complete:
             break
     return best
+
+
+def _leave_out_room(space: Workspace, settings: RegistrationSettings) -> None:
+    rest = leave_out_room(space.database, settings.matching)
+    require_motion(rest, len(space.files))
+    if rest.room:
+        left = sum(int(resting.sum()) for resting in rest.features)
+        found = sum(len(resting) for resting in rest.features)
+        warnings.warn(
+            f"{left} of {found} features lie still in the photographs while others move: they are "
+            "taken for those of a room before which the object turns, and are left out.",
+            PimperWarning,
+            stacklevel=2,
+        )
 
 
 def _starts(settings: RegistrationSettings) -> list[MapSettings]:
@@ -114,15 +143,11 @@ def _starts(settings: RegistrationSettings) -> list[MapSettings]:
     return [replace(mapping, seed=seed) for seed in seeds] + [replace(mapping, pairs_count=True)]
 
 
-def _matched(
-    space: Workspace,
-    pairs: Sequence[PhotographPair],
-    settings: RegistrationSettings,
-    *,
-    guided: bool,
+def _guided(
+    space: Workspace, pairs: Sequence[PhotographPair], settings: RegistrationSettings
 ) -> list[VerifiedPair]:
-    """Match some pairs anew; give all that are verified then."""
-    match_pairs(space, pairs, replace(settings.matching, guided=guided))
+    """Match some pairs anew, along epipolar lines too; give all that are verified then."""
+    match_pairs(space, pairs, replace(settings.matching, guided=True))
     return verified_pairs(space)
 
 
@@ -133,11 +158,14 @@ def _mapped(
     mapping: MapSettings,
 ) -> Registration:
     found = [drop_weak_views(model, mapping.min_inliers) for model in map_views(space, mapping)]
-    models = tuple(sorted(found, key=lambda model: (-model.num_views, -len(model.points_world))))
+    counted = [(count_spread_views(model, mapping.min_inliers), model) for model in found]
+    counted.sort(key=lambda one: (-one[0], -one[1].num_views, -len(one[1].points_world)))
+    models = tuple(model for _, model in counted)
     registered = models[0].names if models else ()
     limit = _AGREEING * settings.matching.max_error_px
     return Registration(
         models=models,
+        spread=tuple(spread for spread, _ in counted),
         missing=tuple(file for file in space.files if file not in registered),
         misplaced=misplaced_views(models[0], space.files, verified, limit) if models else (),
     )

@@ -1,0 +1,108 @@
+import pytest
+import torch
+
+from pimper_torch.errors import PimperWarning, ReconstructionError
+from pimper_torch.geometry.frames import transform
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.metrics.similarity import similarity_between_cameras
+from pimper_torch.records import Views
+from pimper_torch.scenes.config import SceneConfig
+from pimper_torch.scenes.frame import render_frame
+from pimper_torch.scenes.meshes import potato
+from pimper_torch.scenes.scene import build_scene
+from pimper_torch.scenes.stage import Stage
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+
+QUICK = ReconstructConfig(
+    peak_threshold=0.0067,
+    affine_shape=False,
+    guided_pairs=0,
+    starts=0,
+    track_rounds=0,
+    threads=1,
+)
+
+
+@pytest.fixture(scope="module")
+def solid(tmp_path_factory):
+    path = tmp_path_factory.mktemp("meshes") / "potato.ply"
+    write_ply(potato(torch.Generator().manual_seed(3), subdivisions=5), path)
+    return path
+
+
+def photographs(scene, chosen):
+    """Take some of a scene's photographs as a camera of 8 bits does."""
+    taken = []
+    for view in chosen:
+        stage = Stage(scene.bodies_in(view))
+        frame = render_frame(
+            stage, scene.cameras, scene.lights, view, scene.noise(view), scene.config.sensor
+        )
+        taken.append((frame.image, frame.foreground))
+    return Views(
+        images=torch.stack([image for image, _ in taken]),
+        sizes_px=scene.cameras.sizes_px[chosen],
+        names=tuple(scene.names[view] for view in chosen),
+        masks=torch.stack([mask for _, mask in taken]),
+        focals_px=torch.full((len(chosen),), torch.nan),
+    )
+
+
+def furnished(solid, **changes):
+    settings = {"num_views": 24, "width": 320, "height": 240, "path": "turntable"}
+    fixed = {"fixed_lamp": True, "fixed_room": True}
+    return build_scene(solid, SceneConfig(**(settings | fixed | changes)))
+
+
+def center_errors(found, scene):
+    """Give how far each camera's centre is off, in distances of the camera."""
+    rows = torch.tensor([scene.names.index(name) for name in found.views.names])
+    true = scene.cameras.replace(
+        intrinsics=scene.cameras.intrinsics[rows],
+        cam_from_world=scene.cameras.cam_from_world[rows],
+        sizes_px=scene.cameras.sizes_px[rows],
+    )
+    fit = similarity_between_cameras(found.cameras, true).double()
+    ours = transform(fit, found.cameras.centers_world.double())
+    return (ours - true.centers_world).norm(dim=1) / true.centers_world.norm(dim=1)
+
+
+def compare(views, scene):
+    """Give median errors of the cameras, without and with the object's masks."""
+    with pytest.warns(PimperWarning, match="features lie still .* are left out"):
+        without = Reconstruct(QUICK)(views.replace(masks=None))
+    masked = Reconstruct(QUICK)(views)  # a warning would be an error
+    assert without.unregistered == masked.unregistered == ()
+    return tuple(float(center_errors(found, scene).median()) for found in (without, masked))
+
+
+def test_cameras_before_a_room_and_a_table_at_rest_are_those_of_the_object(solid):
+    scene = furnished(solid, fixed_table=True)
+    without, masked = compare(photographs(scene, list(range(6))), scene)
+    assert masked < 0.003
+    assert without < 1.5 * masked  # the same features, but for those that the masks' rims cut
+
+
+@pytest.mark.slow
+def test_cameras_all_round_a_turntable_are_as_exact_as_with_masks(solid):
+    scene = furnished(solid)
+    without, masked = compare(photographs(scene, list(range(24))), scene)
+    assert masked < 0.005
+    assert without < 1.5 * masked
+
+
+def test_photographs_of_one_place_are_refused_with_what_to_do(solid):
+    scene = furnished(solid)
+    (image,) = photographs(scene, [3]).images
+    generator = torch.Generator().manual_seed(4)
+    noise = 0.004 * torch.randn(4, *image.shape, generator=generator)
+    views = Views(
+        images=(image + noise).clamp(0, 1),
+        sizes_px=torch.tensor([[320, 240]] * 4),
+        names=tuple("abcd"),
+        focals_px=torch.full((4,), torch.nan),
+    )
+    with pytest.raises(ReconstructionError, match="Nothing moves in 4 photographs") as caught:
+        Reconstruct(QUICK)(views)
+    for way in ("masks", "plain cloth", "move the camera"):
+        assert way in str(caught.value)
