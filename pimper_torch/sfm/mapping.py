@@ -2,7 +2,9 @@
 
 import tempfile
 from dataclasses import dataclass
+from itertools import count
 
+from pimper_torch.progress import report
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of
 from pimper_torch.sfm.model import SparseModel
@@ -42,7 +44,15 @@ def map_views(space: Workspace, settings: MapSettings) -> list[SparseModel]:
     options.random_seed = settings.seed
     options.mapper.abs_pose_min_num_inliers = settings.min_inliers
     options.triangulation.ignore_two_view_tracks = not settings.pairs_count
+    registered = count(3)  # the first call follows a model of two views
+
+    def tell() -> None:
+        # Of a model that begins anew, more views than there are can have been added.
+        report(min(next(registered), len(space.files)), len(space.files))
+
     with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
-        found = pycolmap.incremental_mapping(space.database, space.images, output, options)
+        found = pycolmap.incremental_mapping(
+            space.database, space.images, output, options, next_image_callback=tell
+        )
     models = [model_of(reconstruction) for reconstruction in found.values()]
     return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))

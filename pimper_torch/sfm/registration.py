@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.progress import track
 from pimper_torch.sfm.agreement import misplaced_views
 from pimper_torch.sfm.components import FEWEST_VIEWS, count_spread_views, require_motion
 from pimper_torch.sfm.leave_out import leave_out_room
@@ -110,7 +109,7 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     missing = {space.files.index(file) for file in best.missing}
     again = pairs if best.misplaced else [pair for pair in pairs if missing & set(pair)]
     verified = _guided(space, again, settings)
-    for mapping in track(_starts(settings)):
+    for mapping in _starts(settings):
         found = _mapped(space, verified, settings, mapping)
         best = max(best, found, key=lambda one: one.rank)
         if best.complete:

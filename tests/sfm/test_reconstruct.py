@@ -16,6 +16,7 @@ from pimper_torch.errors import (
     ReconstructionError,
 )
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Views
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
@@ -214,7 +215,13 @@ def test_eight_photographs_of_the_skull_register_and_their_points_reproject():
 
     views = load_views(str(files("pimper_torch").joinpath("data/skull")))
     chosen = [views.names.index(f"{number}.jpg") for number in (35, 36, 37, 38, 53, 54, 55, 56)]
-    scene = Reconstruct()(views.take(chosen))
+    told: list[tuple[int, int]] = []
+    with listening(lambda done, total: told.append((done, total))):
+        scene = Reconstruct(ReconstructConfig(threads=2))(views.take(chosen))
+    # Two photographs a thread: two steps of extraction, then a tile of pairs, twice: all, and
+    # those that are guided; then the mapper, from its third view on.
+    assert told[:5] == [(1, 2), (2, 2), (1, 1), (1, 1), (3, 8)]
+    assert all(done <= total for done, total in told)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert scene.unregistered == ()
