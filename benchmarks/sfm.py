@@ -2,10 +2,10 @@
 
 Run as ``python benchmarks/sfm.py PHOTOS [PHOTOS ...]``; prints Markdown tables, and below each
 what the runs warned of. With ``--reference MODEL``, a COLMAP model whose images have the
-photographs' names, each view's rotation is compared with the model's; a view more than 2 degrees
-off counts as wrong. With ``--truth FOLDER``, as ``pimper render`` writes it, focal lengths and the
-places of the object's points are compared: where exact rays put them, after the similarity on
-cameras and after the best.
+photographs' names, or a folder with LLFF's ``poses_bounds.npy``, each view's rotation is compared
+with the model's; a view more than 2 degrees off counts as wrong. With ``--truth FOLDER``, as
+``pimper render`` writes it, focal lengths and the places of the object's points are compared: where
+exact rays put them, after the similarity on cameras and after the best.
 """
 
 import argparse
@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from pimper_torch.datasets import read_rendered
+from pimper_torch.datasets.llff import read_llff
 from pimper_torch.errors import PimperError, PimperWarning
 from pimper_torch.io.photographs import load_views
 from pimper_torch.metrics.evaluate import camera_figures
@@ -173,10 +174,10 @@ def estimate_of(scene: SparseScene) -> Estimate:
 
 def rotation_errors_deg(scene: SparseScene, reference: Path) -> Tensor:
     """Give the angle between each view's rotation and the reference's, after alignment."""
-    model = read_model(reference)
-    number = {name: index for index, name in enumerate(model.names)}
+    names, cam_from_world = reference_poses(reference)
+    number = {name: index for index, name in enumerate(names)}
     shared = [index for index, name in enumerate(scene.views.names) if name in number]
-    theirs = model.cam_from_world[[number[scene.views.names[index]] for index in shared]]
+    theirs = cam_from_world[[number[scene.views.names[index]] for index in shared]].double()
     mine = scene.cameras.cam_from_world[shared].double()
     # The rotation between the worlds that most views agree on: of all the views' own, the one
     # with the least median angle to the others.
@@ -184,6 +185,15 @@ def rotation_errors_deg(scene: SparseScene, reference: Path) -> Tensor:
     trace = torch.einsum("aij,bij->ab", between, between)
     angles = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).arccos())
     return angles[angles.median(dim=1).values.argmin()]
+
+
+def reference_poses(folder: Path) -> tuple[tuple[str, ...], Tensor]:
+    """Read names and ``cam_from_world`` of an LLFF set or a COLMAP model."""
+    if (folder / "poses_bounds.npy").is_file():
+        capture = read_llff(folder, max_size_px=64)  # the poses alone are wanted
+        return capture.views.names, capture.cameras.cam_from_world
+    model = read_model(folder)
+    return model.names, model.cam_from_world
 
 
 def cpu_seconds() -> float:
