@@ -1,11 +1,12 @@
 """The one place that loads pycolmap: when a function needs it, so that imports stay light."""
 
+import ctypes
 import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 
@@ -35,3 +36,12 @@ def quiet() -> Iterator[None]:
 def thread_count(threads: int) -> int:
     """Tell how many threads COLMAP runs: as many as given, or with -1 one a core."""
     return threads if threads > 0 else (os.cpu_count() or 1)
+
+
+def release_memory() -> None:
+    """Give memory that COLMAP's threads have freed back to the system, where glibc can.
+
+    With 30 photographs of 1600x1200 that is 400 MB, which would add to what comes after.
+    """
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)

@@ -12,7 +12,7 @@ from torch import nn
 from pimper_torch.config import require
 from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.binding import thread_count
+from pimper_torch.sfm.binding import release_memory, thread_count
 from pimper_torch.sfm.cache import KeptModel, ModelCache, model_key
 from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
@@ -245,11 +245,15 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     with workspace(views, thread_count(config.threads or -1)) as space:
         counts = find_features(space, config.features, _known_focals(views))
         _require_features(counts, views.names)
+        release_memory()
         found = register(space, config.registration)
+    release_memory()
     names = dict(zip(space.files, views.names, strict=True))
     model = _chosen(found, names, config.min_share)
     numbers = [views.names.index(name) for name in model.names]
-    return refine_tracks(views.take(numbers), model, config.tracks)
+    model = refine_tracks(views.take(numbers), model, config.tracks)
+    release_memory()
+    return model
 
 
 def _chosen(found: Registration, names: dict[str, str], min_share: float) -> SparseModel:

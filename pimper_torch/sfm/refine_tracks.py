@@ -7,14 +7,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.radiometry import SATURATED
-from pimper_torch.records import Cameras, Views, pairs_table
+from pimper_torch.records import Cameras, Lens, Views, pairs_table
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reprojection import observation_errors
 from pimper_torch.sfm.sightings import Sightings, SightingSettings, sight
 from pimper_torch.sfm.tangents import tangents
-from pimper_torch.sfm.undistort import undistort
+from pimper_torch.sfm.undistort import pinholes_for, undistorted
 
 # Views that must show a point, its reference among them, for its features to be given up.
 _FEWEST_SIGHTINGS = 3
@@ -64,14 +64,14 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
         The same views. Points that nothing agrees about are left out.
     """
     for _ in range(settings.rounds):
-        undistorted, intrinsics = undistort(_gray(views), model.lenses)
+        pictures = _gray(views, model.lenses)
         cameras = Cameras(
-            intrinsics=intrinsics.double(),
+            intrinsics=pinholes_for(model.lenses),
             cam_from_world=model.cam_from_world,
-            sizes_px=undistorted.sizes_px.cpu(),
+            sizes_px=pictures.sizes_px,
         )
         planes = tangents(model.points_world, model.observed, cameras)
-        found = sight(undistorted, cameras, planes, settings.sightings)
+        found = sight(pictures, cameras, planes, settings.sightings)
         renewed, aligned = _renewed(model, found, cameras, settings.fewest_points)
         if not bool(aligned.any()):
             return model
@@ -79,13 +79,16 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
     return model
 
 
-def _gray(views: Views) -> Views:
-    """Keep what patches are compared by: one channel, saturated where one of three is."""
-    gray = torch.empty_like(views.images[:, :1], device="cpu")
-    for one, image in zip(gray, views.images, strict=True):
-        brightest = image.detach().amax(dim=0)
-        one[0] = torch.where(brightest >= SATURATED, brightest, image.detach().mean(dim=0))
-    return views.replace(images=gray).to("cpu")
+def _gray(views: Views, lenses: tuple[Lens, ...]) -> Views:
+    """Undistort what patches are compared by: one channel, saturated where one of three is."""
+    gray = torch.zeros_like(views.images[:, :1], device="cpu")
+    valid = torch.zeros_like(views.images[:, 0], device="cpu", dtype=torch.bool)
+    for index, (image, inside) in enumerate(undistorted(views, lenses)):
+        height, width = inside.shape
+        brightest, mean = image.detach().amax(dim=0), image.detach().mean(dim=0)
+        gray[index, 0, :height, :width] = torch.where(brightest >= SATURATED, brightest, mean)
+        valid[index, :height, :width] = inside
+    return views.replace(images=gray, masks=valid).to("cpu")
 
 
 def _renewed(

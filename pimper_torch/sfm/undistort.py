@@ -1,5 +1,7 @@
 """Photographs as a pinhole would have taken them."""
 
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -33,20 +35,36 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
     """
     images = torch.zeros_like(views.images)
     valid = torch.zeros_like(views.images[:, 0], dtype=torch.bool)
+    for index, (image, inside) in enumerate(undistorted(views, lenses)):
+        height, width = inside.shape
+        images[index, :, :height, :width], valid[index, :height, :width] = image, inside
+    masks = views.masks
+    if masks is not None or not bool((valid == views.inside).all()):
+        masks = valid
+    return views.replace(images=images, masks=masks), pinholes_for(lenses).to(views.images)
+
+
+def undistorted(
+    views: Views, lenses: tuple[Lens, ...]
+) -> Iterator[tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]]:
+    """Undistort photographs one by one, as :func:`undistort` does, without padding.
+
+    Yields:
+        Radiance, and where it is valid.
+    """
     grids: dict[Lens, _Grid | None] = {}
     for index in track(range(views.num_views)):
         lens = lenses[index]
         if lens not in grids:
             # The last alone, for grids are large.
             grids = {lens: None if is_pinhole(lens) else _grid(lens, like=views.images)}
-        image, inside = _undistort_image(views, index, lens, grids[lens])
-        images[index, :, : lens.height, : lens.width] = image
-        valid[index, : lens.height, : lens.width] = inside
-    intrinsics = torch.stack([pinhole_for(lens) for lens in lenses]).to(views.images)
-    masks = views.masks
-    if masks is not None or not bool((valid == views.inside).all()):
-        masks = valid
-    return views.replace(images=images, masks=masks), intrinsics
+        yield _undistort_image(views, index, lens, grids[lens])
+
+
+def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
+    """Give ``K`` of each lens's :func:`pinhole_for`, in float64."""
+    found = {lens: pinhole_for(lens) for lens in dict.fromkeys(lenses)}
+    return torch.stack([found[lens] for lens in lenses])
 
 
 _Grid = tuple[Float[Tensor, "1 height width 2"], Bool[Tensor, "height width"]]
