@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 import tyro
-from torch import nn
 from torch.nn.functional import normalize
 
 import pimper_torch
@@ -23,6 +22,7 @@ from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.lights import wandering_lights
 from pimper_torch.scenes.noise import random_speckle
 from pimper_torch.scenes.shapes import Sphere
+from pimper_torch.sfm.reconstruct import Reconstruct
 
 PACKAGE = Path(pimper_torch.__file__).parent
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -60,15 +60,11 @@ def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
     scene, found = photographed()
     save_photographs(scene.views, Path("photos"))
 
-    class Placed(nn.Module):
-        def __init__(self, config: object) -> None:
-            super().__init__()
+    def place(_: Reconstruct, views: Views, sparse_model: object = None) -> SparseScene:
+        assert views.names == found.views.names
+        return found.replace(views=views)
 
-        def forward(self, views: Views, sparse_model: object = None) -> SparseScene:
-            assert views.names == found.views.names
-            return found.replace(views=views)
-
-    monkeypatch.setattr("pimper_torch.pipeline.Reconstruct", Placed)  # the longest stage
+    monkeypatch.setattr(Reconstruct, "forward", place)  # the longest stage
     draw = results.draw_overview
     monkeypatch.setattr(results, "draw_overview", lambda found, path: draw(found, path, 40))
     return {}
