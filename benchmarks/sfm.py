@@ -75,12 +75,10 @@ def variants() -> dict[str, ReconstructConfig]:
         "the same, 2048 features": change(first, max_features=2048),
         "the same, 4096 features": change(first, max_features=4096),
         "the same, 3 pairs guided": change(first, guided_pairs=3),
-        "the same, 6 pairs guided": change(first, guided_pairs=6),
+        "the same, 10 pairs guided": guided,
         "the same, all pairs guided": change(first, guided_pairs=ALL),
-        "first model": guided,
         "ours: tracks found again": ours,
         "ours, no pair guided": change(ours, guided_pairs=0),
-        "ours, all pairs guided": change(ours, guided_pairs=ALL),
         "ours, edge 20": change(guided, edge_threshold=20.0),
         "ours, ratio 0.9": change(guided, max_ratio=0.9),
     }

@@ -65,7 +65,7 @@ class ReconstructConfig:
     max_features: int = 8192
     affine_shape: bool = True
     max_ratio: float = 0.8
-    guided_pairs: int = 6
+    guided_pairs: int = 10
     max_error_px: float = 2.0
     min_matches: int = 15
     min_registration_points: int = 30
