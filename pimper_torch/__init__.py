@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pimper_torch.io.results import write_result
     from pimper_torch.pipeline import Pimper, PimperConfig, load_config
     from pimper_torch.radiometry import Encoding
+    from pimper_torch.sfm.cache import user_cache
 
 __all__ = [
     "ConfigError",
@@ -37,6 +38,7 @@ __all__ = [
     "__version__",
     "load_config",
     "load_views",
+    "user_cache",
     "write_result",
 ]
 
@@ -47,6 +49,7 @@ _HOMES = {
     "PimperConfig": "pimper_torch.pipeline",
     "load_config": "pimper_torch.pipeline",
     "load_views": "pimper_torch.io.photographs",
+    "user_cache": "pimper_torch.sfm.cache",
     "write_result": "pimper_torch.io.results",
 }
 
