@@ -19,6 +19,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from pimper_torch.bench.memory import peak_memory
 from pimper_torch.datasets import read_rendered
 from pimper_torch.datasets.llff import read_llff
 from pimper_torch.errors import PimperError, PimperWarning
@@ -124,14 +125,18 @@ def row(
 ) -> str:
     """Run structure from motion once and give its figures as cells."""
     wall, processor = time.perf_counter(), cpu_seconds()
-    try:
-        scene = Reconstruct(config)(views)
-        cells = figures(scene, reference, truth)
-    except PimperError as error:
-        cells = [f"{type(error).__name__}: {str(error).split('.')[0]}", *[""] * 9]
-    wall, processor = time.perf_counter() - wall, cpu_seconds() - processor
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return " | ".join([*cells, f"{wall:.0f}", f"{processor:.0f}", f"{peak:.0f}"])
+    with peak_memory() as peak:
+        try:
+            found: SparseScene | PimperError = Reconstruct(config)(views)
+        except PimperError as error:
+            found = error
+        wall, processor = time.perf_counter() - wall, cpu_seconds() - processor
+        megabytes = peak() or float("nan")
+    if isinstance(found, PimperError):
+        cells = [f"{type(found).__name__}: {str(found).split('.')[0]}", *[""] * 9]
+    else:
+        cells = figures(found, reference, truth)
+    return " | ".join([*cells, f"{wall:.0f}", f"{processor:.0f}", f"{megabytes:.0f}"])
 
 
 def figures(scene: SparseScene, reference: Path | None, truth: Capture | None) -> list[str]:
