@@ -29,14 +29,17 @@ _LEAST_AGREEMENT = 0.5
 
 def misplaced_views(
     model: SparseModel, files: Sequence[str], pairs: Sequence[VerifiedPair], max_error_px: float
-) -> tuple[str, ...]:
-    """Name the views whose strongest pairs contradict the model.
+) -> dict[str, float]:
+    """Find the views whose strongest pairs contradict the model.
 
     Args:
         model: Its names are among ``files``.
         files: Of all photographs.
         pairs: With numbers of photographs; those that the model lacks do not judge.
         max_error_px: Distance from the model's epipolar geometry up to which a match agrees.
+
+    Returns:
+        By name, the share of the matches in those pairs that agree.
     """
     view_of = {files.index(name): view for view, name in enumerate(model.names)}
     judged: dict[PhotographPair, tuple[int, float]] = {}
@@ -45,14 +48,15 @@ def misplaced_views(
             first, second = (view_of[number] for number in pair.views)
             inside = pair.replace(views=(first, second))
             judged[first, second] = pair.num_matches, agreement(model, inside, max_error_px)
-    found = []
+    found = {}
     for view, name in enumerate(model.names):
         mine = [judged[pair] for pair in judged if view in pair]
         judges = sorted(mine, reverse=True)[:_JUDGES]
+        total = sum(count for count, _ in judges)
         agreeing = sum(count * share for count, share in judges)
-        if agreeing < _LEAST_AGREEMENT * sum(count for count, _ in judges):
-            found.append(name)
-    return tuple(found)
+        if agreeing < _LEAST_AGREEMENT * total:
+            found[name] = agreeing / total
+    return found
 
 
 def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> float:

@@ -264,7 +264,11 @@ def _chosen(found: Registration, names: dict[str, str], min_share: float) -> Spa
     photographs = tuple(names.values())
     parts = [model.names for model in models]
     model = models[choose_component(parts, found.spread, photographs, min_share)]
-    misplaced = [names[file] for file in found.misplaced if names[file] in model.names]
+    misplaced = [
+        f"{names[file]} ({share:.0%} agree)"
+        for file, share in found.misplaced.items()
+        if names[file] in model.names
+    ]
     if misplaced:
         warnings.warn(
             f"{len(misplaced)} of {model.num_views} photographs contradict most matches with those "

@@ -1,7 +1,7 @@
 """Photographs with features registered in one model: quickly first, thoroughly where that fails."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pimper_torch.errors import PimperWarning
@@ -53,13 +53,14 @@ class Registration:
         spread: How many views of each see depth, see
             :func:`~pimper_torch.sfm.components.count_spread_views`.
         missing: Files that the first model lacks; all without a model.
-        misplaced: Files of the first model whose strongest pairs contradict it.
+        misplaced: Files of the first model whose strongest pairs contradict it, and the share of
+            the matches in those that agrees.
     """
 
     models: tuple[SparseModel, ...]
     spread: tuple[int, ...]
     missing: tuple[str, ...]
-    misplaced: tuple[str, ...]
+    misplaced: Mapping[str, float]
 
     @property
     def complete(self) -> bool:
@@ -166,5 +167,5 @@ def _mapped(
         models=models,
         spread=tuple(spread for spread, _ in counted),
         missing=tuple(file for file in space.files if file not in registered),
-        misplaced=misplaced_views(models[0], space.files, verified, limit) if models else (),
+        misplaced=misplaced_views(models[0], space.files, verified, limit) if models else {},
     )
