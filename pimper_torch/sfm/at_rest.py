@@ -22,7 +22,7 @@ _CLEARLY = 4.0
 # Of the moving matches. Simulated with 0.2 px of noise: 0.00 in rigid scenes; before a room at
 # rest 0.2 with the camera 2 degrees over the table's plane, 0.5 from 10, 0.8 from 25.
 _CONTRADICTION = 0.1
-# Of the geometry's fit: in simulation violations change by less than 0.01 after 5.
+# Of the fit: in simulation the share of violations changes by 0.01 at most after 5.
 _ROUNDS = 5
 
 
