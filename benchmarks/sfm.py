@@ -74,7 +74,7 @@ def variants() -> dict[str, ReconstructConfig]:
         "COLMAP's, second pass": change(COLMAP, starts=ours.starts),
         "0.002, affine, 2 px": first,
         "the same, 2048 features": change(first, max_features=2048),
-        "the same, 4096 features": change(first, max_features=4096),
+        "the same, 8192 features": change(first, max_features=8192),
         "the same, 3 pairs guided": change(first, guided_pairs=3),
         "the same, 10 pairs guided": guided,
         "the same, all pairs guided": change(first, guided_pairs=ALL),

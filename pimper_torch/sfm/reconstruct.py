@@ -37,7 +37,8 @@ class ReconstructConfig:
         peak_threshold: Contrast below which a feature is dropped; in COLMAP's units, where
             its own default is 0.0067. Lower finds the faint marks of smooth surfaces.
         edge_threshold: Ratio of curvatures above which a feature counts as an edge.
-        max_features: Most features in a photograph; those at coarse scales are kept.
+        max_features: In a photograph; those at coarse scales are kept, whole scales at a time, so
+            that up to twice as many are left.
         affine_shape: Adapt features to slanted surfaces.
         max_ratio: Of the distances to the best and the second best match.
         guided_pairs: Of each photograph, those with most matches, in which more are looked for
@@ -62,7 +63,7 @@ class ReconstructConfig:
     shared_camera: bool = True
     peak_threshold: float = 0.002
     edge_threshold: float = 10.0
-    max_features: int = 8192
+    max_features: int = 4096
     affine_shape: bool = True
     max_ratio: float = 0.8
     guided_pairs: int = 10
