@@ -1,0 +1,189 @@
+"""Derivatives that autograd gives, beside finite differences of the same function.
+
+A stage that selects (which view, which face, which sample is valid) has jumps, and one that
+interpolates has kinks: no derivative there. They show in the finite differences alone: those of two
+step sizes disagree, or those forward and backward. What jumps or bends is left out and counted;
+where all agree, autograd has to agree with them.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.records import Record
+
+# Central differences of two step sizes that differ by more than this share saw a jump; forward and
+# backward ones a kink.
+_JUMP = 0.01
+
+# Of so many roundings a function's value is made.
+_ROUNDINGS = 16
+
+# A direction in which more than this share of an output's elements jump tells nothing of it.
+_MOST_JUMPS = 0.5
+
+Tensors = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class DerivativeCheck(Record):
+    """Directional derivatives of one output by one input.
+
+    Attributes:
+        analytic: ``w . (J d)`` by autograd, for every weight ``w`` and direction ``d``.
+        numeric: The same by central differences.
+        smooth: Directions in which not too many elements jump or bend.
+        jumped: Share of the output's elements that jump or bend, over all directions.
+    """
+
+    analytic: Float[Tensor, "weight direction"]
+    numeric: Float[Tensor, "weight direction"]
+    smooth: Bool[Tensor, " direction"]
+    jumped: float
+
+    @property
+    def ratios(self) -> Float[Tensor, " ratio"]:
+        """Analytic over numeric; 1 where both vanish."""
+        analytic, numeric = self.analytic[:, self.smooth], self.numeric[:, self.smooth]
+        ratios = analytic / torch.where(numeric == 0, torch.nan, numeric)
+        return torch.where((analytic == 0) & (numeric == 0), 1, ratios).flatten()
+
+    @property
+    def median(self) -> float:
+        """Of the ratios; NaN if every direction jumps."""
+        ratios = self.ratios
+        return float(ratios.median()) if len(ratios) else float("nan")
+
+    @property
+    def spread(self) -> float:
+        """Largest distance of a ratio from 1; NaN if every direction jumps."""
+        ratios = self.ratios
+        return float((ratios - 1).abs().max()) if len(ratios) else float("nan")
+
+
+def check_derivatives(
+    function: Callable[[Tensors], Tensors],
+    inputs: Tensors,
+    generator: torch.Generator,
+    *,
+    scales: Mapping[str, float] | None = None,
+    directions: int = 3,
+    weights: int = 2,
+    steps: tuple[float, float] = (1e-6, 1e-7),
+) -> dict[tuple[str, str], DerivativeCheck]:
+    """Compare autograd with central differences, for every input and output of a function.
+
+    Args:
+        function: From named tensors to named tensors; deterministic.
+        inputs: In float64. Entries that are zero throughout a tensor of ``scales`` are moved, too.
+        generator: Of directions and weights.
+        scales: Length of a unit step of each input, per element; the root mean square of its
+            elements where not given.
+        directions: Random ones for each input.
+        weights: Random sums of each output's elements.
+        steps: The two sizes, in scales. Derivatives are those of the smaller one.
+
+    Returns:
+        By input and output.
+
+    >>> check = check_derivatives(
+    ...     lambda x: {"square": x["x"] ** 2 + x["x"].detach()},
+    ...     {"x": torch.linspace(1, 2, 5, dtype=torch.float64)},
+    ...     torch.Generator().manual_seed(0),
+    ... )["x", "square"]
+    >>> 0.5 < check.median < 0.9  # 2 x in place of 2 x + 1
+    True
+    """
+    scales = dict(scales or {})
+    sizes = {
+        name: scales.get(name, float(value.square().mean().sqrt()) or 1.0)
+        for name, value in inputs.items()
+    }
+    paths = {
+        name: sizes[name] * torch.randn(directions, *value.shape, generator=generator).to(value)
+        for name, value in inputs.items()
+    }
+    middle = {key: value.detach() for key, value in function(_leaves(inputs)).items()}
+    moving = {
+        name: [_differences(function, inputs, name, path, steps, middle) for path in paths[name]]
+        for name in inputs
+    }
+    live = _leaves(inputs)
+    found = function(live)
+    checks = {}
+    for output, values in found.items():
+        jumps = {
+            name: torch.stack([jumps[output] for _, jumps in each]) for name, each in moving.items()
+        }
+        smooth = {name: jump.double().mean(dim=1) <= _MOST_JUMPS for name, jump in jumps.items()}
+        apart = torch.stack([jumps[name][smooth[name]].any(dim=0) for name in inputs]).any(dim=0)
+        sums = torch.randn(weights, values.numel(), generator=generator).to(values)
+        sums = torch.where(apart, 0, sums)
+        grads = [_gradients(values, some, live) for some in sums]
+        for name in inputs:
+            numeric = torch.stack([fine[output].flatten() for fine, _ in moving[name]])
+            # A jump elsewhere may be infinite.
+            numeric = torch.where(apart, 0, numeric)
+            analytic = torch.stack([grad[name].flatten() for grad in grads])
+            analytic = analytic @ paths[name].reshape(directions, -1).mT
+            none = analytic.abs() <= _rounding(values.detach(), steps[1]) * values.numel() ** 0.5
+            checks[name, output] = DerivativeCheck(
+                analytic=torch.where(none & ~numeric.any(dim=1), 0, analytic),
+                numeric=sums @ numeric.mT,
+                smooth=smooth[name],
+                jumped=float(jumps[name].double().mean()),
+            )
+    return checks
+
+
+def _leaves(inputs: Tensors) -> dict[str, Tensor]:
+    return {name: value.clone().requires_grad_() for name, value in inputs.items()}
+
+
+def _differences(
+    function: Callable[[Tensors], Tensors],
+    inputs: Tensors,
+    name: str,
+    path: Tensor,
+    steps: tuple[float, float],
+    middle: Tensors,
+) -> tuple[dict[str, Tensor], dict[str, Bool[Tensor, " element"]]]:
+    """Give central differences of all outputs along a path, and the elements that jump or bend."""
+
+    def at(step: float) -> dict[str, Tensor]:
+        found = function(_leaves({**inputs, name: inputs[name] + step * path}))
+        return {key: value.detach() for key, value in found.items()}
+
+    central = []
+    for step in steps:
+        after, before = at(step), at(-step)
+        central.append({key: (after[key] - before[key]) / (2 * step) for key in middle})
+    coarse, fine = central
+    apart = {}
+    for key in middle:
+        bend = (after[key] - 2 * middle[key] + before[key]) / steps[1]
+        size = torch.maximum(coarse[key].abs(), fine[key].abs()).flatten()
+        off = torch.maximum((coarse[key] - fine[key]).abs(), bend.abs()).flatten()
+        floor = _rounding(middle[key], steps[1])
+        apart[key] = ~(off <= _JUMP * (size + size.median()) + floor)
+        fine[key] = torch.where(fine[key].abs() <= floor, 0, fine[key])
+    return fine, apart
+
+
+def _rounding(values: Tensor, step: float) -> Tensor:
+    """Give what is left of a difference of equal values over a step."""
+    return _ROUNDINGS * torch.finfo(values.dtype).eps * values.abs().max() / step
+
+
+def _gradients(values: Tensor, some: Tensor, live: Tensors) -> dict[str, Tensor]:
+    if not values.requires_grad:
+        return {name: torch.zeros_like(value) for name, value in live.items()}
+    total = (values.flatten() * some).sum()
+    found = torch.autograd.grad(total, list(live.values()), retain_graph=True, allow_unused=True)
+    return {
+        name: torch.zeros_like(value) if grad is None else grad
+        for (name, value), grad in zip(live.items(), found, strict=True)
+    }
