@@ -16,9 +16,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.linalg.implicit import implicit_solution, newton_solution
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.photometry.light_field import LightField
-from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.photometry.robust import cauchy_weights, smooth_spread
 
 # Cauchy's weights are 95 % efficient on Gaussian noise with this many standard deviations.
 CAUCHY_TUNING = 2.385
@@ -26,6 +27,14 @@ CAUCHY_TUNING = 2.385
 # A lamp starts this far away, in mean distances of the samples from their middle, and comes no
 # nearer than the second: inside the scene its light has a pole.
 _FIRST_DISTANCE, _LEAST_DISTANCE = 10.0, 1.3
+
+# A fit is done when a step lowers its cost by less than this share; and iterations and share where
+# gradients are asked for, from which Newton's method goes on.
+_LEAST_GAIN, _AT_REST = 1e-7, (300, 1e-13)
+
+# Share of the diagonal that is added to the normal equations where they precondition others: that
+# light and albedo share a factor makes them singular.
+_CLOSE = 1e-6
 
 # A lamp has one number more than soft light, and must leave smaller residuals than this share.
 _LAMP_GAIN = 0.95
@@ -58,48 +67,49 @@ def fit_light_field(
 
     Fails where the normals span too little (a plane shows one number of each soft light): the
     answer is then the smallest change from lights that shine along the mean normal, and
-    lights that differ are found parallel. Computed in float64. Constant to autograd.
+    lights that differ are found parallel. Computed in float64. Differentiable by the implicit
+    function; which model is taken, and what is held at a bound, is constant.
 
     Source: of the lamp, Queau et al., LED-based photometric stereo, JMIV 60, 2018; that it is
     calibrated by the coarse shape is ours.
     """
-    with torch.no_grad():
-        views = radiance.shape[1]
-        if not seen.any():
-            return LightField(
-                origin=radiance.new_zeros(3),
-                soft=radiance.new_zeros(views, 4),
-                lamp=radiance.new_zeros(views, 3),
-                closeness=radiance.new_zeros(views),
-            )
-        some = seen.any(dim=1)
-        seen = seen[some]
-        J = torch.where(seen, radiance[some], 0).double()
-        known = normals[some].double()
-        places = torch.zeros_like(known) if points is None else points[some].double()
-        origin = places.mean(dim=0)
-        size = (places - origin).norm(dim=1).mean()
-        size = torch.where(size > 0, size, 1)
-        soft = lamp = None
-        if model != "lamp":
-            soft = _fit(_Soft(basis=harmonics(known)), J, seen, iterations)
-        if model != "soft":
-            lamp = _fit(_Lamp(normals=known, points=(places - origin) / size), J, seen, iterations)
-        lights = torch.zeros(views, 4).to(J)
-        lamps, closeness = torch.zeros_like(lights[:, 1:]), torch.zeros_like(lights[:, 0])
-        if lamp is None or (soft is not None and lamp.misfit >= _LAMP_GAIN * soft.misfit):
-            assert soft is not None
-            lights = soft.lights
-        else:
-            lights[:, 0], lamps = lamp.lights[:, 0], lamp.lights[:, 1:4]
-            closeness = torch.zeros_like(closeness) if points is None else lamp.lights[:, 4] / size
-        factor = _typical((lights.square().sum(dim=1) + lamps.square().sum(dim=1)).sqrt())
+    views = radiance.shape[1]
+    if not seen.any():
         return LightField(
-            origin=origin.to(radiance),
-            soft=(lights / factor).to(radiance),
-            lamp=(lamps / factor).to(radiance),
-            closeness=closeness.to(radiance),
+            origin=radiance.new_zeros(3),
+            soft=radiance.new_zeros(views, 4),
+            lamp=radiance.new_zeros(views, 3),
+            closeness=radiance.new_zeros(views),
         )
+    some = seen.any(dim=1)
+    seen = seen[some]
+    J = torch.where(seen, radiance[some], 0).double()
+    known = normals[some].double()
+    places = torch.zeros_like(known) if points is None else points[some].double()
+    origin = places.mean(dim=0)
+    size = _extent(places - origin)
+    soft = lamp = None
+    if model != "lamp":
+        soft = _fitted(_Soft(basis=harmonics(known)), J, seen, iterations)
+    if model != "soft":
+        lamp = _fitted(_Lamp(normals=known, points=(places - origin) / size), J, seen, iterations)
+    lights = torch.zeros(views, 4).to(J)
+    lamps, closeness = torch.zeros_like(lights[:, 1:]), torch.zeros_like(lights[:, 0])
+    if lamp is None or (soft is not None and lamp.misfit >= _LAMP_GAIN * soft.misfit):
+        assert soft is not None
+        lights = soft.answering(J, seen).lights
+    else:
+        told = lamp.answering(J, seen).lights
+        lights = torch.cat([told[:, :1], lights[:, 1:]], dim=1)
+        lamps = told[:, 1:4]
+        closeness = torch.zeros_like(closeness) if points is None else told[:, 4] / size
+    factor = _typical(lights.square().sum(dim=1) + lamps.square().sum(dim=1))
+    return LightField(
+        origin=origin.to(radiance),
+        soft=(lights / factor).to(radiance),
+        lamp=(lamps / factor).to(radiance),
+        closeness=closeness.to(radiance),
+    )
 
 
 def fit_distant_lights(
@@ -122,6 +132,14 @@ class _Soft:
 
     basis: Float[Tensor, "sample 4"]
 
+    def known(self) -> tuple[Tensor, ...]:
+        """List what the model is made from."""
+        return (self.basis,)
+
+    def free(self, lights: Float[Tensor, "view 4"]) -> Bool[Tensor, "view 4"]:
+        """Mark parameters that no bound holds."""
+        return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:]) > 0], dim=1)
+
     def start(self, gain: Float[Tensor, " view"]) -> Float[Tensor, "view 4"]:
         """Give lights along the mean normal under which views are as bright as they are."""
         mean = self.basis.mean(dim=0)
@@ -136,8 +154,8 @@ class _Soft:
         return self.basis[:, None].expand(-1, len(lights), -1)
 
     def admit(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "view 4"]:
-        """Give the nearest parameters that make sense: all do."""
-        return lights
+        """Give the nearest parameters that make sense: light from everywhere is not negative."""
+        return torch.cat([lights[:, :1].clamp_min(0), lights[:, 1:]], dim=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,6 +164,15 @@ class _Lamp:
 
     normals: Float[Tensor, "sample 3"]
     points: Float[Tensor, "sample 3"]  # about the middle, in units of the scene's size
+
+    def known(self) -> tuple[Tensor, ...]:
+        """List what the model is made from."""
+        return self.normals, self.points
+
+    def free(self, lights: Float[Tensor, "view 5"]) -> Bool[Tensor, "view 5"]:
+        """Mark parameters that no bound holds."""
+        inner = (lights[:, 4:] > 0) & (lights[:, 4:] < 1 / _LEAST_DISTANCE)
+        return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:4]) > 0, inner], dim=1)
 
     def start(self, gain: Float[Tensor, " view"]) -> Float[Tensor, "view 5"]:
         """Give distant lamps along the mean normal, and a fifth of their light as ambient."""
@@ -205,13 +232,39 @@ _Model = _Soft | _Lamp
 class _Found:
     """A fit, and its median residual as a share of the view's brightness."""
 
+    model: _Model
     lights: Float[Tensor, "view parameter"]
     albedo: Float[Tensor, " sample"]
     misfit: float
 
+    def answering(
+        self, J: Float[Tensor, "sample view"], seen: Bool[Tensor, "sample view"]
+    ) -> "_Found":
+        """Give the fit with gradients to the photographs and to what the model knows, if asked."""
+        return _with_gradients(self, J, seen) if _asked(self.model, J) else self
+
+
+def _asked(model: _Model, J: Float[Tensor, "sample view"]) -> bool:
+    """Tell whether gradients are asked for."""
+    parts = (J, *model.known())
+    return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+
+
+def _fitted(
+    model: _Model, J: Float[Tensor, "sample view"], seen: Bool[Tensor, "sample view"], limit: int
+) -> _Found:
+    """Fit a model; to rest where gradients are asked for."""
+    limit, least_gain = _AT_REST if _asked(model, J) else (limit, _LEAST_GAIN)
+    with torch.no_grad():
+        return _fit(model, J, seen, limit, least_gain)
+
 
 def _fit(
-    model: _Model, J: Float[Tensor, "sample view"], seen: Bool[Tensor, "sample view"], limit: int
+    model: _Model,
+    J: Float[Tensor, "sample view"],
+    seen: Bool[Tensor, "sample view"],
+    limit: int,
+    least_gain: float,
 ) -> _Found:
     """Take damped Gauss-Newton steps on lights and albedo together, albedos eliminated.
 
@@ -228,20 +281,93 @@ def _fit(
         weight = seen * cauchy_weights(residual, scale)
         cost = _cost(seen, residual, scale)
         slopes = albedo[:, None, None] * model.slopes(lights)
+        downhill = ((weight * residual)[..., None] * slopes).sum(dim=0)
+        # A parameter that would only be pushed over its bound stays out of the others' way.
+        slopes = torch.where(model.admit(lights + downhill) == lights, 0, slopes)
         lights_step, albedo_step = _step(shading, slopes, residual, weight, damping)
-        moved, changed = model.admit(lights + lights_step), albedo + albedo_step
+        moved = model.admit(lights + lights_step)
         shown = model.shade(moved)
+        changed = _best_albedo(J, seen, shown, albedo + albedo_step, weight, scale)
         left = torch.where(seen, J - changed[:, None] * shown, 0)
         after = _cost(seen, left, scale)
         if after < cost:
             lights, albedo, shading, residual = moved, changed, shown, left
             damping = max(damping / 4, 1e-9)
-            if widen == 1 and after > cost * (1 - 1e-7):
+            if widen == 1 and after > cost * (1 - least_gain):
                 break
         else:
             damping = min(damping * 10, 1e6)
     relative = residual.abs() / _level(J, seen).clamp_min(1e-300)
-    return _Found(lights=lights, albedo=albedo, misfit=float(relative[seen].median()))
+    return _Found(model=model, lights=lights, albedo=albedo, misfit=float(relative[seen].median()))
+
+
+def _with_gradients(
+    found: _Found, J: Float[Tensor, "sample view"], seen: Bool[Tensor, "sample view"]
+) -> _Found:
+    """Give the fit its gradients by the implicit function, at the nearest stationary point.
+
+    One number is free, as light and albedo share a factor: the largest of the lights' keeps its
+    value, and so does what a bound holds or nothing tells.
+    """
+    model, count = found.model, found.lights.numel()
+    start = torch.cat([found.lights.flatten(), found.albedo])
+
+    def slopes(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+        lights, albedo = at[:count].reshape(found.lights.shape), at[count:]
+        shown = model.shade(lights)
+        residual = torch.where(seen, J - albedo[:, None] * shown, 0)
+        heavy = seen * cauchy_weights(residual, _scale(J, seen, residual)) * residual
+        by_lights = torch.einsum("sv,s,svp->vp", heavy, albedo, model.slopes(lights))
+        return torch.cat([by_lights.flatten(), (heavy * shown).sum(dim=1)])
+
+    with torch.no_grad():
+        shown = model.shade(found.lights)
+        residual = torch.where(seen, J - found.albedo[:, None] * shown, 0)
+        weight = seen * cauchy_weights(residual, _scale(J, seen, residual))
+        normal = _normal_equations(
+            shown, found.albedo[:, None, None] * model.slopes(found.lights), weight, _CLOSE
+        )
+        held = ~torch.cat([model.free(found.lights).flatten(), (weight * shown**2).sum(dim=1) > 0])
+        flat = found.lights.abs().flatten()
+        held[torch.where(held[:count], 0, flat).argmax()] = True
+
+    def equations(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+        return torch.where(held, start - at, slopes(at))
+
+    def precondition(side: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+        inner = torch.where(held, 0, side)
+        lights, albedo = normal.solve(inner[:count].reshape(found.lights.shape), inner[count:])
+        return -torch.where(held, side, torch.cat([lights.flatten(), albedo]))
+
+    solution = newton_solution(equations, start, precondition)
+    answer = implicit_solution(equations, solution, precondition)
+    return _Found(
+        model=model,
+        lights=answer[:count].reshape(found.lights.shape),
+        albedo=answer[count:],
+        misfit=found.misfit,
+    )
+
+
+def _best_albedo(
+    J: Float[Tensor, "sample view"],
+    seen: Bool[Tensor, "sample view"],
+    shading: Float[Tensor, "sample view"],
+    albedo: Float[Tensor, " sample"],
+    weight: Float[Tensor, "sample view"],
+    scale: Float[Tensor, " view"],
+) -> Float[Tensor, " sample"]:
+    """Give the albedo that suits shading best: by the weights there are, then by its own.
+
+    Lights and albedo are multiplied, so that after a step of both at once it is not the best.
+    """
+    for _ in range(2):
+        square = (weight * shading**2).sum(dim=1)
+        product = (weight * shading * torch.where(seen, J, 0)).sum(dim=1)
+        albedo = torch.where(square > 0, product / torch.where(square > 0, square, 1), albedo)
+        residual = torch.where(seen, J - albedo[:, None] * shading, 0)
+        weight = seen * cauchy_weights(residual, scale)
+    return albedo
 
 
 def _brightness(
@@ -266,7 +392,7 @@ def _scale(
     seen: Bool[Tensor, "sample view"],
     residual: Float[Tensor, "sample view"],
 ) -> Float[Tensor, " view"]:
-    return CAUCHY_TUNING * spread(residual.mT, seen.mT).maximum(1e-4 * _level(J, seen))
+    return CAUCHY_TUNING * smooth_spread(residual.mT, seen.mT).maximum(1e-4 * _level(J, seen))
 
 
 def _cost(
@@ -285,7 +411,7 @@ def _step(
     weight: Float[Tensor, "sample view"],
     damping: float,
 ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
-    """Solve the normal equations for all lights and albedos, albedos eliminated (Schur).
+    """Give what to add to lights and albedos.
 
     Args:
         shading: What albedo 1 shows: the derivatives by the albedos.
@@ -293,10 +419,42 @@ def _step(
         residual: What is left to explain.
         weight: Of each.
         damping: Share of the diagonal that is added to it.
-
-    Returns:
-        What to add to lights and albedos.
     """
+    on_lights = ((weight * residual)[..., None] * slopes).sum(dim=0)
+    on_albedo = (weight * residual * shading).sum(dim=1)
+    return _normal_equations(shading, slopes, weight, damping).solve(on_lights, on_albedo)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Normal:
+    """The normal equations of lights and albedos, albedos eliminated (Schur).
+
+    Attributes:
+        cross: Between albedos and the parameters of the lights.
+        inverse: Of the albedos' own part.
+        factor: Of what is left for the lights: ``torch.linalg.lu_factor``'s.
+    """
+
+    cross: Float[Tensor, "sample unknown"]
+    inverse: Float[Tensor, " sample"]
+    factor: tuple[Tensor, Tensor]
+
+    def solve(
+        self, on_lights: Float[Tensor, "view parameter"], on_albedo: Float[Tensor, " sample"]
+    ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+        """Solve for both."""
+        rhs = on_lights.flatten() - self.cross.mT @ (self.inverse * on_albedo)
+        step = torch.linalg.lu_solve(*self.factor, rhs[:, None])[:, 0]
+        return step.reshape(on_lights.shape), self.inverse * (on_albedo - self.cross @ step)
+
+
+def _normal_equations(
+    shading: Float[Tensor, "sample view"],
+    slopes: Float[Tensor, "sample view parameter"],
+    weight: Float[Tensor, "sample view"],
+    damping: float,
+) -> _Normal:
+    """Set up Gauss-Newton's equations; see :func:`_step`."""
     _, num_views, size = slopes.shape
     heavy = weight[..., None] * slopes
     blocks = heavy.permute(1, 2, 0) @ slopes.transpose(0, 1)
@@ -313,14 +471,17 @@ def _step(
     spread_out = damped.new_zeros(num_views, size, num_views, size)
     spread_out[view, :, view, :] = damped
     schur = spread_out.reshape(size * num_views, -1) - cross.mT @ (inverse[:, None] * cross)
-    on_lights = (heavy * residual[..., None]).sum(dim=0).flatten()
-    on_albedo = (weight * residual * shading).sum(dim=1)
-    rhs = on_lights - cross.mT @ (inverse * on_albedo)
     ridge = 1e-12 * torch.diag(schur.diagonal().abs())
-    step = torch.linalg.solve(schur + ridge, rhs)
-    return step.reshape(num_views, size), inverse * (on_albedo - cross @ step)
+    return _Normal(cross=cross, inverse=inverse, factor=torch.linalg.lu_factor(schur + ridge))
 
 
-def _typical(length: Float[Tensor, " view"]) -> Float[Tensor, ""]:
-    shining = length[length > 0]
-    return shining.median() if len(shining) else length.new_ones(())
+def _extent(places: Float[Tensor, "sample 3"]) -> Float[Tensor, ""]:
+    """Give the mean distance of places from their middle, 1 if all are one."""
+    apart = places[(places != 0).any(dim=1)]
+    return apart.norm(dim=1).sum() / len(places) if len(apart) else places.new_ones(())
+
+
+def _typical(square: Float[Tensor, " view"]) -> Float[Tensor, ""]:
+    """Give the median length of lights, from the squares of those that shine."""
+    shining = square[square > 0]
+    return shining.sqrt().median() if len(shining) else square.new_ones(())

@@ -28,6 +28,8 @@ def light_of_mesh(
         coarse: Normals of what the templates carry, bucket by bucket, patch frame.
         min_views: Views a sample must be valid in.
         model: See :func:`~pimper_torch.photometry.lights.fit_light_field`.
+
+    Differentiable in radiance, normals and templates; which samples are taken is constant.
     """
     chosen = [
         (templates.barycentric >= 0).all(dim=-1) & (registered.valid.sum(dim=1) >= min_views)
@@ -39,13 +41,13 @@ def light_of_mesh(
         seen.patches.buckets, seen.buckets, coarse, chosen, strict=True
     ):
         patch, row, column = (part[::stride] for part in these.nonzero(as_tuple=True))
-        gray = registered.radiance[patch, :, :, row, column].detach().mean(dim=2)
+        gray = registered.radiance[patch, :, :, row, column].mean(dim=2)
         finite = gray.isfinite()
         radiance.append(torch.where(finite, gray, 0))
         visible.append(registered.valid[patch, :, row, column] & finite)
         to_world = templates.patch_from_world[patch, :3, :3].to(blend)
         normals.append((blend[patch, row, column, None] @ to_world)[:, 0])
-        places = templates.points_patch[patch, row, column, None].detach()
+        places = templates.points_patch[patch, row, column, None]
         points.append(transform(invert_rigid(templates.patch_from_world[patch]), places)[:, 0])
     return fit_light_field(
         torch.cat(radiance),
