@@ -34,7 +34,7 @@ from pimper_torch.photometry.quadratics import (
     dot,
     outer,
 )
-from pimper_torch.photometry.robust import Loss, Squares, spread
+from pimper_torch.photometry.robust import Loss, Squares, smooth_spread
 from pimper_torch.records import Convergence, Record, StopCause
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
@@ -81,6 +81,21 @@ class Bilinear(Record):
     manifold: Manifold = Cone()  # noqa: RUF009 - frozen
     loss: Loss = Squares()  # noqa: RUF009 - frozen
     stride: int = 1
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether the solution is to carry gradients."""
+        data = (self.radiance, self.anchor, self.pull, self.prior)
+        return any(part is not None and part.requires_grad for part in data)
+
+    def detached(self) -> "Bilinear":
+        """Give the same problem to a solver, without gradients."""
+        tensors = {
+            field.name: value.detach()
+            for field in dataclasses.fields(self)
+            if isinstance(value := getattr(self, field.name), Tensor)
+        }
+        return self.replace(**tensors)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -272,17 +287,26 @@ def finish(
     cause: Int[Tensor, " patch"],
 ) -> Factors:
     """Put the solution in its record."""
-    residual = problem.radiance - lights @ shading
-    count = problem.weight.sum(dim=(1, 2))
-    total = (problem.weight * residual**2).sum(dim=(1, 2))
-    rms = (total / torch.where(count > 0, count, 1)).sqrt()
+    some = problem.weight.sum(dim=(1, 2)) > 0
     empty = torch.full_like(cause, int(StopCause.EMPTY))
     convergence = Convergence(
         iterations=iterations,
-        residual=rms.detach(),
-        cause=torch.where(count > 0, cause, empty),
+        residual=root_mean_square(problem, lights, shading),
+        cause=torch.where(some, cause, empty),
     )
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
+
+
+def root_mean_square(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+) -> Float[Tensor, " patch"]:
+    """Give the root mean square residual over what was observed; 0 where nothing was."""
+    residual = problem.radiance - lights @ shading
+    count = problem.weight.sum(dim=(1, 2))
+    mean = (problem.weight * residual**2).sum(dim=(1, 2)) / torch.where(count > 0, count, 1)
+    return torch.where(mean > 0, torch.where(mean > 0, mean, 1).sqrt(), 0)
 
 
 def deviation_of(
@@ -293,4 +317,4 @@ def deviation_of(
     seen = problem.weight[:, :, :: problem.stride].flatten(1) > 0
     count = problem.weight.sum(dim=(1, 2)).clamp_min(1)
     level = problem.radiance.abs().sum(dim=(1, 2)) / count
-    return spread(some, seen).maximum(SMALLEST_SPREAD * level)
+    return smooth_spread(some, seen).maximum(SMALLEST_SPREAD * level)

@@ -44,24 +44,23 @@ def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
 
     With ``A`` and ``b`` the sample's normal equations and ``B`` the manifold's tangents,
     :math:`\delta = (B^\top A B)^{-1} B^\top (b - A n)`. At a converged solution the step is
-    next to nothing, but its derivative by the radiances is the implicit function's (Gauss-
-    Newton's approximation, lights held): this step is what gradients go through.
+    next to nothing, and so is its derivative if the factors carry gradients by the implicit
+    function (:mod:`~pimper_torch.photometry.implicit`).
 
     The same matrix tells the standard error of the normal, :math:`\sigma^2 = s^2
     (C_{11} + C_{22}) / \rho^2` with ``C`` the inverse of :math:`B^\top A B` for the tangents
     that turn the normal and ``s`` the spread of the residuals, the sample's and the patch's
     pooled. Confidence is :math:`1 / (1 + (\sigma / 8°)^2)`: many views, lights that differ,
-    brightness and small residuals all raise it. Confidence is constant to autograd.
+    brightness and small residuals all raise it. Differentiable in factors and radiance.
     """
     A, b = equations_of_samples(problem, factors.lights, factors.weight)
     slope = b - apply_packed(A, factors.shading)
     moved = step_along(problem.manifold, A, slope, factors.shading)
     albedo, normals = problem.manifold.split(moved.mT)
-    with torch.no_grad():
-        curvature = curvature_along(problem.manifold.tangents(factors.shading), A)
-        error = _standard_error(problem, factors, curvature)
-        half = math.radians(HALF_CONFIDENCE_DEG)
-        confidence = 1 / (1 + (error / half) ** 2)
+    curvature = curvature_along(problem.manifold.tangents(factors.shading), A)
+    error = _standard_error(problem, factors, curvature)
+    half = math.radians(HALF_CONFIDENCE_DEG)
+    confidence = 1 / (1 + (error / half) ** 2)
     return Certain(albedo=albedo, normals=normals, confidence=confidence.nan_to_num(nan=0.0))
 
 
@@ -126,6 +125,7 @@ def _standard_error(
         unit[:, place] = 1
         variance = variance + solve_packed(curvature, unit)[:, place]
     albedo, _ = problem.manifold.split(factors.shading.mT)
-    some = albedo > 0
-    error = (spread * variance).clamp_min(0).sqrt() / torch.where(some, albedo, 1)
-    return torch.where(some & (variance > 0), error, torch.inf)
+    some = (albedo > 0) & (spread * variance > 0)
+    error = torch.where(some, spread * variance, 1).sqrt() / torch.where(some, albedo, 1)
+    exact = (albedo > 0) & (variance > 0) & (spread == 0)
+    return torch.where(some, error, torch.where(exact, 0, torch.inf))

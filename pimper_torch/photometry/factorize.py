@@ -71,6 +71,10 @@ LOSSES: dict[str, Callable[[float], Loss]] = {
     "cauchy": Cauchy,
 }
 
+# Iterations at most, and tolerance, where gradients are asked for: from there Newton's method took
+# all of 60 patches of a sphere to rounding; from the default tolerance, 37 of them.
+AT_REST = 300, 1e-9
+
 # A surface is right to so many samples, where it casts shadows.
 SHADOW_SAMPLES = 2.0
 
@@ -191,9 +195,11 @@ class Factorize(nn.Module):
     that sees nothing of a patch has the light zero there. NaN and infinity in the radiance
     count as missing.
 
-    Differentiable in the radiance: lights by the implicit function at the optimum (see
-    :mod:`~pimper_torch.photometry.implicit`), then every sample by its exact last step and its
-    albedo. The light field, robust weights of the last step and the gauge are held constant.
+    Differentiable in the radiance and in templates and normals that it starts from: light field,
+    lights and samples by the implicit function at the optimum (see
+    :mod:`~pimper_torch.photometry.implicit`), which Newton's method takes them to where gradients
+    are asked for. Which samples count is constant, and so is the start from the data's own
+    factors, to which lights hold that nothing else does (``start="svd"`` without ``light_pull``).
     """
 
     def __init__(self, config: FactorizeConfig | None = None) -> None:
@@ -249,8 +255,8 @@ class Factorize(nn.Module):
                 places.reshape(raster),
                 rotate(world_from_patch, own.flatten(1, 2)).reshape(raster),
                 templates.spacing,
-                tolerance=SHADOW_SAMPLES * templates.spacing,
-                guard=SHADOW_SAMPLES * float(templates.spacing[0]),
+                tolerance=SHADOW_SAMPLES * templates.spacing.detach(),
+                guard=SHADOW_SAMPLES * float(templates.spacing[0].detach()),
                 asked=templates.inside,
             )
             reached = (shadows.lit & shadows.sure).movedim(-1, 1)
@@ -281,7 +287,7 @@ class Factorize(nn.Module):
         self, chunk: _Chunk, posed: _Posed, problem: Bilinear, factors: Factors
     ) -> Photometry:
         rows, normals = posed.rows, chunk.normals
-        if problem.radiance.requires_grad:
+        if torch.is_grad_enabled() and posed.problem.requires_grad:
             factors = differentiable(problem, factors)
         found = refine_on_manifold(problem, factors)
         sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
@@ -319,27 +325,27 @@ class Factorize(nn.Module):
     ) -> Bilinear:
         config = self.config
         gray = rows.radiance.mean(dim=2)
-        with torch.no_grad():
-            weight = rows.seen.to(gray.dtype)
-            manifold = MANIFOLDS[config.rank]
-            basis = manifold.join(torch.ones_like(rows.normals[..., 0]), rows.normals).mT
-            shading = start_from_mesh(gray, rows.seen, anchor, basis)
-            lights = anchor
-            if config.start == "svd":
+        weight = rows.seen.to(gray.dtype)
+        manifold = MANIFOLDS[config.rank]
+        basis = manifold.join(torch.ones_like(rows.normals[..., 0]), rows.normals).mT
+        shading = start_from_mesh(gray, rows.seen, anchor, basis)
+        lights = anchor
+        if config.start == "svd":
+            with torch.no_grad():
                 lights, shading = start_from_data(gray, rows.seen, anchor, shading)
-            if config.light_pull == 0:
-                anchor = lights
-            square = manifold.split(shading.mT)[0] ** 2
-            count = (square > 0).sum(dim=1).clamp_min(1)
-            seen_square = (weight @ square[..., None])[..., 0]
-            borrowed = BORROWED_SAMPLES * square.sum(dim=1) / count
-            pull = max(config.light_pull, LEAST_PULL) * (seen_square + borrowed[:, None])
-            views = rows.seen.any(dim=2).sum(dim=1).clamp_min(1)
-            level = (anchor**2).sum(dim=(1, 2)) / views
-            prior = None
-            if config.geometry_weight > 0:
-                gamma = config.geometry_weight * level
-                prior = gamma[:, None, None] * manifold.bend(rows.normals.mT)
+        if config.light_pull == 0:
+            anchor = lights
+        square = manifold.split(shading.mT)[0] ** 2
+        count = (square > 0).sum(dim=1).clamp_min(1)
+        seen_square = (weight @ square[..., None])[..., 0]
+        borrowed = BORROWED_SAMPLES * square.sum(dim=1) / count
+        pull = max(config.light_pull, LEAST_PULL) * (seen_square + borrowed[:, None])
+        views = rows.seen.any(dim=2).sum(dim=1).clamp_min(1)
+        level = (anchor**2).sum(dim=(1, 2)) / views
+        prior = None
+        if config.geometry_weight > 0:
+            gamma = config.geometry_weight * level
+            prior = gamma[:, None, None] * manifold.bend(rows.normals.mT)
         return Bilinear(
             radiance=gray,
             weight=weight,
@@ -355,8 +361,10 @@ class Factorize(nn.Module):
 
     def _solve(self, posed: _Posed) -> tuple[Bilinear, Factors]:
         problem, config = posed.problem, self.config
-        data = problem.replace(radiance=problem.radiance.detach())
+        data = problem.detached()
         solve, limits = SOLVERS[config.solver], (config.max_iterations, config.tolerance)
+        if torch.is_grad_enabled() and problem.requires_grad:
+            limits = max(limits[0], AT_REST[0]), min(limits[1], AT_REST[1])
         if not config.colour:
             return problem, solve(data, *limits)
         radiance = posed.rows.radiance
@@ -418,12 +426,11 @@ def _joined(chunks: list[Photometry]) -> Photometry:
 
 def _in_gauge(buckets: list[Photometry]) -> tuple[Photometry, ...]:
     """Set the 99th percentile of gray albedo to 1."""
-    with torch.no_grad():
-        gray = torch.cat([bucket.albedo.mean(dim=-1)[bucket.valid] for bucket in buckets])
-        if len(gray) == 0:
-            return tuple(buckets)
-        bright = gray.kthvalue(max(1, math.ceil(0.99 * len(gray)))).values
-        factor = torch.where(bright > 0, bright, 1)
+    gray = torch.cat([bucket.albedo.mean(dim=-1)[bucket.valid] for bucket in buckets])
+    if len(gray) == 0:
+        return tuple(buckets)
+    bright = gray.kthvalue(max(1, math.ceil(0.99 * len(gray)))).values
+    factor = torch.where(bright > 0, bright, 1)
     return tuple(
         bucket.replace(albedo=bucket.albedo / factor, lights_patch=bucket.lights_patch * factor)
         for bucket in buckets

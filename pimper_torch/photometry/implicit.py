@@ -6,8 +6,8 @@ A solver's answer satisfies :math:`\nabla E(x; \theta) = 0`, so that with the He
 
 whatever way the solver took. One Newton step with ``H`` held constant has just this derivative,
 and next to no length. ``H`` is exact: the curvature of the manifold, of the loss and of the
-product of lights and shading are in it. Samples are eliminated, as in
-:mod:`~pimper_torch.photometry.variable_projection`.
+product of lights and shading, and what robust weights owe to the spread of the residuals, are in
+it. Samples are eliminated, as in :mod:`~pimper_torch.photometry.variable_projection`.
 """
 
 from dataclasses import dataclass
@@ -21,6 +21,8 @@ from pimper_torch.photometry.bilinear import (
     Factors,
     curvature_of_views,
     deviation_of,
+    reweigh,
+    root_mean_square,
 )
 from pimper_torch.photometry.quadratics import (
     apply_packed,
@@ -29,11 +31,16 @@ from pimper_torch.photometry.quadratics import (
     outer,
     unpacked,
 )
+from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record
 
 # Directions that nothing determines, such as Lorentz transformations of free lights, are held by
 # this share of the mean curvature: the answer moves along none of them.
 _RIDGE = 1e-10
+
+# Newton's method doubles the digits of a solution at every step, once it is near; before that its
+# steps are halved until they help, down to this share.
+_NEWTON_STEPS, _LEAST_STEP = 30, 1e-3
 
 # Entries of the mixed part of the Hessian that are held at once.
 _CHUNK_ENTRIES = 10_000_000
@@ -42,22 +49,49 @@ _CHUNK_ENTRIES = 10_000_000
 def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     r"""Let gradients flow from a solution to the data it was found from.
 
+    Solvers stop when steps become small; Newton's method first takes the solution to rounding, as
+    the implicit function holds at the optimum alone. A patch that its steps do not bring nearer
+    stays where it is.
+
     Args:
-        problem: What was solved. Gradients reach ``radiance``, ``weight``, ``anchor``, ``pull``
-            and ``prior``.
+        problem: What was solved. Gradients reach ``radiance``, ``anchor``, ``pull`` and ``prior``.
         factors: Its solution, near enough to a minimum that the Hessian is positive.
 
     Returns:
-        The same values, with gradients. Of a robust loss the deviation of the residuals is
-        constant, the weights are not. In float64.
+        Lights, shading, weights and residuals at the optimum, with gradients, those of the robust
+        weights and of the deviation they rest on included.
 
-    Checked by ``gradcheck`` against the solvers themselves in ``test_implicit.py``.
+    Checked against the solvers themselves in ``test_implicit.py``. The Hessian is in float64.
     """
-    system = eliminated(problem, factors)
-    size = system.slope.shape[1] * system.slope.shape[2]
-    flat = system.slope.reshape(-1, size, 1)
-    step = torch.linalg.solve(system.hessian.schur, flat).reshape(system.slope.shape)
-    return answered(factors, system, step)
+    factors = _polished(problem, factors)
+    L, N = factors.lights.detach().double(), factors.shading.detach().double()
+    hessian = _hessian(problem, L, N)
+    step = _newton_step(problem, hessian)
+    moved = combination(hessian.columns, step.turn)
+    lights = factors.lights.detach() + (step.lights - step.lights.detach()).to(factors.lights)
+    shading = factors.shading.detach() + (moved - moved.detach()).to(factors.shading)
+    convergence = factors.convergence
+    return factors.replace(
+        lights=lights,
+        shading=shading,
+        weight=reweigh(problem, lights, shading),
+        convergence=convergence.replace(residual=root_mean_square(problem, lights, shading)),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Step(Record):
+    """A change of all unknowns: of the lights, and of the samples along their tangents."""
+
+    lights: Float[Tensor, "patch view rank"]
+    turn: Float[Tensor, "patch tangent sample"]
+
+    def moved(self, factor: Float[Tensor, " patch"], other: "Step") -> "Step":
+        """Add so many times another step."""
+        return Step(
+            lights=self.lights + factor[:, None, None] * other.lights,
+            turn=self.turn + factor[:, None, None] * other.turn,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -83,41 +117,102 @@ class Hessian(Record):
     schur: Float[Tensor, "patch unknown unknown"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Eliminated(Record):
-    """The Newton step at a solution, as equations for the lights alone.
-
-    Attributes:
-        hessian: Constant; its ``schur`` times the step of the lights is the slope.
-        slope: What the data say to the lights; zero at the optimum, but not its derivative.
-        inner: What they say to the samples, lights held.
-    """
-
-    hessian: Hessian
-    slope: Float[Tensor, "patch view rank"]
-    inner: Float[Tensor, "patch tangent sample"]
-
-
-def eliminated(problem: Bilinear, factors: Factors) -> Eliminated:
-    """Set the equations up; differentiable in the data, with the Hessian held constant."""
-    L, N = factors.lights.detach().double(), factors.shading.detach().double()
-    hessian = _hessian(problem, L, N)
-    on_lights, on_samples = _slopes(problem, hessian, L, N)
-    inner = _apply(hessian.inverse, on_samples)
-    return Eliminated(hessian=hessian, slope=on_lights - _mix(hessian, inner), inner=inner)
-
-
-def answered(
-    factors: Factors, system: Eliminated, step: Float[Tensor, "patch view rank"]
-) -> Factors:
-    """Give the solution the derivatives of a step of the lights, and of the samples after it."""
-    hessian = system.hessian
-    turn = system.inner - _apply(hessian.inverse, _mix_back(hessian, step))
-    moved = combination(hessian.columns, turn)
+@torch.no_grad()
+def _polished(problem: Bilinear, factors: Factors) -> Factors:
+    """Take Newton steps, patch by patch, as long as they bring the slopes nearer to zero."""
+    hessian = _hessian(problem, factors.lights.double(), factors.shading.double())
+    size = _slope_size(problem, hessian)
+    share = torch.ones_like(size)
+    for _ in range(_NEWTON_STEPS):
+        step = _newton_step(problem, hessian)
+        L = hessian.lights + share[:, None, None] * step.lights
+        turn = combination(hessian.columns, share[:, None, None] * step.turn)
+        N = problem.manifold.retract((hessian.shading + turn).mT).mT
+        there = _hessian(problem, L, N)
+        after = _slope_size(problem, there)
+        better = after < size
+        share = torch.where(better, (2 * share).clamp_max(1), share / 2)
+        if bool(better.any()):
+            keep = better[:, None, None]
+            L, N = torch.where(keep, L, hessian.lights), torch.where(keep, N, hessian.shading)
+            size = torch.where(better, after, size)
+            hessian = _hessian(problem, L, N)
+        elif bool((share < _LEAST_STEP).all()):
+            break
     return factors.replace(
-        lights=factors.lights.detach() + (step - step.detach()).to(factors.lights),
-        shading=factors.shading.detach() + (moved - moved.detach()).to(factors.shading),
+        lights=hessian.lights.to(factors.lights), shading=hessian.shading.to(factors.shading)
     )
+
+
+def _slope_size(problem: Bilinear, hessian: Hessian) -> Float[Tensor, " patch"]:
+    on_lights, on_samples = _slopes(problem, hessian)
+    return on_lights.square().sum(dim=(1, 2)) + on_samples.square().sum(dim=(1, 2))
+
+
+def _newton_step(problem: Bilinear, hessian: Hessian) -> Step:
+    r"""Give the step to where the slopes vanish; differentiable in the data, the Hessian held.
+
+    The deviation :math:`d` that robust weights rest on follows the residuals, which adds one
+    product to the Hessian: of the slopes' change with :math:`d`, and of the change of :math:`d`
+    with the unknowns. Its inverse is that of Sherman and Morrison.
+    """
+    step = _solved(hessian, *_slopes(problem, hessian))
+    if isinstance(problem.loss, Squares):
+        return step
+    with torch.no_grad():
+        told, slopes = _by_deviation(problem, hessian)
+        aside = _solved(hessian, *slopes)
+        left = 1 - _change_of(told, hessian, aside)
+    return step.moved(_change_of(told, hessian, step) / left, aside)
+
+
+def _solved(
+    hessian: Hessian,
+    on_lights: Float[Tensor, "patch view rank"],
+    on_samples: Float[Tensor, "patch tangent sample"],
+) -> Step:
+    """Apply the Hessian's inverse, samples eliminated."""
+    inner = _apply(hessian.inverse, on_samples)
+    slope = on_lights - _mix(hessian, inner)
+    flat = slope.reshape(len(slope), -1, 1)
+    lights = torch.linalg.solve(hessian.schur, flat).reshape(slope.shape)
+    return Step(lights=lights, turn=inner - _apply(hessian.inverse, _mix_back(hessian, lights)))
+
+
+def _by_deviation(
+    problem: Bilinear, hessian: Hessian
+) -> tuple[
+    Float[Tensor, "patch view sample"],
+    tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]],
+]:
+    """Give the deviation's derivatives by the residuals, and the slopes' by the deviation."""
+    residual = problem.radiance.double() - hessian.lights @ hessian.shading
+    with torch.enable_grad():
+        at = residual.detach().requires_grad_()
+        deviation = deviation_of(problem, at)
+        told = torch.zeros_like(at)
+        if deviation.requires_grad:
+            (told,) = torch.autograd.grad(deviation.sum(), at)
+    deviation = deviation.detach()[:, None, None]
+    change = torch.func.jvp(
+        lambda spread: problem.loss.weights(residual, spread),
+        (deviation,),
+        (torch.ones_like(deviation),),
+    )[1]
+    pulled = problem.weight.double() * change * residual
+    return told, (
+        pulled @ hessian.shading.mT,
+        coordinates(hessian.columns, hessian.lights.mT @ pulled),
+    )
+
+
+def _change_of(
+    told: Float[Tensor, "patch view sample"], hessian: Hessian, step: Step
+) -> Float[Tensor, " patch"]:
+    """Give how much a step changes the deviation."""
+    shown = step.lights @ hessian.shading
+    shown = shown + hessian.lights @ combination(hessian.columns, step.turn)
+    return -(told * shown).sum(dim=(1, 2))
 
 
 @torch.no_grad()
@@ -180,14 +275,12 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
 
 
 def _slopes(
-    problem: Bilinear,
-    hessian: Hessian,
-    L: Float[Tensor, "patch view rank"],
-    N: Float[Tensor, "patch rank sample"],
+    problem: Bilinear, hessian: Hessian
 ) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]]:
     """Give minus half the gradient, as a function of the data."""
+    L, N = hessian.lights, hessian.shading
     residual = problem.radiance.double() - L @ N
-    deviation = deviation_of(problem, residual).detach()[:, None, None]
+    deviation = deviation_of(problem, residual)[:, None, None]
     pulled = problem.weight.double() * problem.loss.weights(residual, deviation) * residual
     apart = L - problem.anchor.double()
     on_lights = pulled @ N.mT - problem.pull.double()[..., None] * apart
