@@ -71,7 +71,7 @@ class AdaptConfig:
 
 
 class Adapt(nn.Module):
-    """Fit the coarse mesh to a surface; a constant to autograd. See :func:`adapt`."""
+    """Fit the coarse mesh to a surface. See :func:`adapt`."""
 
     def __init__(self, config: AdaptConfig | None = None) -> None:
         super().__init__()
@@ -95,11 +95,10 @@ class Adapt(nn.Module):
             residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
             views = (found.lights_patch != 0).any(dim=2).sum(dim=1)
             seen = seen.index_copy(0, templates.facet, views >= _SEEING)
-        spacing = float(patches.buckets[0].spacing[0])
+        spacing = float(patches.buckets[0].spacing[0].detach())
         return adapt(patches.coarse, surface, spacing, self.config, residual=residual, seen=seen)
 
 
-@torch.no_grad()
 def adapt(
     coarse: CoarseMesh,
     surface: Surface,
@@ -135,7 +134,8 @@ def adapt(
     Raises:
         InputError: The surface is not this mesh's lattice.
 
-    A surface without confidence anywhere drops no facet. Not differentiable.
+    A surface without confidence anywhere drops no facet. Vertices and normals are differentiable in
+    the surface's and the old mesh's; which facets are split, dropped or moved is constant.
     """
     config = config or AdaptConfig()
     _require_lattice(coarse, surface)
@@ -143,12 +143,13 @@ def adapt(
     faces = coarse.mesh.faces
     edges, face_edge = face_edges(faces)
     corners, middles = _on_surface(old, faces, edges, face_edge, surface)
-    kept = _with_data(old, faces, surface, seen, config.max_hole)
-    severity = _severity(corners, faces, surface, spacing, residual, config)
-    side = _side(corners, faces) / spacing
-    small = (side < config.min_samples) | ~kept
-    marked = _worst_first(old, faces, severity, small, kept, config.max_facets)
-    split = split_edges(old, faces, marked)
+    with torch.no_grad():
+        kept = _with_data(old, faces, surface, seen, config.max_hole)
+        severity = _severity(corners, faces, surface, spacing, residual, config)
+        side = _side(corners, faces) / spacing
+        small = (side < config.min_samples) | ~kept
+        marked = _worst_first(old, faces, severity, small, kept, config.max_facets)
+        split = split_edges(old, faces, marked)
     flat = torch.cat([old, old[edges[split.halved]].mean(dim=1)])
     onto = torch.cat([corners, middles[split.halved]])
     split_kept = kept[split.parent]

@@ -1,7 +1,8 @@
 """Which points a camera sees: ray casting on triangle meshes.
 
 The one place that talks to embree. It runs on the CPU in float32 whatever the device of the
-tensors, and its answers are constants to autograd.
+tensors, and which face a ray meets is a constant to autograd; where it meets that face is not, see
+:meth:`Hits.refined`.
 """
 
 from dataclasses import dataclass
@@ -39,6 +40,42 @@ class Hits(Record):
         corners = per_vertex[faces[self.face.clamp_min(0)]]
         blended = (self.barycentric[..., None] * corners).sum(dim=-2)
         return torch.where((self.face >= 0)[..., None], blended, 0)
+
+    def refined(
+        self,
+        vertices: Float[Tensor, "vertex 3"],
+        faces: Int[Tensor, "face 3"],
+        origins: Float[Tensor, "*#batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+    ) -> "Hits":
+        """Meet the planes of the same faces again, in the dtype of the rays and with gradients.
+
+        Args:
+            vertices: Of the mesh that was hit.
+            faces: Of it.
+            origins: Of the rays.
+            directions: Of the rays.
+
+        Differentiable in vertices, origins and directions. A ray that lies in the plane of its
+        face keeps what ray casting gave.
+        """
+        hit = self.face >= 0
+        a, b, c = vertices[faces[self.face.clamp_min(0)]].unbind(dim=-2)
+        one, other = b - a, c - a
+        normal = torch.linalg.cross(one, other)
+        rate = (directions * normal).sum(dim=-1)
+        sound = hit & (rate != 0)
+        distance = ((a - origins) * normal).sum(dim=-1) / torch.where(sound, rate, 1)
+        along = origins + distance[..., None] * directions - a
+        area = torch.where(sound, normal.square().sum(dim=-1), 1)
+        v = (torch.linalg.cross(along, other) * normal).sum(dim=-1) / area
+        w = (torch.linalg.cross(one, along) * normal).sum(dim=-1) / area
+        return self.replace(
+            distance=torch.where(sound, distance, self.distance),
+            barycentric=torch.where(
+                sound[..., None], torch.stack([1 - v - w, v, w], dim=-1), self.barycentric
+            ),
+        )
 
 
 class RayCaster:

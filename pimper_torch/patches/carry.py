@@ -24,7 +24,8 @@ def carry(patches: PatchSet, surface: Mesh) -> PatchSet:
     along the facet's normal, nearest to the facet's plane. Samples without one, or whose place
     is further off than half the template's extent, are no longer ``inside``.
 
-    Differentiable in the surface's vertices and normals; which face a line meets is constant.
+    Differentiable in the surface's vertices and normals and in the templates' frames; which face
+    a line meets is constant.
     """
     normals = surface.normals_world
     if normals is None:
@@ -64,9 +65,9 @@ def coarse_normals(
 def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Make unit, and bring what faces away to just before the rim."""
     unit = normalize(normals, dim=-1)
-    facing = unit[..., 2:].clamp_max(-LEAST_FACING)
-    aside = (1 - facing**2).clamp_min(0).sqrt() * normalize(unit[..., :2], dim=-1)
-    return torch.where(unit[..., 2:] > -LEAST_FACING, torch.cat([aside, facing], dim=-1), unit)
+    aside = (1 - LEAST_FACING**2) ** 0.5 * normalize(unit[..., :2], dim=-1)
+    turned = torch.cat([aside, torch.full_like(unit[..., 2:], -LEAST_FACING)], dim=-1)
+    return torch.where(unit[..., 2:] > -LEAST_FACING, turned, unit)
 
 
 def _carrying(
@@ -81,6 +82,7 @@ def _carrying(
     places = transform(world_from_patch, flat.reshape(num, -1, 3))
     inward = world_from_patch[:, None, :3, 2].expand_as(places)
     hits, met = _nearest(caster, places, inward, surface)
+    hits = hits.refined(surface.vertices_world, surface.faces, places, inward)
     found = hits.interpolate(surface.vertices_world, surface.faces)
     depth = transform(templates.patch_from_world, found)[..., 2]
     turned = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))

@@ -98,7 +98,9 @@ def test_the_nearer_of_two_sheets_is_carried(flat):
         assert_close(one.depth[one.inside], other.depth[one.inside])
 
 
-@pytest.mark.parametrize("axes", [[0.0, 0.0, 1.0]], ids=["up"])
+@pytest.mark.parametrize(
+    "axes", [[0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]], ids=["up", "sideways", "anyhow"]
+)
 def test_depth_has_the_slope_of_its_differences_as_vertices_move(flat, axes):
     whole = surface(30)
     generator = torch.Generator().manual_seed(101)
