@@ -160,7 +160,7 @@ def _(photometric: PhotometricPatches) -> dict[str, int | float]:
         "determined_patches": sum(int(bucket.determined.sum()) for _, bucket in pairs),
         "converged_patches": sum(int(end.converged.sum()) for end in ended),
         "mean_iterations": sum(float(end.iterations.sum()) for end in ended) / count,
-        "mean_residual": sum(float(end.residual.sum()) for end in ended) / count,
+        "mean_residual": sum(float(end.residual.detach().sum()) for end in ended) / count,
     }
 
 

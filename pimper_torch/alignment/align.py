@@ -326,7 +326,7 @@ class Align(nn.Module):
         points = pulls.points
         if points is not None:
             missed = (points.samples * transforms[points.facet]).sum(dim=-1) - points.heights
-            held = (1 + (missed / (config.outlier * points.spread)).square()) ** -2
+            held = (1 + (missed / config.outlier / points.spread).square()) ** -2
             points = points.replace(weight=points.weight * held)
         return pulls.replace(weight=pulls.weight * trust, points=points)
 

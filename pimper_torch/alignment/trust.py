@@ -35,7 +35,8 @@ def trust_by_distance(
         outlier: A sample this many times the median apart keeps a quarter of its weight
             (Geman and McClure's function).
     """
-    return (1 + (distance / (outlier * common_distance(distance, met))).square()) ** -2
+    # An infinite limit comes first: its product with a distance would have no derivative.
+    return (1 + (distance / outlier / common_distance(distance, met)).square()) ** -2
 
 
 def overlapping_seams(met: Bool[Tensor, "seam ray"]) -> Bool[Tensor, " seam"]:

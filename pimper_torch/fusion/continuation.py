@@ -37,7 +37,7 @@ def continued(
         otherwise: What the others are taken for, far from what is known.
         hold: How many neighbours that counts as, above 0.
 
-    Differentiable in the values that are known, and in the others' ``otherwise``.
+    Differentiable in the values that are known, and in the others' ``otherwise`` and ``hold``.
 
     >>> chain = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4]])
     >>> known = torch.tensor([True, True, False, True, True])
@@ -75,18 +75,18 @@ def about_mean(
     """Continue values from where they are known; far from there, they are the mean of these.
 
     Both variances are those of the known values. If none is known, ``values`` are returned.
+    Differentiable in the known values.
     """
     if not bool(known.any()):
         return values
     given = values[known]
     mean = given.mean(dim=0)
-    spread = float((given - mean).detach().double().square().sum(dim=1).mean())
-    one, other = values.detach().double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
-    step = float((one - other).square().sum(dim=1).mean()) if len(one) else 0.0
-    hold = max(step / spread if spread > 0 else 0.0, _LEAST_HOLD)
-    return continued(
-        values, known, edges, mean.expand_as(values), torch.full_like(values[:, 0], hold)
-    )
+    spread = (given - mean).double().square().sum(dim=1).mean()
+    one, other = values.double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
+    step = (one - other).square().sum() / max(len(one), 1)
+    hold = torch.where(spread > 0, step / torch.where(spread > 0, spread, 1), 0)
+    hold = hold.clamp_min(_LEAST_HOLD).expand(len(values))
+    return continued(values, known, edges, mean.expand_as(values), hold)
 
 
 def enclosed(

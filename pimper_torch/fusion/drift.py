@@ -15,10 +15,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.fusion.estimate import MEDIAN_SQUARE
 from pimper_torch.fusion.evidence import Common, Evidence
 from pimper_torch.geometry.lattice import Lattice
 from pimper_torch.records import Record
+
+# Of the square of unit Gaussian noise.
+_MEDIAN_SQUARE = 0.4549
 
 # Of the squared length of a vector of two numbers of unit Gaussian noise.
 MEDIAN_OF_TILT = 2 * math.log(2)
@@ -71,9 +73,9 @@ def drift(
         shape: Of the surface, unit.
         known: Where there are photometric ones.
 
-    Large differences, as across a cliff, are cut to a quarter of a radian.
+    Large differences, as across a cliff, are cut to a quarter of a radian. Differentiable.
     """
-    apart = torch.where(known[:, None], shape - normals, 0).detach()
+    apart = torch.where(known[:, None], shape - normals, 0)
     size = apart.norm(dim=-1, keepdim=True)
     apart = apart * (0.25 / size.clamp_min(0.25))
     held = known.to(apart)
@@ -95,15 +97,17 @@ def common_height(
         heights: Of the surface. The less part they had in it, the better it judges them.
         facet: Of each vertex.
         held: Facets where that surface is known otherwise; elsewhere it cannot judge.
+
+    Differentiable.
     """
     vertex = found.unknowns[:, 0]
     size = int(facet.max()) + 1
-    off = found.residual(heights).detach()
+    off = found.residual(heights)
     weight = found.information.to(off)
     total = off.new_zeros(size).index_add(0, facet[vertex], weight)
     mean = off.new_zeros(size).index_add(0, facet[vertex], weight * off)
     judged = torch.zeros_like(total, dtype=torch.bool).index_fill(0, held, True) & (total > 0)
     square = (mean[judged] / total[judged]).square()
     count = torch.bincount(facet[vertex], minlength=size)[facet].to(off)
-    variance = square.median() / MEDIAN_SQUARE if len(square) > 0 else off.new_zeros(())
+    variance = square.median() / _MEDIAN_SQUARE if len(square) > 0 else off.new_zeros(())
     return Common(variance=variance, count=count)

@@ -19,6 +19,7 @@ from torch import Tensor
 from pimper_torch.fusion.evidence import Evidence
 from pimper_torch.linalg.equations import normal_equations
 from pimper_torch.linalg.systems import solutions
+from pimper_torch.photometry.robust import smooth_variance
 from pimper_torch.records import Record
 
 # Cauchy's weights are 95 % efficient on Gaussian noise with this many standard deviations.
@@ -27,9 +28,6 @@ _CAUCHY = 2.385
 # Of the heights, in the energy norm, relative: below what the evidence leaves open. Weights range
 # over many orders, so that with less the residuals of the weakest are still large.
 _ACCURACY = 1e-8
-
-# Of the square of unit Gaussian noise.
-MEDIAN_SQUARE = 0.4549
 
 # No source is more than twice too modest: where one kind is followed blindly its residuals
 # vanish, and would make it surer still.
@@ -66,51 +64,50 @@ def fuse_evidence(
         hold: Information that they keep them by.
         rounds: Of solves.
 
-    Differentiable in targets, coefficients, information and start through the last solve,
-    whose weights and factors are constants.
+    Differentiable in targets, coefficients, information, hold and start, through the weights and
+    the factors too: every solve answers by the implicit function. That takes as many more solves
+    as there were, once gradients are asked for.
 
     Raises:
         SingularSystemError: See :func:`~pimper_torch.linalg.systems.solutions`.
     """
-    factors = [1.0 for _ in kinds]
+    factors = [torch.ones((), dtype=torch.float64).to(start.device) for _ in kinds]
     weights = [torch.ones_like(kind.information).double() for kind in kinds]
     generator = torch.Generator().manual_seed(0)  # of signs: any will do
     probe = 2.0 * torch.randint(0, 2, (len(start),), generator=generator) - 1
     probe = probe.double().to(start.device)
     for _ in range(rounds - 1):
-        with torch.no_grad():
-            entries, rhs = _system(kinds, weights, factors, start, hold)
-            heights, answer = solutions(
-                *entries, rhs, probe, what="the fusion", tolerance=_ACCURACY
-            )
-            for place, kind in enumerate(kinds):
-                if not kind.judged or len(kind.targets) == 0:
-                    continue
-                square = kind.information.double() * kind.residual(heights).square()
-                square = square * kind.correlated
-                weight = weights[place] * kind.information / factors[place]
-                used = (weight * _sum(kind, probe) * _sum(kind, answer)).sum()
-                left = 1 - float(used / weights[place].sum())
-                square = square / max(left, _LEAST_LEFT)
-                factors[place] = noise_factor(square)
-                weights[place] = 1 / (1 + square / (_CAUCHY**2 * factors[place]))
+        entries, rhs = _system(kinds, weights, factors, start, hold)
+        heights, answer = solutions(*entries, rhs, probe, what="the fusion", tolerance=_ACCURACY)
+        for place, kind in enumerate(kinds):
+            if not kind.judged or len(kind.targets) == 0:
+                continue
+            square = kind.information.double() * kind.residual(heights).square()
+            square = square * kind.correlated
+            weight = weights[place] * kind.information / factors[place]
+            used = (weight * _sum(kind, probe) * _sum(kind, answer)).sum()
+            left = 1 - used / weights[place].sum()
+            square = square / left.clamp_min(_LEAST_LEFT)
+            factors[place] = noise_factor(square)
+            weights[place] = 1 / (1 + square / (_CAUCHY**2 * factors[place]))
     entries, rhs = _system(kinds, weights, factors, start, hold)
     (heights,) = solutions(*entries, rhs, what="the fusion", tolerance=_ACCURACY)
-    return Fused(heights=heights, factors=tuple(factors))
+    return Fused(heights=heights, factors=tuple(float(factor.detach()) for factor in factors))
 
 
-def noise_factor(square: Float[Tensor, " equation"]) -> float:
-    """Tell the variance of Gaussian noise from its squares, by their median.
+def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
+    """Tell the variance of Gaussian noise from its squares, outliers apart. Differentiable.
 
     Args:
         square: Of residuals, in units of the variance that is claimed, over the share of the
             equations that the solution leaves over.
 
     >>> noise = torch.randn(10000, generator=torch.Generator().manual_seed(1))
-    >>> abs(noise_factor(4 * noise.double().square()) - 4) < 0.2
+    >>> bool(abs(noise_factor(4 * noise.double().square()) - 4) < 0.2)
     True
     """
-    return max(float(square.median()) / MEDIAN_SQUARE, _LEAST_FACTOR)
+    everything = torch.ones_like(square, dtype=torch.bool)
+    return smooth_variance(square, everything).clamp_min(_LEAST_FACTOR)
 
 
 def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
@@ -120,7 +117,7 @@ def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " eq
 def _system(
     kinds: Sequence[Evidence],
     weights: Sequence[Float[Tensor, " _"]],
-    factors: Sequence[float],
+    factors: Sequence[Float[Tensor, ""]],
     start: Float[Tensor, " vertex"],
     hold: Float[Tensor, " vertex"],
 ) -> tuple[

@@ -127,7 +127,7 @@ def kept_slopes(
     directions: Float[Tensor, "vertex 3"],
     shape: Float[Tensor, "vertex 3"],
     carried: Float[Tensor, " vertex"],
-    variance: float,
+    variance: float | Float[Tensor, ""],
 ) -> Evidence:
     """Say that edges lie as they do on the surface that there is, where light tells nothing.
 
@@ -139,7 +139,7 @@ def kept_slopes(
         carried: Its heights.
         variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
     """
-    found = slopes(edges, flat, directions, shape, torch.full_like(carried, variance))
+    found = slopes(edges, flat, directions, shape, variance * torch.ones_like(carried))
     return found.replace(
         targets=(found.coefficients * carried[edges]).sum(dim=1),
         judged=False,
@@ -150,7 +150,7 @@ def kept_steps(
     edges: Int[Tensor, "edge 2"],
     flat: Float[Tensor, "vertex 3"],
     carried: Float[Tensor, " vertex"],
-    variance: float,
+    variance: float | Float[Tensor, ""],
 ) -> Evidence:
     """Say that heights go on differing as they do, where edges are not upright.
 
@@ -213,7 +213,7 @@ def cloud_points(
     carried: Float[Tensor, " vertex"],
     directions: Float[Tensor, "vertex 3"],
     reach: float,
-    finest: float,
+    finest: float | Float[Tensor, ""],
 ) -> Evidence:
     """Say that points of the cloud lie on the surface.
 
@@ -224,17 +224,20 @@ def cloud_points(
 
     Args:
         points: With covariances.
-        surface: Where the vertices lie now; constant.
+        surface: Where the vertices lie now.
         faces: Of the lattice.
         carried: Heights of the vertices now.
         directions: ``d``, unit.
         reach: Points further off are not of this surface.
         finest: Deviation that the surest point has, of the surface between its vertices.
+
+    Differentiable; which vertex and which face are nearest is constant.
     """
     tree = cKDTree(surface.detach().cpu().numpy())
     _, nearest = tree.query(points.points_world.detach().cpu().numpy())
     line = directions[torch.as_tensor(nearest, device=faces.device)]
-    hits, lift = _above_or_below(RayCaster(surface, faces), points.points_world.to(line), line)
+    hits = _above_or_below(surface, faces, points.points_world.to(line), line)
+    lift = -hits.distance
     met = (hits.face >= 0) & (lift.abs() <= reach)
     corners, share, line = faces[hits.face[met]], hits.barycentric[met], line[met]
     vertex = corners.gather(1, share.argmax(dim=1, keepdim=True))
@@ -251,16 +254,18 @@ def cloud_points(
 
 
 def _above_or_below(
-    caster: RayCaster, places: Float[Tensor, "point 3"], line: Float[Tensor, "point 3"]
-) -> tuple[Hits, Float[Tensor, " point"]]:
-    """Find the nearer of the faces on both sides, and how far above it each place is."""
+    surface: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    places: Float[Tensor, "point 3"],
+    line: Float[Tensor, "point 3"],
+) -> Hits:
+    """Find where the line through each place meets the nearer of the faces on both sides."""
+    caster = RayCaster(surface, faces)
     ahead, behind = caster.cast(places, line), caster.cast(places, -line)
     first = ahead.distance <= behind.distance
-    return (
-        Hits(
-            face=torch.where(first, ahead.face, behind.face),
-            distance=torch.where(first, ahead.distance, behind.distance),
-            barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
-        ),
-        torch.where(first, -ahead.distance, behind.distance),
+    nearer = Hits(
+        face=torch.where(first, ahead.face, behind.face),
+        distance=torch.where(first, ahead.distance, -behind.distance),
+        barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
     )
+    return nearer.refined(surface, faces, places, line)

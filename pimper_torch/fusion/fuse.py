@@ -48,8 +48,9 @@ _REACH = 20.0
 # A turn from vertex to vertex that is larger, in radians, is a fold's.
 _FOLD = 0.25
 
-# Squared turn from vertex to vertex that even flat facets are said to have, radians.
-_LEAST_TURN = 1e-8
+# Squared turn from vertex to vertex that even flat facets are said to have, radians; and the
+# least variance of the slopes that a surface has already.
+_LEAST_TURN, _LEAST_DOUBT = 1e-8, 1e-6
 
 # Between its vertices the surface is flat: points tell no more than this share of a spacing.
 _FINEST = 0.03
@@ -114,7 +115,7 @@ class _Task(Record):
     places: Float[Tensor, "vertex 3"]
     shape: Float[Tensor, "vertex 3"]
     edges: Int[Tensor, "edge 2"]
-    spacing: float
+    spacing: Float[Tensor, ""]
     correlated: float
 
 
@@ -136,9 +137,9 @@ class Fuse(nn.Module):
     (:mod:`~pimper_torch.fusion.bands`).
 
     The surface's normals are its own; its albedo is continued over what no light tells,
-    without confidence. Differentiable in what the templates carry, normals, albedo and swept
-    offsets, through the last solve; its weights, the tilts, the coarse shape's difference, and
-    the confidence are constants.
+    without confidence. Differentiable in templates, normals, albedo, confidence, swept heights
+    and the cloud, through every solve; which patches, samples, edges, vertices and faces take part
+    is constant.
     """
 
     def __init__(self, config: FuseConfig | None = None) -> None:
@@ -158,12 +159,12 @@ class Fuse(nn.Module):
         config, patches = self.config, swept.patches
         facets = patches.coarse.mesh.faces
         spacing = vertex_spacing(patches, config.samples_per_vertex)
-        lattice = subdivide(patches.coarse.mesh.vertices_world.detach(), facets, spacing)
-        directions = ray_directions(lattice, patches.coarse).detach()
+        lattice = subdivide(patches.coarse.mesh.vertices_world, facets, spacing)
+        directions = ray_directions(lattice, patches.coarse)
         union = unite(
             carried_reliefs(swept), lattice, directions, config.outlier_samples, swept.buckets
         )
-        places = (lattice.points + union.heights[:, None] * directions).detach()
+        places = lattice.points + union.heights[:, None] * directions
         task = _Task(
             lattice=lattice,
             facets=facets,
@@ -172,7 +173,7 @@ class Fuse(nn.Module):
             places=places,
             shape=vertex_normals(places, lattice.faces),
             edges=face_edges(lattice.faces)[0],
-            spacing=float(spacing.median()),
+            spacing=spacing.median(),
             correlated=swept.averaged / config.samples_per_vertex**2,
         )
         fused, solves = self._solved(task, self._points(task, swept))
@@ -199,7 +200,7 @@ class Fuse(nn.Module):
         if not self.config.heights:
             return []
         union = task.union
-        facing = (task.shape * task.directions).sum(dim=-1).detach()
+        facing = (task.shape * task.directions).sum(dim=-1)
         told = union.heights, union.offsets, union.information, facing
         return [swept_heights(*told, task.correlated, common)]
 
@@ -215,7 +216,7 @@ class Fuse(nn.Module):
                 task.lattice.faces,
                 task.union.heights,
                 task.directions,
-                _REACH * task.spacing,
+                float(_REACH * task.spacing.detach()),
                 _FINEST * task.spacing,
             )
         ]
@@ -230,7 +231,7 @@ class Fuse(nn.Module):
         lit = known[task.edges].all(dim=1) & upright(task.edges, along, union.normals_world)
         straight = task.edges[lit]
         unlit = self._unlit(task, known, lit)
-        hold = torch.full_like(union.heights, _HOLD / task.spacing**2)
+        hold = (_HOLD / task.spacing**2).expand_as(union.heights)
 
         def solve(
             normals: Float[Tensor, "vertex 3"], positions: list[Evidence], common: Common | None
@@ -244,24 +245,22 @@ class Fuse(nn.Module):
         if config.drift_rounds == 0 or not bool(lit.any()) or not (heights or points):
             return solve(normals, [*points, *heights], None), solves
         shape = task.shape
-        with torch.no_grad():
-            # Heights are judged by the others first, which they would draw along.
-            positions = points or heights
-            for _ in range(config.drift_rounds):
-                apart = drift(task.lattice, task.facets, normals, shape, known)
-                fused = solve(normals, positions, apart.common(task.lattice))
-                moved = fused.heights.to(flat)
-                shape = vertex_normals(flat + moved[:, None] * along, task.lattice.faces)
-                solves += config.noise_rounds
-                if points and heights:
-                    positions = [*points, *self._judged(task, heights, points, fused)]
+        # Heights are judged by the others first, which they would draw along.
+        positions = points or heights
+        for _ in range(config.drift_rounds):
+            apart = drift(task.lattice, task.facets, normals, shape, known)
+            fused = solve(normals, positions, apart.common(task.lattice))
+            moved = fused.heights.to(flat)
+            shape = vertex_normals(flat + moved[:, None] * along, task.lattice.faces)
+            solves += config.noise_rounds
+            if points and heights:
+                positions = [*points, *self._judged(task, heights, points, fused)]
         apart = drift(task.lattice, task.facets, normals, shape, known)
         normals = normalize(normals + apart.at(task.lattice, task.facets), dim=-1)
         fine = solve(normals, positions, None)
-        with torch.no_grad():
-            left = drift(task.lattice, task.facets, normals, shape, known)
-            coarse = solve(normals, positions, left.common(task.lattice))
-            shift = coarse_part(coarse.heights - fine.heights, task.lattice, task.facets)
+        left = drift(task.lattice, task.facets, normals, shape, known)
+        coarse = solve(normals, positions, left.common(task.lattice))
+        shift = coarse_part(coarse.heights - fine.heights, task.lattice, task.facets)
         return fine.replace(heights=fine.heights + shift), solves + config.noise_rounds
 
     def _judged(
@@ -299,12 +298,12 @@ class Fuse(nn.Module):
             kept_steps(edges[stays & ~sloped], flat, carried, doubt),
         ]
 
-    def _doubt(self, task: _Task, known: Bool[Tensor, " vertex"]) -> float:
+    def _doubt(self, task: _Task, known: Bool[Tensor, " vertex"]) -> Float[Tensor, ""]:
         """Estimate the variance of the slopes that the surface has already, from the others."""
         if not bool(known.any()):
-            return math.radians(HALF_CONFIDENCE_DEG) ** 2
-        apart = (task.union.normals_world - task.shape)[known].detach().norm(dim=-1)
-        return max(float(apart.square().median()) / MEDIAN_OF_TILT, 1e-6)
+            return task.shape.new_tensor(math.radians(HALF_CONFIDENCE_DEG) ** 2)
+        apart = (task.union.normals_world - task.shape)[known].square().sum(dim=-1)
+        return (apart.median() / MEDIAN_OF_TILT).clamp_min(_LEAST_DOUBT)
 
 
 def carried_reliefs(swept: SweptPatches) -> DepthPatches:
@@ -322,14 +321,14 @@ def carried_reliefs(swept: SweptPatches) -> DepthPatches:
     )
 
 
-def _turn(normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]) -> float:
+def _turn(normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]) -> Float[Tensor, ""]:
     """Give the mean squared turn of normals along edges, folds cut; squared radians."""
-    one, other = normals[edges].detach().unbind(dim=1)
+    one, other = normals[edges].unbind(dim=1)
     square = (one - other).square().sum(dim=1).clamp_max(_FOLD**2)
-    return max(float(square.mean()) if len(edges) else 0.0, _LEAST_TURN)
+    return (square.sum() / max(len(edges), 1)).clamp_min(_LEAST_TURN)
 
 
 def _variance(confidence: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
     """Undo confidence: the squared standard error of normals, in radians."""
     half = math.radians(HALF_CONFIDENCE_DEG)
-    return half**2 * (1 / confidence.detach().clamp(1e-4, 1 - 1e-3) - 1)
+    return half**2 * (1 / confidence.clamp(1e-4, 1 - 1e-3) - 1)

@@ -29,7 +29,7 @@ def check_photometry(photometric: PhotometricPatches) -> None:
             facet = int(templates.facet[wrong.flatten(1).sum(dim=1).argmax()])
             raise InputError(
                 f"fuse: {int(wrong.sum())} confidences of a bucket lie outside [0, 1], such as "
-                f"{float(share[wrong][0]):.4g}, most of them on facet {facet}. Divide by the "
-                "largest, or clamp them: 1 is a normal known without error, 0.5 one that is off "
-                "by the angle `HALF_CONFIDENCE_DEG` of photometry/certainty.py."
+                f"{float(share.detach()[wrong][0]):.4g}, most of them on facet {facet}. Divide by "
+                "the largest, or clamp them: 1 is a normal known without error, 0.5 one that is "
+                "off by the angle `HALF_CONFIDENCE_DEG` of photometry/certainty.py."
             )

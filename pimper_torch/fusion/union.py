@@ -106,8 +106,8 @@ def unite(
     ``1 + 10 (d / outlier_samples - 1)^2``: a wild patch is outvoted. Swept offsets count by
     their information, besides.
 
-    Differentiable in depth, normals, albedo and confidence; which samples are blended is
-    decided without gradient.
+    Differentiable in templates, depth, normals, albedo, confidence and swept heights; which
+    patches and samples are blended is constant.
     """
     coarse = depths.patches.coarse
     held = torch.bincount(lattice.facet, minlength=len(coarse.mesh.faces)).tolist()
@@ -172,7 +172,7 @@ def _estimates(
     barycentric = points[..., :2] @ from_patch[..., :2].mT + from_patch[:, None, :, 2]
     weight = _taper(barycentric, bands)
     found = present & hit & (weight > 0)
-    xy = points[..., :2].detach()
+    xy = points[..., :2]
     inverse = templates.patch_from_world.mT
     normals_world = photometry.normals_patch @ inverse[:, None, :3, :3].mT
     layers = torch.cat([normals_world, photometry.confidence[..., None], photometry.albedo], dim=-1)
@@ -312,8 +312,9 @@ def _agreement(
         before = (total.cumsum(0) - total)[vertex]
         below = _sum_at(vertex, (running - before < total[vertex] / 2).long(), count)
         middle = (number.cumsum(0) - number + below.clamp_max((number - 1).clamp_min(0)))[vertex]
-        median = torch.empty_like(estimates.height)
-        median[order] = estimates.height[order][middle]
+        nearest = torch.empty_like(order)
+        nearest[order] = order[middle]
+    median = estimates.height[nearest]
     away = (estimates.height - median) / (outlier_samples * estimates.scale)
     many = number[estimates.vertex] >= 3
     beyond = (away.abs() - 1).clamp_min(0)

@@ -31,18 +31,16 @@ def inconsistency(
         scale: ``c``, in units of radiance.
         rounds: Of the albedo.
 
-    Differentiable in radiance and shading, the albedo held: exact where it has converged, as
-    the cost is least there.
+    Differentiable in radiance, shading and scale, through the rounds of the albedo.
     """
     s = torch.where(seen, shading, 1)[..., None]
     taken, per_scale = seen[..., None].to(radiance), 1 / scale[:, None, None]
-    with torch.no_grad():
-        said = torch.where(seen[..., None], radiance / s, torch.nan)
-        albedo = said.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
-        for _ in range(rounds):
-            residual = (radiance - albedo * s) * per_scale
-            lit = taken * s / (1 + residual.square())
-            square = (lit * s).sum(dim=1, keepdim=True)
-            albedo = (lit * radiance).sum(dim=1, keepdim=True) / torch.where(square > 0, square, 1)
+    said = torch.where(seen[..., None], radiance / s, torch.nan)
+    albedo = said.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
+    for _ in range(rounds):
+        residual = (radiance - albedo * s) * per_scale
+        lit = taken * s / (1 + residual.square())
+        square = (lit * s).sum(dim=1, keepdim=True)
+        albedo = (lit * radiance).sum(dim=1, keepdim=True) / torch.where(square > 0, square, 1)
     residual = (radiance - albedo * s) * per_scale
     return 0.5 * (taken * torch.log1p(residual.square())).sum(dim=1)

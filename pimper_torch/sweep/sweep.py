@@ -34,6 +34,9 @@ from pimper_torch.sweep.windows import level_weight, window_mean, window_size
 # So many samples err alike, as they were looked up between the same pixels, blurred.
 CORRELATED_SAMPLES = 4.0
 
+# A sample seen at a flatter angle (cosine) is looked up as if seen at this one.
+_LEAST_FACING = 0.05
+
 # Residuals of a patch that suits its light perfectly still have this spread, of saturation.
 LEAST_SPREAD = 1e-4
 
@@ -108,9 +111,9 @@ class Sweep(nn.Module):
     changing. How sure a height is follows from the costs of all heights: with little texture,
     or several that suit, it is not, and says so by its information.
 
-    A height at the end of the range is none. Differentiable in the photographs, in what the
-    templates carry, normals and lights, through the parabola at the least cost; which views
-    and which height are chosen, and the information, are constants.
+    A height at the end of the range is none. Differentiable in photographs, cameras, templates,
+    normals, lights and the patches' residuals, offsets through the parabola at the least cost;
+    which views and which height are chosen is constant.
     """
 
     def __init__(self, config: SweepConfig | None = None) -> None:
@@ -163,10 +166,9 @@ class Sweep(nn.Module):
         costs = window_mean(costs, window, config.window_samples) * (averaged / CORRELATED_SAMPLES)
         costs = costs.movedim(1, -1)
         place, curvature, found = parabola_minimum(costs)
-        with torch.no_grad():
-            variance = posterior_variance(costs, curvature)
-            unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
-            share = (1 / variance - 1 / unknown).clamp_min(0) / averaged
+        variance = posterior_variance(costs, curvature)
+        unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
+        share = (1 / variance - 1 / unknown).clamp_min(0) / averaged
         found = found & (window > 0) & (share > 0)
         return Heights(
             offset=torch.where(found, (place - config.steps) * step[:, None, None], 0),
@@ -207,7 +209,7 @@ class Sweep(nn.Module):
             place=place[enough],
             patch=patch[enough],
             points_world=points[enough],
-            outward=outward[enough].detach(),
+            outward=outward[enough],
             chosen=chosen[enough],
             seen=seen[enough],
             shading=shading.gather(1, chosen)[enough],
@@ -245,14 +247,13 @@ class Sweep(nn.Module):
             moved = start[:, None] + moves[sample, :, None] * outward[:, None]
             camera = cameras.cam_from_world[view], cameras.intrinsics[view]
             pixels, _ = project(moved.reshape(-1, 3), *camera)
-            with torch.no_grad():
-                spacing = templates.spacing[rows.patch[sample]]
-                one = cameras.take([view])
-                across = self._footprint(start, spacing, one)[:, 0]
-                away = normalize(one.centers_world - start, dim=-1)
-                squeezed = (away * outward).sum(dim=-1).clamp_min(0.05)
-                level = (across * squeezed.sqrt()).clamp_min(1).log2()
-                level = level[:, None].expand(-1, moves.shape[1]).flatten()
+            spacing = templates.spacing[rows.patch[sample]]
+            one = cameras.take([view])
+            across = self._footprint(start, spacing, one)[:, 0]
+            away = normalize(one.centers_world - start, dim=-1)
+            squeezed = (away * outward).sum(dim=-1).clamp_min(_LEAST_FACING)
+            level = (across * squeezed.sqrt()).clamp_min(1).log2()
+            level = level[:, None].expand(-1, moves.shape[1]).flatten()
             radiance = look_up([image[view] for image in gray], pixels, level)
             found = found.index_copy(0, slot, radiance.reshape(len(slot), -1).to(found))
         return found.reshape(*rows.chosen.shape, -1)

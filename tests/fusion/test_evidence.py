@@ -14,6 +14,7 @@ from pimper_torch.fusion.evidence import (
 )
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.metrics.derivatives import check_derivatives
 from pimper_torch.records import FacetPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -169,3 +170,78 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
         cloud, lattice.points, lattice.faces, carried, along, reach=0.01, finest=1e-9
     )
     assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())
+
+
+@pytest.mark.parametrize("kind", ["slopes", "kept_slopes", "kept_steps", "swept_heights"])
+def test_terms_agree_with_finite_differences(lattice, generator, kind):
+    count, edges = len(lattice.points), face_edges(lattice.faces)[0]
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    def term(x):
+        along, normals = normalize(x["directions"], dim=1), normalize(x["normals"], dim=1)
+        common = Common(variance=x["common"].square(), count=torch.full((count,), 6.0).double())
+        facing = (along * normals).sum(dim=1)
+        information = x["variance"] ** -2
+        found = {
+            "slopes": lambda: slopes(
+                edges, x["flat"], along, normals, x["variance"].square(), common
+            ),
+            "kept_slopes": lambda: kept_slopes(
+                edges, x["flat"], along, normals, x["heights"], x["common"].square()
+            ),
+            "kept_steps": lambda: kept_steps(edges, x["flat"], x["heights"], x["common"].square()),
+            "swept_heights": lambda: swept_heights(
+                x["heights"], x["offsets"], information, facing, 5.0, common
+            ),
+        }[kind]()
+        return {
+            "coefficients": found.coefficients,
+            "targets": found.targets,
+            "information": found.information,
+            "correlated": found.correlated,
+        }
+
+    inputs = {
+        "flat": lattice.points,
+        "directions": UP + 0.2 * draw(count, 3),
+        "normals": UP + 0.2 * draw(count, 3),
+        "heights": draw(count),
+        "offsets": draw(count),
+        "variance": 0.1 + 0.02 * draw(count).abs(),
+        "common": torch.tensor(0.1).double(),
+    }
+    told = 0
+    for check in check_derivatives(term, inputs, generator, directions=2).values():
+        told += bool(check.numeric.any())
+        assert check.spread < 1e-5
+    assert told >= 3
+
+
+def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(lattice, generator):
+    height = 0.1 * torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
+    along = UP.expand(len(height), 3)
+    places = lattice.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
+    cloud = FacetPoints(
+        points_world=places,
+        covariance_world=1e-4 * torch.eye(3).double().expand(len(places), 3, 3),
+        facet=torch.zeros(len(places), dtype=torch.long),
+    )
+
+    def target(x):
+        raised = x["heights"] + x["all"]
+        surface = lattice.points + raised[:, None] * along
+        points = cloud.replace(points_world=x["points"])
+        found = cloud_points(points, surface, lattice.faces, raised, along, 9.0, 1e-3)
+        return {"target": found.targets}
+
+    inputs = {"heights": height, "points": places, "all": torch.zeros(()).double()}
+    checks = check_derivatives(target, inputs, generator)
+    for check in checks.values():
+        assert check.smooth.any()
+    assert checks["heights", "target"].spread < 1e-5
+    assert checks["points", "target"].spread < 1e-5
+    # Raising all of the surface alike takes the point as much nearer: its target stays.
+    assert checks["all", "target"].analytic.abs().max() < 1e-9
+    assert checks["all", "target"].numeric.abs().max() < 1e-6
