@@ -85,8 +85,9 @@ class Pimper(nn.Module):
     To swap a stage, assign another module that takes and gives the same records:
     ``pimper.factorize = MyFactorize()``.
 
-    Structure from motion, the coarse mesh and the patches' layout are constants to autograd;
-    gradients run from the photographs' radiance in ``warp`` to the vertices of the mesh.
+    Gradients run from photographs, cameras and coarse mesh through every stage after it. Structure
+    from motion, how the coarse mesh is found, and what is chosen (views, samples, faces, splits)
+    are constants to autograd.
 
     Source: Sabzevari, Del Bue, Murino: PiMPeR, piecewise dense 3D reconstruction from
     multi-view and multi-illumination images, 2015. The rounds are ours.
