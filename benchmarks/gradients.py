@@ -33,8 +33,8 @@ def main() -> None:
     if options.scales is not None:
         changes = {"rounds": {"all_round": False, "scales": options.scales}}
     pimper = pt.Pimper(pt.load_config(options.config, changes))
-    say("| stage | by | of | median ratio | farthest from 1 | directions | elements that jump, % |")
-    say("|---|---|---|--:|--:|--:|--:|")
+    say("| stage | by | of | ratio | median | farthest from 1 | directions | jump or bend, % |")
+    say("|---|---|---|--:|--:|--:|--:|--:|")
     for stage, probe in probes(pimper, *small_scene()).items():
         if options.only and stage not in options.only:
             continue
@@ -49,7 +49,8 @@ def main() -> None:
                 continue  # they do not depend on one another
             told = f"{int(check.smooth.sum())} of {len(check.smooth)}"
             say(
-                f"| {stage} | {source} | {target} | {check.median:.4f} | {check.spread:.4f} | "
+                f"| {stage} | {source} | {target} | {check.ratio:.4f} | {check.median:.4f} | "
+                f"{check.spread:.4f} | "
                 f"{told} | {100 * check.jumped:.1f} |"
             )
 

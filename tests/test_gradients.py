@@ -34,7 +34,7 @@ def assert_agree(stage, pairs, tolerance):
     for (source, target), check in pairs.items():
         text = f"{stage}, {target} by {source}: {check.ratios}, {check.jumped} jump"
         assert check.smooth.any(), text
-        assert abs(check.median - 1) < tolerance, text
+        assert abs(check.ratio - 1) < tolerance, text
 
 
 def in_rounds(**changes):
@@ -54,7 +54,9 @@ def published():
 
 @pytest.mark.parametrize("stage", ["warp", "decompose", "sweep", "fuse", "mend", "adapt"])
 def test_stages_of_the_rounds_agree_with_finite_differences(rounds, stage, generator):
-    assert_agree(stage, rounds[stage].check(generator, directions=1), STAGE)
+    # What sways the surface little is told from rounding by longer steps.
+    steps = (3e-6, 1e-6) if stage == "fuse" else (1e-6, 1e-7)
+    assert_agree(stage, rounds[stage].check(generator, directions=1, steps=steps), STAGE)
 
 
 @pytest.mark.parametrize("stage", ["integrate", "align", "refine"])
