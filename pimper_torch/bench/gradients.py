@@ -167,7 +167,7 @@ def _gathered(buckets: Sequence[Record], name: str) -> Float[Tensor, " value"]:
     return torch.cat([getattr(bucket, name).flatten() for bucket in buckets])
 
 
-def _replaced(buckets: Sequence[Any], **fields: Float[Tensor, " value"]) -> tuple[Any, ...]:
+def _replaced(buckets: Sequence[Any], **fields: Float[Tensor, " _"]) -> tuple[Any, ...]:
     """Put gathered values back into their buckets."""
     for name, values in fields.items():
         sizes = [getattr(bucket, name).numel() for bucket in buckets]

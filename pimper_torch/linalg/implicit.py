@@ -20,6 +20,7 @@ _RESTARTS, _STEPS = 5, 60
 _NEWTON_STEPS, _LEAST_STEP = 8, 0.05
 
 Vector = Float[Tensor, " unknown"]
+Array = np.ndarray[tuple[int], np.dtype[np.float64]]
 
 
 def implicit_solution(
@@ -54,7 +55,7 @@ def implicit_solution(
             at = solution.detach().requires_grad_()
             left = equations(at)
 
-        def product(vector: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        def product(vector: Array) -> Array:
             (found,) = torch.autograd.grad(left, at, _as(vector, at), retain_graph=True)
             return found.cpu().double().numpy()
 
@@ -85,7 +86,7 @@ def newton_solution(
         if bool(left.norm() <= close):
             break
 
-        def product(vector: np.ndarray[Any, Any], at: Vector = at) -> np.ndarray[Any, Any]:
+        def product(vector: Array, at: Vector = at) -> Array:
             found = torch.func.jvp(equations, (at,), (_as(vector, at),))[1]
             return found.cpu().double().numpy()
 
@@ -103,11 +104,11 @@ def newton_solution(
 
 
 def _solve(
-    product: Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]],
+    product: Callable[[Array], Array],
     precondition: Callable[[Vector], Vector],
     side: Vector,
 ) -> Vector:
-    def near(vector: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def near(vector: Array) -> Array:
         return precondition(_as(vector, side)).detach().cpu().double().numpy()
 
     shape = (len(side), len(side))
@@ -122,7 +123,7 @@ def _solve(
     return _as(found, side)
 
 
-def _as(vector: np.ndarray[Any, Any], like: Tensor) -> Tensor:
+def _as(vector: Array, like: Tensor) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(vector)).to(like)
 
 

@@ -108,7 +108,7 @@ def test_gradcheck_passes_through_the_solver(noisy):
 
 
 def test_robust_weights_and_the_deviation_they_rest_on_take_part(noisy, generator):
-    problem = noisy(Cone(), Cauchy(), patches=2, samples=20)
+    problem = noisy(Cone(), Cauchy(), patches=1, samples=12)
 
     def answer(x):
         given = problem.replace(radiance=x["radiance"], prior=x["prior"])
@@ -121,7 +121,7 @@ def test_robust_weights_and_the_deviation_they_rest_on_take_part(noisy, generato
         }
 
     inputs = {"radiance": problem.radiance, "prior": problem.prior}
-    for check in check_derivatives(answer, inputs, generator, directions=2).values():
+    for check in check_derivatives(answer, inputs, generator, directions=1).values():
         assert check.smooth.all()
         assert check.spread < 1e-4
 
