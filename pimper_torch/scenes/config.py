@@ -40,7 +40,10 @@ class SceneConfig:
         supersample: Rays a pixel, along each side, where pixels differ from their neighbours.
         bits: Of a sample in the photographs.
         encoding: sRGB as cameras write it, or samples proportional to radiance.
+        table: Its texture: cloth is modest, patterned has plenty of features all over.
         up: Which axis of a mesh file points up.
+        turn_deg: Of the object about the upright axis, counter-clockwise seen from above.
+        albedo: Linear red, green and blue, uniform over the object; by default its texture.
         specular: Share of light that the object mirrors head on, 0 is matte; by default the
             scene's own, for a mesh file 0.
         roughness: Of the highlight, 0.1 polished to 0.5 satin; by default the scene's own, for
@@ -71,7 +74,10 @@ class SceneConfig:
     supersample: int = 2
     bits: Literal[8, 16] = 8
     encoding: Literal["srgb", "linear"] = "srgb"
+    table: Literal["cloth", "patterned"] = "cloth"
     up: Literal["x", "y", "z"] = "z"
+    turn_deg: float = 0.0
+    albedo: tuple[float, float, float] | None = None
     specular: float | None = None
     roughness: float | None = None
 
@@ -108,6 +114,8 @@ class SceneConfig:
             self.irradiance,
             "some light: irradiance, ambient or flash",
         )
+        for channel in self.albedo or ():
+            require(0 <= channel <= 1, "albedo", self.albedo, "between 0 and 1 in every channel")
         require(0 <= self.bounces <= 8, "bounces", self.bounces, "between 0 and 8")
         _ = self.sensor  # refuses its own
 

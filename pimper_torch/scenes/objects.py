@@ -226,6 +226,22 @@ def cloth(generator: torch.Generator, half_side: float = 4.0) -> Body:
     return Body(mesh=table(half_side, cells=64), texture=weave, surroundings=True)
 
 
+def patterned_cloth(generator: torch.Generator, half_side: float = 4.0) -> Body:
+    """Lay a matte cloth of strong contrast on the table, with features of every size."""
+    print_ = random_speckle(
+        generator,
+        cells=(0.53, 0.23, 0.097, 0.043, 0.019),
+        darkest=0.08,
+        brightest=0.75,
+        contrast=2.0,
+    )
+    return Body(mesh=table(half_side, cells=64), texture=print_, surroundings=True)
+
+
+TABLES: dict[str, Callable[[torch.Generator], Body]] = {
+    "cloth": cloth,
+    "patterned": patterned_cloth,
+}
 RECIPES: dict[str, Recipe] = {"mug": mug, "jar": jar, "balls": balls, "potatoes": potatoes}
 
 

@@ -27,8 +27,9 @@ from pimper_torch.scenes.config import SceneConfig
 from pimper_torch.scenes.lights import Lights, lights_round
 from pimper_torch.scenes.meshes import join
 from pimper_torch.scenes.noise import random_speckle
-from pimper_torch.scenes.objects import RECIPES, cloth
+from pimper_torch.scenes.objects import RECIPES, TABLES
 from pimper_torch.scenes.room import fixed_light, room, turned_about, turntable
+from pimper_torch.scenes.textures import Uniform
 
 OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
 _MARGIN = 1.15  # of the turntable's radius over the object's reach from the axis
@@ -90,7 +91,7 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     Args:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, or the path of a mesh file, which
             is scaled to the size of the others. Its vertex colours are its texture; without
-            any it gets one.
+            any it gets one. Its normals are those of its faces, averaged at the vertices.
         config: How it is photographed.
 
     Raises:
@@ -157,7 +158,7 @@ def _surroundings(
     config: SceneConfig, generator: torch.Generator, axis: Float[Tensor, " 3"], radius: float
 ) -> tuple[tuple[Body, ...], tuple[Body, ...]]:
     """Give what turns with the object, in the world, and what is fixed, in the room."""
-    table = cloth(generator)
+    table = TABLES[config.table](generator)
     if not (config.fixed_room or config.fixed_table):
         return (table,), ()
     table = turntable(table, radius)
@@ -183,7 +184,11 @@ def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "v
 def _finished(body: Body, config: SceneConfig) -> Body:
     specular = body.specular if config.specular is None else config.specular
     roughness = body.roughness if config.roughness is None else config.roughness
-    return Body(mesh=body.mesh, texture=body.texture, specular=specular, roughness=roughness)
+    texture = body.texture if config.albedo is None else Uniform(albedo=config.albedo)
+    made = Body(mesh=body.mesh, texture=texture, specular=specular, roughness=roughness)
+    origin = body.mesh.vertices_world.new_zeros(3)
+    turn = torch.deg2rad(origin.new_tensor([config.turn_deg]))
+    return carried(made, turned_about(origin, turn)[0]) if config.turn_deg else made
 
 
 def _read_body(path: str | Path, config: SceneConfig, generator: torch.Generator) -> Body:
@@ -212,13 +217,11 @@ def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
         raise InputError(f"{path}: all its vertices are in one place; needed: a surface.")
     foot = torch.stack([*((lowest + highest) / 2)[:2], lowest[2]])
     vertices = (vertices - foot) * (OBJECT_SIZE / longest)
-    normals = mesh.normals_world
-    return mesh.replace(
-        vertices_world=vertices,
-        normals_world=vertex_normals(vertices, mesh.faces)
-        if normals is None
-        else normals[:, order],
-    )
+    # OBJ knows normals of corners; read one a vertex, those of flat faces contradict the shape.
+    # Averaged from the faces instead, over vertices that a seam of the texture doubles, too.
+    places, own = torch.unique(vertices, dim=0, return_inverse=True)
+    normals = vertex_normals(places, own[mesh.faces])[own]
+    return mesh.replace(vertices_world=vertices, normals_world=normals)
 
 
 def _dressed(bodies: list[Body]) -> Mesh:

@@ -39,6 +39,21 @@ class CylinderRegion:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Uniform:
+    """One albedo everywhere.
+
+    Attributes:
+        albedo: Linear; one number a channel.
+    """
+
+    albedo: tuple[float, ...]
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
+        """Give the albedo at points."""
+        return points.new_tensor(self.albedo).expand(*points.shape[:-1], -1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Painted:
     """One texture with another on top of it in some places.
 

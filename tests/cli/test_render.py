@@ -1,8 +1,11 @@
 import json
 
 import pytest
+import torch
+from torch.testing import assert_close
 
 from pimper_torch.cli.main import main
+from pimper_torch.datasets.rendered import read_rendered
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.scenes.meshes import icosphere
@@ -43,6 +46,18 @@ def test_a_room_and_a_lamp_stand_still_on_demand_and_only_where_the_object_turns
     assert render(ball, tmp_path / "out", "--path", "turntable", *options) == 0
     settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
     assert all(settings[name] for name in ("fixed_lamp", "fixed_room", "fixed_table"))
+
+
+def test_an_object_of_one_albedo_stands_on_a_patterned_table_on_demand(ball, tmp_path):
+    options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--turn-deg", "30")
+    assert render(ball, tmp_path / "out", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert settings["albedo"] == [0.6, 0.5, 0.4]
+    assert settings["table"] == "patterned"
+    assert settings["turn_deg"] == 30
+    capture = read_rendered(tmp_path / "out")
+    seen = capture.truth.albedo[capture.truth.foreground]
+    assert_close(seen, torch.tensor([0.6, 0.5, 0.4]).expand_as(seen), atol=3e-4, rtol=0)  # float16
 
 
 def test_a_former_rendering_is_replaced_only_on_demand(ball, tmp_path, capsys):

@@ -98,6 +98,52 @@ def test_gloss_is_the_scenes_own_unless_told(egg):
     assert scene.bodies[-1].specular == 0  # the table stays matte
 
 
+def test_a_uniform_albedo_replaces_the_texture_of_the_object_alone(egg):
+    options = {"num_views": 2, "width": 40, "height": 30}
+    plain = build_scene(egg, SceneConfig(albedo=(0.6, 0.5, 0.4), **options))
+    textured = build_scene(egg, SceneConfig(**options))
+    expected = torch.tensor([0.6, 0.5, 0.4]).expand_as(plain.object_mesh.albedo)
+    assert_close(plain.object_mesh.albedo, expected)
+    assert textured.object_mesh.albedo.std() > 0.05
+    assert_close(plain.surroundings_mesh.albedo, textured.surroundings_mesh.albedo)
+    assert_close(plain.lights.positions_world, textured.lights.positions_world)
+
+
+def test_a_patterned_table_has_more_contrast_than_a_cloth(egg):
+    def contrast(table):
+        scene = build_scene(egg, SceneConfig(num_views=2, width=40, height=30, table=table))
+        albedo = scene.surroundings_mesh.albedo
+        return float((albedo.std(dim=0) / albedo.mean(dim=0)).min())
+
+    assert contrast("patterned") > 2 * contrast("cloth")
+
+
+def test_an_object_turns_counter_clockwise_with_its_texture(egg):
+    options = {"num_views": 2, "width": 40, "height": 30}
+    still = build_scene(egg, SceneConfig(**options)).object_mesh
+    turned = build_scene(egg, SceneConfig(turn_deg=90.0, **options)).object_mesh
+    quarter = still.vertices_world.new_tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # x to y
+    assert_close(turned.vertices_world, still.vertices_world @ quarter.mT)
+    assert_close(turned.normals_world.double(), still.normals_world.double() @ quarter.mT)
+    assert_close(turned.albedo, still.albedo, atol=1e-4, rtol=0)  # the texture's float32
+
+
+def test_normals_of_a_file_that_contradict_its_faces_are_not_taken(tmp_path):
+    # A regular octahedron with one normal a face, as flat shading writes it.
+    corners = "v 1 0 0\nv -1 0 0\nv 0 1 0\nv 0 -1 0\nv 0 0 1\nv 0 0 -1\n"
+    flat = "".join(f"vn {x} {y} {z}\n" for x in (1, -1) for y in (1, -1) for z in (1, -1))
+    order = [(1, 3, 5), (1, 6, 3), (1, 5, 4), (1, 4, 6), (2, 5, 3), (2, 3, 6), (2, 4, 5), (2, 6, 4)]
+    faces = "".join(
+        "f " + " ".join(f"{corner}//{face + 1}" for corner in one) + "\n"
+        for face, one in enumerate(order)
+    )
+    (tmp_path / "flat.obj").write_text(corners + flat + faces)
+    mesh = build_scene(tmp_path / "flat.obj", SMALL).object_mesh
+    middle = mesh.vertices_world.mean(dim=0)
+    radial = torch.nn.functional.normalize(mesh.vertices_world - middle, dim=1)
+    assert_close(mesh.normals_world, radial.float(), atol=1e-5, rtol=0)
+
+
 def test_a_seed_decides_everything(egg):
     first, again = build_scene(egg, SMALL), build_scene(egg, SMALL)
     other = build_scene(egg, SceneConfig(num_views=5, width=80, height=60, seed=1))
@@ -128,6 +174,7 @@ def test_a_cloud_without_faces_is_refused(tmp_path):
         ({"irradiance": 0.0, "ambient": 0.0}, "some light"),
         ({"lamp_distance": 0.5}, "lamp_distance is 0.5"),
         ({"exposure": 0.0}, "exposure is 0.0"),
+        ({"albedo": (0.5, 0.5, 1.5)}, "albedo is"),
         ({"bounces": 9}, "bounces is 9"),
     ],
 )
