@@ -78,7 +78,7 @@ def _parse(command: str, arguments: Sequence[str]) -> _Job:
         """Render photographs of a scene under a lamp, and write the truth beside them.
 
         Args:
-            scene: One of mug, jar, balls, potatoes, or the path of a mesh file.
+            scene: One of mug, jar, balls, potatoes, pair, or the path of a mesh file.
             out: Folder for photos, masks and truth; new or empty.
             processes: That render at the same time.
             overwrite: Replace a former rendering in OUT.

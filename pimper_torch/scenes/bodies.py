@@ -10,6 +10,7 @@ from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Mesh
+from pimper_torch.scenes.conductors import Conductor
 
 Texture = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch channel"]]
 
@@ -26,6 +27,8 @@ class Body:
             wholly matte, 0.04 is glaze or varnish.
         roughness: Of the mirroring facets, as artists count it (its square is GGX's alpha):
             0.1 is polished, 0.5 satin.
+        conductor: A metal in place of matte surface under glaze: it mirrors the lamps as
+            ``roughness`` says, other bodies and the environment sharply. Its albedo is 0.
         surroundings: Part of the scene but not of the object: the table.
     """
 
@@ -33,6 +36,7 @@ class Body:
     texture: Texture | None = None
     specular: float = 0.0
     roughness: float = 0.4
+    conductor: Conductor | None = None
     surroundings: bool = False
 
     def __post_init__(self) -> None:

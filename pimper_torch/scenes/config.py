@@ -48,6 +48,11 @@ class SceneConfig:
             scene's own, for a mesh file 0.
         roughness: Of the highlight, 0.1 polished to 0.5 satin; by default the scene's own, for
             a mesh file 0.3.
+        conductor: A metal that the object is made of: it has no matte part, and mirrors the
+            table, itself and the environment.
+        environment: A picture infinitely far away that the ambient light comes from: the same
+            in all photographs, or changing from one to the next. By default constant round a
+            conductor, else none.
     """
 
     num_views: int = 30
@@ -80,6 +85,8 @@ class SceneConfig:
     albedo: tuple[float, float, float] | None = None
     specular: float | None = None
     roughness: float | None = None
+    conductor: Literal["none", "copper", "gold", "silver"] = "none"
+    environment: Literal["none", "constant", "changing"] | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be photographed."""
@@ -116,8 +123,21 @@ class SceneConfig:
         )
         for channel in self.albedo or ():
             require(0 <= channel <= 1, "albedo", self.albedo, "between 0 and 1 in every channel")
+        require(
+            self.conductor == "none" or (self.albedo is None and self.specular is None),
+            "conductor",
+            self.conductor,
+            "none with albedo or specular: a metal has no matte part, and its own reflectance",
+        )
         require(0 <= self.bounces <= 8, "bounces", self.bounces, "between 0 and 8")
         _ = self.sensor  # refuses its own
+
+    @property
+    def surrounded(self) -> Literal["none", "constant", "changing"]:
+        """The environment asked for, or that of the conductor."""
+        if self.environment is not None:
+            return self.environment
+        return "none" if self.conductor == "none" else "constant"
 
     @property
     def sensor(self) -> SensorConfig:

@@ -34,7 +34,8 @@ class Frame(Record):
         foreground: True on the object.
         lit: True where the lamp reaches the surface.
         highlight: True where a highlight adds noticeably to the matte part: a hundredth of
-            saturation or more, and a twentieth of the matte part.
+            saturation or more, and a twentieth of the matte part. So does all that a conductor
+            mirrors.
     """
 
     image: Float[Tensor, "channel height width"]
@@ -129,12 +130,15 @@ class _Look:
         rays = rays_through(pixels, self._cam_from_world, self._intrinsics).float()
         spots = self._stage.trace(self._eye, rays)
         shaded = self._stage.shade(spots, self._eye, self._lamp, self._indirect)
-        radiance = self._exposure * (shaded.matte + shaded.mirrored[:, None])
-        mirrored, matte = self._exposure * shaded.mirrored, shaded.matte.mean(dim=-1)
+        hit = (spots.body >= 0)[:, None]
+        beyond = self._lamp.surroundings(rays)
+        radiance = self._exposure * torch.where(hit, shaded.matte + shaded.mirrored, beyond)
+        mirrored = self._exposure * shaded.mirrored.mean(dim=-1)
+        matte = shaded.matte.mean(dim=-1)
         relative = mirrored > _NOTICEABLE_SHARE * self._exposure * matte
         return _Seen(
             spots=spots,
-            radiance=torch.where((spots.body >= 0)[:, None], radiance, 0),
+            radiance=radiance,
             lit=shaded.lit,
             highlight=(mirrored > _NOTICEABLE) & relative,
         )

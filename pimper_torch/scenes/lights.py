@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.records import Record
+from pimper_torch.scenes.environment import Environment
 
 # Farther by this factor, falloff over an object is below what float32 tells.
 _FAR = 1e5
@@ -22,6 +23,13 @@ class Lamp(Record):
     irradiance: float
     ambient: float
     flash: float
+    environment: Environment | None = None
+
+    def surroundings(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Give the radiance that arrives from where there is no body; 0 without environment."""
+        if self.environment is None:
+            return torch.zeros_like(directions)
+        return self.ambient * self.environment(directions)
 
     def arriving(
         self, points: Float[Tensor, "*batch 3"], place: Float[Tensor, " 3"], irradiance: float
@@ -54,6 +62,8 @@ class Lights(Record):
         target_world: Where irradiance is stated.
         flash: Irradiance at the target of a second light in the camera's own place, one a
             view, without shadows.
+        environments: The picture that the ambient light comes from, one a view. Matte surfaces
+            get its mean; mirrors and the background show it.
     """
 
     positions_world: Float[Tensor, "view 3"]
@@ -61,6 +71,7 @@ class Lights(Record):
     ambient: Float[Tensor, " view"]
     target_world: Float[Tensor, " 3"]
     flash: Float[Tensor, " view"]
+    environments: tuple[Environment, ...] | None = None
 
     def lamp(self, view: int) -> Lamp:
         """Pick the light of one photograph."""
@@ -70,6 +81,7 @@ class Lights(Record):
             irradiance=float(self.irradiance[view]),
             ambient=float(self.ambient[view]),
             flash=float(self.flash[view]),
+            environment=None if self.environments is None else self.environments[view],
         )
 
     def harmonics_world(

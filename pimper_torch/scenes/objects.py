@@ -1,4 +1,4 @@
-"""The objects of the four published sequences, grown from a seed.
+"""The objects of the four published sequences, and others, grown from a seed.
 
 Each stands on ``z = 0`` round the z axis, is about 2.4 scene units large, and is seen from
 -y. Surfaces, not brands: what is alike is how they reflect and how much texture they have.
@@ -72,6 +72,8 @@ _POTATOES = (  # place before they are pushed apart, size, turn
     ((0.12, 0.55), 0.66, 80.0),
     ((0.02, -0.70), 0.36, 10.0),
 )
+
+_PAIR = (((-0.15, 0.85), 0.75), ((0.0, -0.6), 0.6))  # place and size, behind and in front
 
 
 def mug(generator: torch.Generator) -> tuple[Body, ...]:
@@ -212,6 +214,26 @@ def potatoes(generator: torch.Generator) -> tuple[Body, ...]:
     return tuple(bodies)
 
 
+def pair(generator: torch.Generator) -> tuple[Body, ...]:
+    """Stand two objects apart, one in front of the other, which it hides in part."""
+    clay = random_speckle(
+        generator,
+        cells=(0.31, 0.13, 0.055, 0.024),
+        darkest=0.2,
+        brightest=0.8,
+        contrast=1.2,
+        tint=(1.0, 0.8, 0.65),
+    )
+    skin = random_speckle(generator, cells=(0.27, 0.11, 0.047), darkest=0.15, contrast=1.5)
+    (back, back_size), (front, front_size) = _PAIR
+    tall = moved(jar_mesh(), scale=back_size, shift=(*back, 0.0))
+    low = moved(potato(generator), scale=front_size, turn_deg=20.0, shift=(*front, 0.0))
+    return (
+        Body(mesh=tall, texture=clay, specular=0.04, roughness=0.3),
+        Body(mesh=low, texture=skin),
+    )
+
+
 def cloth(generator: torch.Generator, half_side: float = 4.0) -> Body:
     """Lay a matte cloth of modest texture on the table."""
     weave = random_speckle(
@@ -242,7 +264,13 @@ TABLES: dict[str, Callable[[torch.Generator], Body]] = {
     "cloth": cloth,
     "patterned": patterned_cloth,
 }
-RECIPES: dict[str, Recipe] = {"mug": mug, "jar": jar, "balls": balls, "potatoes": potatoes}
+RECIPES: dict[str, Recipe] = {
+    "mug": mug,
+    "jar": jar,
+    "balls": balls,
+    "potatoes": potatoes,
+    "pair": pair,
+}
 
 
 def _mug_level(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:

@@ -1,7 +1,7 @@
 """A whole scene, ready to be photographed: bodies, cameras and lamps."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,9 @@ from pimper_torch.scenes.cameras import (
     pinholes,
     turntable_directions,
 )
+from pimper_torch.scenes.conductors import CONDUCTORS
 from pimper_torch.scenes.config import SceneConfig
+from pimper_torch.scenes.environment import Environment, random_environment
 from pimper_torch.scenes.lights import Lights, lights_round
 from pimper_torch.scenes.meshes import join
 from pimper_torch.scenes.noise import random_speckle
@@ -33,6 +35,7 @@ from pimper_torch.scenes.textures import Uniform
 
 OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
 _MARGIN = 1.15  # of the turntable's radius over the object's reach from the axis
+_ENVIRONMENT = 1 << 20  # numbers of environments; those of photographs' noise are smaller
 _FOCAL = 1.6  # widths of the picture: a normal to short telephoto lens
 
 
@@ -81,17 +84,22 @@ class Scene:
 
     def noise(self, view: int) -> torch.Generator:
         """Give the random numbers of one photograph, whoever renders it."""
-        seed = np.random.SeedSequence((self.config.seed, view)).generate_state(1, np.uint64)[0]
-        return torch.Generator().manual_seed(int(seed >> np.uint64(1)))
+        return _generator(self.config.seed, view)
+
+
+def _generator(seed: int, number: int) -> torch.Generator:
+    """Give random numbers of their own to each part of a scene."""
+    state = np.random.SeedSequence((seed, number)).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 
 
 def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     """Put an object on a table, and place cameras and lamps round it.
 
     Args:
-        name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, or the path of a mesh file, which
-            is scaled to the size of the others. Its vertex colours are its texture; without
-            any it gets one. Its normals are those of its faces, averaged at the vertices.
+        name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
+            file, which is scaled to the size of the others. Its vertex colours are its texture;
+            without any it gets one. Its normals are those of its faces, averaged at the vertices.
         config: How it is photographed.
 
     Raises:
@@ -119,13 +127,14 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     world_from_room = turned_about(target, azimuths)
     lights = _lights(config, generator, azimuths, target, (lowest, highest))
     reach = float((points - target)[:, :2].norm(dim=-1).amax())
+    environments = _environments(config, world_from_room)
     turning, fixed = _surroundings(config, generator, target, _MARGIN * reach)
     return Scene(
         name=str(name_or_path),
         config=config,
         bodies=(*bodies, *turning),
         cameras=pinholes(poses, focal_px, config.width, config.height),
-        lights=lights,
+        lights=lights.replace(environments=environments),
         fixed=fixed,
         world_from_room=world_from_room,
     )
@@ -152,6 +161,22 @@ def _lights(
         far=config.light == "directional",
     )
     return fixed_light(lights, turned_about(aim, azimuths)) if config.fixed_lamp else lights
+
+
+def _environments(
+    config: SceneConfig, world_from_room: Float[Tensor, "view 4 4"]
+) -> tuple[Environment, ...] | None:
+    """Draw the environment of every photograph; with a fixed room, it is at rest there."""
+    if config.surrounded == "none":
+        return None
+    drawn = []
+    for view in range(config.num_views):
+        number = view if config.surrounded == "changing" else 0
+        one = random_environment(_generator(config.seed, _ENVIRONMENT + number))
+        if config.fixed_room:
+            one = replace(one, own_from_world=world_from_room[view, :3, :3].mT)
+        drawn.append(one)
+    return tuple(drawn)
 
 
 def _surroundings(
@@ -184,8 +209,15 @@ def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "v
 def _finished(body: Body, config: SceneConfig) -> Body:
     specular = body.specular if config.specular is None else config.specular
     roughness = body.roughness if config.roughness is None else config.roughness
-    texture = body.texture if config.albedo is None else Uniform(albedo=config.albedo)
-    made = Body(mesh=body.mesh, texture=texture, specular=specular, roughness=roughness)
+    conductor = CONDUCTORS.get(config.conductor)
+    albedo = (0.0, 0.0, 0.0) if conductor else config.albedo
+    made = Body(
+        mesh=body.mesh,
+        texture=body.texture if albedo is None else Uniform(albedo=albedo),
+        specular=specular,
+        roughness=roughness,
+        conductor=conductor,
+    )
     origin = body.mesh.vertices_world.new_zeros(3)
     turn = torch.deg2rad(origin.new_tensor([config.turn_deg]))
     return carried(made, turned_about(origin, turn)[0]) if config.turn_deg else made

@@ -66,7 +66,8 @@ def render_scene(
     number of processes.
 
     Args:
-        name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, or the path of a mesh file.
+        name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
+            file.
         folder: New or empty; its parents are made.
         config: ``None`` is the default one.
         processes: That render at the same time. More than 1 start Python anew, so that a

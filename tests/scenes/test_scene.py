@@ -4,7 +4,9 @@ from scipy.spatial import KDTree
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.frames import rotate
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.scenes import objects
@@ -15,9 +17,11 @@ from pimper_torch.scenes.cameras import (
     handheld_directions,
 )
 from pimper_torch.scenes.config import SceneConfig
+from pimper_torch.scenes.environment import even_directions
 from pimper_torch.scenes.lights import lights_round
 from pimper_torch.scenes.meshes import icosphere
 from pimper_torch.scenes.scene import build_scene
+from pimper_torch.scenes.stage import Stage
 from pimper_torch.scenes.textures import CylinderRegion, Marked, Painted
 
 SMALL = SceneConfig(num_views=5, width=80, height=60)
@@ -144,6 +148,51 @@ def test_normals_of_a_file_that_contradict_its_faces_are_not_taken(tmp_path):
     assert_close(mesh.normals_world, radial.float(), atol=1e-5, rtol=0)
 
 
+def test_a_conductor_has_no_albedo_and_an_environment_all_photographs_share(egg):
+    options = {"num_views": 3, "width": 40, "height": 30}
+    scene = build_scene(egg, SceneConfig(conductor="copper", **options))
+    assert scene.bodies[0].conductor is not None
+    assert scene.bodies[-1].conductor is None  # the table stays cloth
+    assert (scene.object_mesh.albedo == 0).all()
+    directions = even_directions(500)
+
+    def pictures(scene):
+        return [scene.lights.lamp(view).surroundings(directions) for view in range(3)]
+
+    ambient = [scene.lights.lamp(view).ambient for view in range(3)]
+    first, second, _ = (one / share for one, share in zip(pictures(scene), ambient, strict=True))
+    assert_close(first, second)
+    changing = build_scene(egg, SceneConfig(conductor="copper", environment="changing", **options))
+    first, second, third = pictures(changing)
+    assert min((first - second).abs().mean(), (second - third).abs().mean()) > 0.01
+    none = build_scene(egg, SceneConfig(conductor="copper", environment="none", **options))
+    assert all((one == 0).all() for one in pictures(none))
+
+
+def test_an_environment_stands_still_with_a_fixed_room(egg):
+    options = {"num_views": 4, "width": 40, "height": 30, "path": "turntable"}
+    scene = build_scene(egg, SceneConfig(environment="constant", fixed_room=True, **options))
+    ahead = rotate(scene.world_from_room, even_directions(500)[None].expand(4, -1, -1))
+    shown = torch.stack([scene.lights.environments[view](ahead[view]) for view in range(4)])
+    assert_close(shown, shown[:1].expand_as(shown))
+
+
+def test_of_a_pair_the_one_in_front_hides_part_of_the_other(generator):
+    scene = build_scene("pair", SceneConfig(num_views=5, width=80, height=60))
+    behind, front = (Stage([body]) for body in scene.bodies[:2])
+    gap = KDTree(scene.bodies[0].mesh.vertices_world.numpy()).query(
+        scene.bodies[1].mesh.vertices_world.numpy()
+    )[0]
+    assert gap.min() > 0.15
+    for view in range(5):
+        camera = scene.cameras
+        pixels = pixel_centers(80, 60, like=camera.intrinsics).reshape(-1, 2)
+        rays = rays_through(pixels, camera.cam_from_world[view], camera.intrinsics[view]).float()
+        eye = camera.centers_world[view].float()
+        hidden = (behind.trace(eye, rays).body >= 0) & (front.trace(eye, rays).body >= 0)
+        assert hidden.sum() > 20
+
+
 def test_a_seed_decides_everything(egg):
     first, again = build_scene(egg, SMALL), build_scene(egg, SMALL)
     other = build_scene(egg, SceneConfig(num_views=5, width=80, height=60, seed=1))
@@ -176,6 +225,7 @@ def test_a_cloud_without_faces_is_refused(tmp_path):
         ({"exposure": 0.0}, "exposure is 0.0"),
         ({"albedo": (0.5, 0.5, 1.5)}, "albedo is"),
         ({"bounces": 9}, "bounces is 9"),
+        ({"conductor": "gold", "specular": 0.04}, "conductor is"),
     ],
 )
 def test_settings_that_give_no_photographs_are_refused(setting, words):
