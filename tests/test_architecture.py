@@ -26,6 +26,7 @@ ROOMS = [
     "geometry",
     "linalg",
     "sfm",
+    "outlines",
     "coarse",
     "patches",
     "photometry",
@@ -54,13 +55,19 @@ SOLE_IMPORTERS = {
     "fcpw": {"geometry/nearest.py"},
     "kornia_rs": {"io/decode.py"},
     "tifffile": {"io/decode.py"},
+    "cv2": {"outlines/opencv.py"},
     "yaml": {"config.py"},
     "tyro": {"cli/"},
     "matplotlib": {"viz/"},
 }
 
 # Where a distribution's module has another name.
-MODULES = {"pyyaml": "yaml", "pillow": "PIL", "scikit-image": "skimage"}
+MODULES = {
+    "pyyaml": "yaml",
+    "pillow": "PIL",
+    "scikit-image": "skimage",
+    "opencv-python-headless": "cv2",
+}
 
 
 def files() -> list[Path]:

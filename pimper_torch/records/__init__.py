@@ -1,5 +1,6 @@
 """Frozen data that travels between stages; no algorithms."""
 
+from pimper_torch.records.outlines import Outlines
 from pimper_torch.records.patches import (
     AlignVerdict,
     Convergence,
@@ -44,6 +45,7 @@ __all__ = [
     "Heights",
     "Lens",
     "Mesh",
+    "Outlines",
     "PatchSet",
     "PatchVerdict",
     "PatchViews",

@@ -1,0 +1,1 @@
+"""Which pixels of every view show the object."""
