@@ -76,7 +76,7 @@ def visual_hull(
     box_world: Float[Tensor, "2 3"],
     *,
     num_voxels: int = 2_000_000,
-    disagreeing: float = 0.04,
+    disagreeing: float = 0.03,
     least_seen: float = 0.5,
 ) -> Hull | None:
     """Build the hull by the vote of the trusted views.
