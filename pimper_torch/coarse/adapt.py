@@ -27,7 +27,7 @@ _ON_EDGE = 1e-6
 # Share of a facet's lattice vertices that must lie within the distance it is said to depart by.
 _DEPARTURE_SHARE = 0.9
 
-# Views that have to see a facet which is to stay.
+# Views that a facet has to show in to stay, whatever light tells of it.
 _SEEING = 2
 
 # A facet smaller than this share of what it was before its corners moved has collapsed.
@@ -85,16 +85,17 @@ class Adapt(nn.Module):
         """Adapt the mesh that the patches stand on to the surface that was found.
 
         Lengths count in samples of these patches; the residual is their photometry's. A facet
-        that two views see has data, whether or not light tells its normals.
+        that shows in two views has data, whether or not it is lit there.
         """
         patches = swept.patches
         residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
         seen = torch.zeros_like(residual, dtype=torch.bool)
-        for templates, found in zip(patches.buckets, swept.photometric.buckets, strict=True):
+        for templates, found, heights in zip(
+            patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
+        ):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
-            views = (found.lights_patch != 0).any(dim=2).sum(dim=1)
-            seen = seen.index_copy(0, templates.facet, views >= _SEEING)
+            seen = seen.index_copy(0, templates.facet, heights.num_views >= _SEEING)
         spacing = float(patches.buckets[0].spacing[0].detach())
         return adapt(patches.coarse, surface, spacing, self.config, residual=residual, seen=seen)
 

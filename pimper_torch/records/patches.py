@@ -203,10 +203,12 @@ class Heights(Record):
         information: Inverse variance of the offset, one over scene units squared; 0 where
             nothing tells. A sample's own share: neighbours that were averaged with it have
             theirs.
+        num_views: In how many views a sample of the patch shows, lit or not.
     """
 
     offset: Float[Tensor, "patch height width"]
     information: Float[Tensor, "patch height width"]
+    num_views: Int[Tensor, " patch"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

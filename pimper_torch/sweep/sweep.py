@@ -149,8 +149,9 @@ class Sweep(nn.Module):
         carried = carried_normals(photometric.patches.coarse, templates)
         rows = self._rows(templates, registered, photometry, carried, cameras)
         nothing = torch.zeros_like(templates.depth)
+        shown = registered.valid.flatten(2).any(dim=2).sum(dim=1)
         if len(rows.place) == 0:
-            return Heights(offset=nothing, information=nothing)
+            return Heights(offset=nothing, information=nothing, num_views=shown)
         step = config.step_samples * templates.spacing
         ladder = torch.arange(-config.steps, config.steps + 1, device=step.device).to(step)
         moves = step[rows.patch, None] * ladder
@@ -173,6 +174,7 @@ class Sweep(nn.Module):
         return Heights(
             offset=torch.where(found, (place - config.steps) * step[:, None, None], 0),
             information=torch.where(found, share / step[:, None, None].square(), 0),
+            num_views=shown,
         )
 
     def _rows(
