@@ -17,8 +17,7 @@ from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.reliefs import sample_raster
 from pimper_torch.geometry.surfaces import side_lengths
-from pimper_torch.photometry.lights import CAUCHY_TUNING
-from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
 from pimper_torch.records import CoarseMesh
 
 # A point of the cloud further than this from the coarse mesh along z, in the mesh's median

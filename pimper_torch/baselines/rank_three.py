@@ -17,9 +17,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.baselines.one_matrix import chunks
-from pimper_torch.photometry.lights import CAUCHY_TUNING
 from pimper_torch.photometry.quadratics import diagonal, outer, solve_packed
-from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
 from pimper_torch.records import Record
 
 # Filling in the missing entries comes near; the alternation after it is exact.

@@ -19,11 +19,8 @@ from torch import Tensor
 from pimper_torch.fusion.evidence import Evidence
 from pimper_torch.linalg.equations import normal_equations
 from pimper_torch.linalg.systems import solutions
-from pimper_torch.photometry.robust import smooth_variance
+from pimper_torch.photometry.robust import CAUCHY_TUNING, smooth_variance
 from pimper_torch.records import Record
-
-# Cauchy's weights are 95 % efficient on Gaussian noise with this many standard deviations.
-_CAUCHY = 2.385
 
 # Of the heights, in the energy norm, relative: below what the evidence leaves open. Weights range
 # over many orders, so that with less the residuals of the weakest are still large.
@@ -89,7 +86,7 @@ def fuse_evidence(
             left = 1 - used / weights[place].sum()
             square = square / left.clamp_min(_LEAST_LEFT)
             factors[place] = noise_factor(square)
-            weights[place] = 1 / (1 + square / (_CAUCHY**2 * factors[place]))
+            weights[place] = 1 / (1 + square / (CAUCHY_TUNING**2 * factors[place]))
     entries, rhs = _system(kinds, weights, factors, start, hold)
     (heights,) = solutions(*entries, rhs, what="the fusion", tolerance=_ACCURACY)
     return Fused(heights=heights, factors=tuple(float(factor.detach()) for factor in factors))

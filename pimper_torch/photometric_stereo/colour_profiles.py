@@ -28,8 +28,7 @@ from pimper_torch.photometric_stereo.factors import (
 )
 from pimper_torch.photometric_stereo.relief_metric import metric_row, relief_of_metric
 from pimper_torch.photometry.bas_relief import BasRelief
-from pimper_torch.photometry.lights import CAUCHY_TUNING
-from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
 
 # Pixels a group that are compared with other groups' normals.
 _COMPARED = 1000

@@ -18,9 +18,8 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.photometric_stereo.relief import convex
 from pimper_torch.photometry.bas_relief import BasRelief
-from pimper_torch.photometry.lights import CAUCHY_TUNING
 from pimper_torch.photometry.quadratics import diagonal, outer
-from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
 
 _ROUNDS = 20
 # The least singular value of the equations, as a share of the largest: below, the vectors lie on

@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.lights import CAUCHY_TUNING
 from pimper_torch.photometry.quadratics import PackedCholesky, diagonal, outer
-from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
 from pimper_torch.records import Record
 
 # Of the rounds of re-weighting: the scale starts this many times too wide and narrows to its own

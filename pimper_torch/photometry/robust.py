@@ -8,6 +8,9 @@ from torch import Tensor
 
 from pimper_torch.config import require
 
+# Cauchy's weights are 95 % efficient on Gaussian noise with a scale of so many standard deviations.
+CAUCHY_TUNING = 2.385
+
 # The scale of Gaussian noise of unit deviation: the root of the expectation of its equation.
 _OF_GAUSSIAN = 0.6472404
 
@@ -40,7 +43,7 @@ class Cauchy:
         scale: ``s`` in standard deviations of the residuals.
     """
 
-    scale: float = 2.385  # 95 % efficient on Gaussian noise
+    scale: float = CAUCHY_TUNING
 
     def __post_init__(self) -> None:
         require(self.scale > 0, "scale", self.scale, "above 0")

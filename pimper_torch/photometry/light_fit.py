@@ -1,0 +1,264 @@
+"""Lights and albedo fitted together to radiance under known normals.
+
+Damped Gauss-Newton steps on both, the albedos eliminated, under Cauchy's loss; gradients by the
+implicit function at the optimum.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.linalg.implicit import implicit_solution, newton_solution
+from pimper_torch.photometry.light_models import LightModel
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, smooth_spread
+
+# A fit is done when a step lowers its cost by less than this share; and iterations and share where
+# gradients are asked for, from which Newton's method goes on.
+_LEAST_GAIN, _AT_REST = 1e-7, (300, 1e-13)
+
+# Share of the diagonal that is added to the normal equations where they precondition others: that
+# light and albedo share a factor makes them singular.
+_CLOSE = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """What the views show of the samples.
+
+    Attributes:
+        radiance: Gray, linear; zero where not seen.
+        seen: False where missing.
+    """
+
+    radiance: Float[Tensor, "sample view"]
+    seen: Bool[Tensor, "sample view"]
+
+    @cached_property
+    def level(self) -> Float[Tensor, " view"]:
+        """Mean brightness of each view."""
+        return (self.radiance.sum(dim=0) / self.seen.sum(dim=0).clamp_min(1)).abs()
+
+    def residual(
+        self, albedo: Float[Tensor, " sample"], shading: Float[Tensor, "sample view"]
+    ) -> Float[Tensor, "sample view"]:
+        """Give what albedo under this shading leaves to explain."""
+        return torch.where(self.seen, self.radiance - albedo[:, None] * shading, 0)
+
+    def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
+        """Give the scale of Cauchy's loss for each view."""
+        least = 1e-4 * self.level
+        return CAUCHY_TUNING * smooth_spread(residual.mT, self.seen.mT).maximum(least)
+
+    def weights(
+        self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]
+    ) -> Float[Tensor, "sample view"]:
+        """Weigh what is seen by Cauchy's function."""
+        return self.seen * cauchy_weights(residual, scale)
+
+    def cost(self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]) -> float:
+        """Give the sum of Cauchy's loss."""
+        relative = residual / torch.where(scale > 0, scale, 1)
+        return float((self.seen * scale**2 * torch.log1p(relative**2)).sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LightFit:
+    """A fit, and its median residual as a share of the view's brightness."""
+
+    model: LightModel
+    lights: Float[Tensor, "view parameter"]
+    albedo: Float[Tensor, " sample"]
+    misfit: float
+
+
+def fit_lights(model: LightModel, shown: Shown, iterations: int) -> LightFit:
+    """Fit a model's lights and the samples' albedo; a constant to autograd.
+
+    Where gradients are asked for, the fit goes on to rest: see :func:`with_gradients`.
+
+    Args:
+        model: Soft light or a lamp, on the samples.
+        shown: What they are to explain.
+        iterations: At most, where no gradients are asked for.
+    """
+    limit, least_gain = _AT_REST if _asked(model, shown) else (iterations, _LEAST_GAIN)
+    with torch.no_grad():
+        return _fit(model, shown, limit, least_gain)
+
+
+def _asked(model: LightModel, shown: Shown) -> bool:
+    parts = (shown.radiance, *model.known())
+    return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+
+
+def _fit(model: LightModel, shown: Shown, limit: int, least_gain: float) -> LightFit:
+    """Step on lights and albedo together: alternation crawls along valleys where both mimic."""
+    gain, albedo = _brightness(shown)
+    lights = model.admit(model.start(gain))
+    shading = model.shade(lights)
+    residual = shown.residual(albedo, shading)
+    damping = 1e-3
+    for step in range(limit):
+        widen = max(1.0, 4.0 * 0.7**step)
+        scale = widen * shown.scale(residual)
+        weight = shown.weights(residual, scale)
+        cost = shown.cost(residual, scale)
+        slopes = albedo[:, None, None] * model.slopes(lights)
+        pull = weight * residual
+        downhill = (pull[..., None] * slopes).sum(dim=0)
+        # A parameter that would only be pushed over its bound stays out of the others' way.
+        held = model.admit(lights + downhill) == lights
+        normal = _normal_equations(shading, torch.where(held, 0, slopes), weight, damping)
+        steps = normal.solve(torch.where(held, 0, downhill), (pull * shading).sum(dim=1))
+        moved = model.admit(lights + steps[0])
+        under = model.shade(moved)
+        changed = _best_albedo(shown, under, albedo + steps[1], weight, scale)
+        left = shown.residual(changed, under)
+        after = shown.cost(left, scale)
+        if after < cost:
+            lights, albedo, shading, residual = moved, changed, under, left
+            damping = max(damping / 4, 1e-9)
+            if widen == 1 and after > cost * (1 - least_gain):
+                break
+        else:
+            damping = min(damping * 10, 1e6)
+    relative = (residual.abs() / shown.level.clamp_min(1e-300))[shown.seen]
+    return LightFit(model=model, lights=lights, albedo=albedo, misfit=float(relative.median()))
+
+
+def with_gradients(found: LightFit, shown: Shown) -> LightFit:
+    """Give the fit gradients to photographs and geometry, if any are asked for.
+
+    By the implicit function, at the nearest stationary point. One number is free, as light and
+    albedo share a factor: the largest of the lights' keeps its value, and so does what a bound
+    holds or nothing tells.
+    """
+    if not _asked(found.model, shown):
+        return found
+    model, count = found.model, found.lights.numel()
+    start = torch.cat([found.lights.flatten(), found.albedo])
+
+    def slopes(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+        lights, albedo = at[:count].reshape(found.lights.shape), at[count:]
+        shading = model.shade(lights)
+        residual = shown.residual(albedo, shading)
+        pull = shown.weights(residual, shown.scale(residual)) * residual
+        by_lights = torch.einsum("sv,s,svp->vp", pull, albedo, model.slopes(lights))
+        return torch.cat([by_lights.flatten(), (pull * shading).sum(dim=1)])
+
+    with torch.no_grad():
+        shading = model.shade(found.lights)
+        residual = shown.residual(found.albedo, shading)
+        weight = shown.weights(residual, shown.scale(residual))
+        by_lights = found.albedo[:, None, None] * model.slopes(found.lights)
+        normal = _normal_equations(shading, by_lights, weight, _CLOSE)
+        told = (weight * shading**2).sum(dim=1) > 0
+        held = ~torch.cat([model.free(found.lights).flatten(), told])
+        flat = found.lights.abs().flatten()
+        held[torch.where(held[:count], 0, flat).argmax()] = True
+
+    def equations(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+        return torch.where(held, start - at, slopes(at))
+
+    def precondition(side: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+        inner = torch.where(held, 0, side)
+        lights, albedo = normal.solve(inner[:count].reshape(found.lights.shape), inner[count:])
+        return -torch.where(held, side, torch.cat([lights.flatten(), albedo]))
+
+    solution = newton_solution(equations, start, precondition)
+    answer = implicit_solution(equations, solution, precondition)
+    return LightFit(
+        model=model,
+        lights=answer[:count].reshape(found.lights.shape),
+        albedo=answer[count:],
+        misfit=found.misfit,
+    )
+
+
+def _best_albedo(
+    shown: Shown,
+    shading: Float[Tensor, "sample view"],
+    albedo: Float[Tensor, " sample"],
+    weight: Float[Tensor, "sample view"],
+    scale: Float[Tensor, " view"],
+) -> Float[Tensor, " sample"]:
+    """Give the albedo that suits shading best: by the weights there are, then by its own.
+
+    Lights and albedo are multiplied, so that after a step of both at once it is not the best.
+    """
+    for _ in range(2):
+        square = (weight * shading**2).sum(dim=1)
+        product = (weight * shading * shown.radiance).sum(dim=1)
+        albedo = torch.where(square > 0, product / torch.where(square > 0, square, 1), albedo)
+        weight = shown.weights(shown.residual(albedo, shading), scale)
+    return albedo
+
+
+def _brightness(shown: Shown) -> tuple[Float[Tensor, " view"], Float[Tensor, " sample"]]:
+    """Take robust brightnesses of views, and of samples relative to their views."""
+    missing = torch.where(shown.seen, shown.radiance, torch.nan)
+    gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
+    known = shown.seen & (gain > 0)
+    ratio = torch.where(known, shown.radiance / gain.clamp_min(1e-300), torch.nan)
+    albedo = ratio.nanmedian(dim=1).values.nan_to_num(nan=0.0)
+    return gain, torch.where(known.any(dim=1), albedo, 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Normal:
+    """The normal equations of lights and albedos, albedos eliminated (Schur).
+
+    Attributes:
+        cross: Between albedos and the parameters of the lights.
+        inverse: Of the albedos' own part.
+        factor: Of what is left for the lights: ``torch.linalg.lu_factor``'s.
+    """
+
+    cross: Float[Tensor, "sample unknown"]
+    inverse: Float[Tensor, " sample"]
+    factor: tuple[Tensor, Tensor]
+
+    def solve(
+        self, on_lights: Float[Tensor, "view parameter"], on_albedo: Float[Tensor, " sample"]
+    ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+        """Solve for both."""
+        rhs = on_lights.flatten() - self.cross.mT @ (self.inverse * on_albedo)
+        step = torch.linalg.lu_solve(*self.factor, rhs[:, None])[:, 0]
+        return step.reshape(on_lights.shape), self.inverse * (on_albedo - self.cross @ step)
+
+
+def _normal_equations(
+    shading: Float[Tensor, "sample view"],
+    slopes: Float[Tensor, "sample view parameter"],
+    weight: Float[Tensor, "sample view"],
+    damping: float,
+) -> _Normal:
+    """Set up Gauss-Newton's equations.
+
+    Args:
+        shading: What albedo 1 shows: the derivatives by the albedos.
+        slopes: The derivatives by the parameters of the lights.
+        weight: Of each residual.
+        damping: Share of the diagonal that is added to it.
+    """
+    _, num_views, size = slopes.shape
+    heavy = weight[..., None] * slopes
+    blocks = heavy.permute(1, 2, 0) @ slopes.transpose(0, 1)
+    diagonal = blocks.diagonal(dim1=1, dim2=2)
+    # A view without data keeps its light: a unit block, and nothing on the right. So does a
+    # parameter that nothing tells.
+    floor = 1e-9 * diagonal.sum(dim=1, keepdim=True)
+    floor = torch.where(floor > 0, floor, 1)
+    damped = blocks + torch.diag_embed(damping * diagonal + floor)
+    own = (weight * shading**2).sum(dim=1) * (1 + damping)
+    inverse = torch.where(own > 0, 1 / torch.where(own > 0, own, 1), 0)
+    cross = (heavy * shading[..., None]).flatten(1)
+    view = torch.arange(num_views, device=slopes.device)
+    spread_out = damped.new_zeros(num_views, size, num_views, size)
+    spread_out[view, :, view, :] = damped
+    schur = spread_out.reshape(size * num_views, -1) - cross.mT @ (inverse[:, None] * cross)
+    ridge = 1e-12 * torch.diag(schur.diagonal().abs())
+    return _Normal(cross=cross, inverse=inverse, factor=torch.linalg.lu_factor(schur + ridge))
