@@ -19,7 +19,7 @@ from torch import Tensor
 from pimper_torch.fusion.evidence import Evidence
 from pimper_torch.linalg.equations import normal_equations
 from pimper_torch.linalg.systems import solutions
-from pimper_torch.photometry.robust import CAUCHY_TUNING, smooth_variance
+from pimper_torch.photometry.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.records import Record
 
 # Of the heights, in the energy norm, relative: below what the evidence leaves open. Weights range
@@ -104,7 +104,7 @@ def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
     True
     """
     everything = torch.ones_like(square, dtype=torch.bool)
-    return smooth_variance(square, everything).clamp_min(_LEAST_FACTOR)
+    return robust_variance(square, everything).clamp_min(_LEAST_FACTOR)
 
 
 def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:

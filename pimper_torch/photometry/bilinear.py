@@ -34,7 +34,7 @@ from pimper_torch.photometry.quadratics import (
     dot,
     outer,
 )
-from pimper_torch.photometry.robust import Loss, Squares, smooth_spread
+from pimper_torch.photometry.robust import Loss, Squares, spread
 from pimper_torch.records import Convergence, Record, StopCause
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
@@ -317,4 +317,4 @@ def deviation_of(
     seen = problem.weight[:, :, :: problem.stride].flatten(1) > 0
     count = problem.weight.sum(dim=(1, 2)).clamp_min(1)
     level = problem.radiance.abs().sum(dim=(1, 2)) / count
-    return smooth_spread(some, seen).maximum(SMALLEST_SPREAD * level)
+    return spread(some, seen).maximum(SMALLEST_SPREAD * level)

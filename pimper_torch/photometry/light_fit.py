@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
 from pimper_torch.photometry.light_models import LightModel
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, smooth_spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
 
 # A fit is done when a step lowers its cost by less than this share; and iterations and share where
 # gradients are asked for, from which Newton's method goes on.
@@ -50,7 +50,7 @@ class Shown:
     def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
         """Give the scale of Cauchy's loss for each view."""
         least = 1e-4 * self.level
-        return CAUCHY_TUNING * smooth_spread(residual.mT, self.seen.mT).maximum(least)
+        return CAUCHY_TUNING * spread(residual.mT, self.seen.mT).maximum(least)
 
     def weights(
         self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]

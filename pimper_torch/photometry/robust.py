@@ -68,17 +68,6 @@ Loss = Squares | Cauchy
 def spread(
     residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
 ) -> Float[Tensor, "*batch"]:
-    """Estimate the standard deviation of residuals from their median size; 0 if none is seen.
-
-    1.4826 makes the median absolute value of Gaussian noise its standard deviation.
-    """
-    size = torch.where(seen, residual.abs(), torch.nan)
-    return 1.4826 * size.nanmedian(dim=-1).values.nan_to_num(nan=0.0)
-
-
-def smooth_spread(
-    residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
-) -> Float[Tensor, "*batch"]:
     r"""Estimate the standard deviation of residuals, outliers apart, without a median's kinks.
 
     An M-estimate of scale, of which the median absolute value is the limit of high powers: the
@@ -98,20 +87,20 @@ def smooth_spread(
         0 where none is seen, or half of them are zero. Differentiable by the implicit function.
 
     >>> noise = torch.randn(100_000, generator=torch.Generator().manual_seed(0))
-    >>> torch.allclose(smooth_spread(3 * noise, noise < 9), torch.tensor(3.0), rtol=0.01)
+    >>> torch.allclose(spread(3 * noise, noise < 9), torch.tensor(3.0), rtol=0.01)
     True
 
     Source: Huber, Robust Statistics, 1981, chapter 5, for M-estimates of scale.
     """
-    variance = smooth_variance(torch.where(seen, residual, 0).square(), seen)
+    variance = robust_variance(torch.where(seen, residual, 0).square(), seen)
     some = variance > 0
     return torch.where(some, torch.where(some, variance, 1).sqrt(), 0)
 
 
-def smooth_variance(
+def robust_variance(
     square: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
 ) -> Float[Tensor, "*batch"]:
-    """Estimate the variance that squared residuals show; see :func:`smooth_spread`.
+    """Estimate the variance that squared residuals show; see :func:`spread`.
 
     Args:
         square: Zero where not seen.
