@@ -7,9 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.bench.inputs import Inputs
-from pimper_torch.errors import PimperError
 from pimper_torch.metrics.distances import bounding_diagonal
-from pimper_torch.metrics.relative import Meeting, meet_in_view
+from pimper_torch.metrics.relative import Meeting
 from pimper_torch.records import Capture, Mesh
 from pimper_torch.viz.heatmap import (
     ErrorScale,
@@ -29,19 +28,19 @@ ERROR_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
 
 
 def method_panels(
-    mesh: Mesh, inputs: Inputs, scene: str, method: str, heatmap: Path
+    mesh: Mesh, met: Meeting | None, inputs: Inputs, scene: str, method: str, heatmap: Path
 ) -> MethodPanels:
     """Draw the errors of a surface on it, and give its pictures for the sheet.
 
     Args:
         mesh: In the frame of the truth.
+        met: Where the rays of the reference view meet it; ``None`` if none does.
         inputs: What it was made from.
         scene: Name.
         method: Name.
         heatmap: Where the errors are drawn, as PNG.
     """
     truth = inputs.maps
-    met = meet_truth(mesh, truth)
     if met is None or truth.cameras is None:
         return MethodPanels(method=method, note="points only")
     errors = error_along_rays(met, truth)
@@ -68,26 +67,6 @@ def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> 
         truth=normals_picture(maps.truth.normals_world[0], maps.cameras, 0)[crop],
         methods=methods,
     )
-
-
-def meet_truth(mesh: Mesh, maps: Capture) -> Meeting | None:
-    """Cast the rays of a true view on a surface in the frame of the truth.
-
-    Args:
-        mesh: The surface.
-        maps: The truth in that view alone.
-
-    Returns:
-        ``None`` for points without faces, and where no ray meets both.
-    """
-    truth, cameras = maps.truth, maps.cameras
-    if not len(mesh.faces) or truth.depth is None or cameras is None:
-        return None
-    where = None if truth.foreground is None else truth.foreground[0]
-    try:
-        return meet_in_view(mesh, torch.eye(4).double(), cameras, 0, truth.depth[0], where)
-    except PimperError:
-        return None
 
 
 def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:

@@ -32,12 +32,19 @@ class Row(Record):
         minutes: Wall clock of this method alone.
         sfm_minutes: Wall clock of the structure from motion that all methods share.
         relative_error: The published 3D error, along the rays of the reference view, per cent.
-        coverage_percent: Of the true pixels, those whose ray meets the surface; the 3D error
-            is over these.
+        coverage_percent: Of the true pixels, those whose ray meets the surface, and not where
+            it shows the table; the 3D error is over these.
         mean_normal_deg: Error of the normals that the vertices carry.
         median_normal_deg: The same.
         mean_shape_normal_deg: Error of the normals of the surface's own shape.
         median_shape_normal_deg: The same.
+        common_percent: Of the true pixels, those that all methods of the table cover that gave
+            a surface.
+        common_relative_error: The 3D error over these.
+        common_mean_normal_deg: Of the normals that the vertices carry, over these.
+        common_median_normal_deg: The same.
+        common_mean_shape_normal_deg: Of the surface's own shape, over these.
+        common_median_shape_normal_deg: The same.
         pitted_percent: Rays where these are far further off than around: pimples and pits.
         chamfer: Mean of accuracy and completeness of what three views or more see.
         accuracy: Mean distance from the surface to the truth.
@@ -64,6 +71,12 @@ class Row(Record):
     median_normal_deg: float | None = None
     mean_shape_normal_deg: float | None = None
     median_shape_normal_deg: float | None = None
+    common_percent: float | None = None
+    common_relative_error: float | None = None
+    common_mean_normal_deg: float | None = None
+    common_median_normal_deg: float | None = None
+    common_mean_shape_normal_deg: float | None = None
+    common_median_shape_normal_deg: float | None = None
     pitted_percent: float | None = None
     chamfer: float | None = None
     accuracy: float | None = None

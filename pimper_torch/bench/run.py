@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import torch
+
+from pimper_torch.bench.common import Covered, with_common
 from pimper_torch.bench.config import BenchConfig
 from pimper_torch.bench.inputs import Inputs, prepare, scene_folder
 from pimper_torch.bench.machine import this_machine
@@ -22,6 +25,7 @@ from pimper_torch.io.folders import written_whole
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.metrics.alignment import carry
 from pimper_torch.metrics.evaluate import Evaluation, evaluate
+from pimper_torch.metrics.in_view import meet_truth
 from pimper_torch.progress import listening
 from pimper_torch.records import Record, StageReport
 from pimper_torch.reporting import Observer, Silent, peak_memory_mb
@@ -37,10 +41,13 @@ class Measured(Record):
     Attributes:
         row: Its figures.
         panels: Its pictures.
+        covered: True where rays of the reference view meet truth and surface; ``None`` if it
+            has no surface.
     """
 
     row: Row
     panels: MethodPanels
+    covered: Covered | None = None
 
 
 def run_bench(
@@ -142,7 +149,17 @@ def _scene(
         with _shown(observer, f"{name} {method}"):
             cells.append(_cell(name, method, run, inputs, config, staging))
     row = scene_row(name, inputs, tuple(cell.panels for cell in cells))
-    return [cell.row for cell in cells], [row]
+    rows = with_common(
+        [cell.row for cell in cells],
+        [cell.covered for cell in cells],
+        [_mesh_file(staging, name, method) for method in methods],
+        inputs.maps,
+    )
+    return rows, [row]
+
+
+def _mesh_file(folder: Path, scene: str, method: str) -> Path:
+    return folder / "meshes" / f"{scene}_{method}.ply"
 
 
 def _cell(
@@ -167,12 +184,14 @@ def _cell(
         row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
         return Measured(row=row, panels=MethodPanels(method=method, note=row.note))
     mesh = carry(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
-    file = f"{scene}_{method}"
-    write_ply(mesh, staging / "meshes" / f"{file}.ply")
-    heatmap = staging / "heatmaps" / f"{file}.png"
+    write_ply(mesh, _mesh_file(staging, scene, method))
+    heatmap = staging / "heatmaps" / f"{scene}_{method}.png"
+    # Evaluated in a view, it has been met.
+    met = meet_truth(mesh, torch.eye(4).double(), inputs.maps, 0) if evaluation.views else None
     return Measured(
         row=row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes),
-        panels=method_panels(mesh, inputs, scene, method, heatmap),
+        panels=method_panels(mesh, met, inputs, scene, method, heatmap),
+        covered=met.both if met else None,
     )
 
 

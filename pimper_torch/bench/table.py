@@ -57,6 +57,20 @@ _RAYS = (
     ),
     Column(heading="pitted, %", value=lambda row: row.pitted_percent, decimals=2),
 )
+_COMMON = (
+    Column(heading="covered by all, %", value=lambda row: row.common_percent, decimals=1),
+    Column(heading="3D error there, %", value=lambda row: row.common_relative_error, decimals=2),
+    Column(heading="normals there, °", value=lambda row: row.common_mean_normal_deg, decimals=2),
+    Column(heading="median there, °", value=lambda row: row.common_median_normal_deg, decimals=2),
+    Column(
+        heading="shape there, °", value=lambda row: row.common_mean_shape_normal_deg, decimals=2
+    ),
+    Column(
+        heading="shape median there, °",
+        value=lambda row: row.common_median_shape_normal_deg,
+        decimals=2,
+    ),
+)
 _SURFACE = (
     Column(heading="Chamfer, %", value=lambda row: row.chamfer, decimals=3),
     Column(heading="accuracy, %", value=lambda row: row.accuracy, decimals=3),
@@ -84,6 +98,7 @@ def columns(rows: Sequence[Row]) -> dict[str, tuple[Column, ...]]:
     return {
         "cost": known(_COST),
         "along the rays of the reference view": known(_RAYS),
+        "where all methods cover the object": known(_COMMON),
         "distances of surfaces": known((*_SURFACE, *scores)),
     }
 
@@ -176,7 +191,9 @@ def legend(table: Table) -> list[str]:
         "Samples count every template's pixels times the views, missing ones included. Minutes "
         "are of the method alone; structure from motion is shared and stands apart. The 3D error "
         "is `100 ||S - S_hat|| / ||S - mean S||` along the rays of the reference view, over the "
-        "share of the true pixels that is covered. Normals are those that the vertices carry; "
+        "share of the true pixels that is covered; rays that meet a surface on the table, through "
+        "a hole in the object, are misses. There: over the pixels that all methods of the scene "
+        "cover that gave a surface. Normals are those that the vertices carry; "
         "shape is the surface's own. Chamfer (the mean of accuracy and completeness), accuracy, "
         "completeness and the thresholds of F are in % of the diagonal of the true bounding box, "
         "over the part of the true surface that three views or more see. "

@@ -7,12 +7,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import cast_view
 from pimper_torch.metrics.pits import pitted_percent
 from pimper_torch.metrics.reflectance import AlbedoFigures, compare_albedo
 from pimper_torch.metrics.relative import Meeting, angles_deg, meet_in_view, relative_error
+from pimper_torch.metrics.surroundings import without_surroundings
 from pimper_torch.metrics.visible import joined
 from pimper_torch.records import Capture, Mesh, Record
 
@@ -39,8 +41,8 @@ class ViewFigures(Record):
     Attributes:
         name: Of the view.
         relative_error: :func:`pimper_torch.metrics.relative.relative_error`, per cent.
-        coverage: Share of the true pixels whose ray meets the mesh; the other figures are
-            over these.
+        coverage: Share of the true pixels whose ray meets the mesh, and not where it shows
+            the surroundings; the other figures are over these.
         pixels: Rays that meet the truth.
         carried_normals: Of the normals that the mesh carries at its vertices; ``None`` if it
             carries none or nobody knows the true ones.
@@ -76,11 +78,29 @@ class TrueMaps(Record):
 def compare_along_rays(
     mesh: Mesh, truth_from_world: Float[Tensor, "4 4"], capture: Capture, view: int
 ) -> ViewFigures | None:
-    """Compare a mesh with the truth in one view.
+    """Compare a mesh with the truth in one view, over the rays of :func:`meet_truth`.
+
+    Returns:
+        ``None`` where the truth has neither depth maps nor a mesh, or no cameras.
+
+    Raises:
+        InputError: No ray meets both.
+    """
+    met = meet_truth(mesh, truth_from_world, capture, view)
+    if met is None:
+        return None
+    return figures_of(met, mesh, truth_from_world, capture, view)
+
+
+def meet_truth(
+    mesh: Mesh, truth_from_world: Float[Tensor, "4 4"], capture: Capture, view: int
+) -> Meeting | None:
+    """Cast the rays of a true view on a mesh.
 
     The truth is what its maps hold; where it has no depth map, its mesh is ray cast. It is
     compared on the object alone if anybody said where that is: the truth's foreground, else
-    the masks of the photographs.
+    the masks of the photographs. Rays that pass the object and meet the mesh on the truth's
+    surroundings are misses.
 
     Returns:
         ``None`` where the truth has neither depth maps nor a mesh, or no cameras.
@@ -92,6 +112,25 @@ def compare_along_rays(
     if cameras is None or maps is None or len(mesh.faces) == 0:
         return None
     met = meet_in_view(mesh, truth_from_world, cameras, view, maps.depth, maps.where)
+    met = without_surroundings(met, capture.truth)
+    if not met.both.any():
+        raise InputError(
+            f"view {capture.views.names[view]}: where rays through the object meet the mesh, it "
+            "lies on the surroundings. Check that the mesh holds the object."
+        )
+    return met
+
+
+def figures_of(
+    met: Meeting,
+    mesh: Mesh,
+    truth_from_world: Float[Tensor, "4 4"],
+    capture: Capture,
+    view: int,
+) -> ViewFigures:
+    """Compare a mesh with the truth over rays that meet both, all or some; at least one."""
+    maps = true_maps(capture, view)
+    assert maps is not None  # it was met
     shape = vertex_normals(mesh.vertices_world, mesh.faces)
     albedo = None
     if mesh.albedo is not None and capture.truth.albedo is not None:

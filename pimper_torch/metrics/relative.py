@@ -109,6 +109,7 @@ class Meeting(Record):
         both: True where it meets the mesh too.
         points: Of the mesh, from the camera's centre, frame of the truth.
         points_true: The same.
+        center_world: Of the camera, frame of the truth.
         hits: On the mesh, for every pixel.
         faces: Of the mesh.
     """
@@ -117,6 +118,7 @@ class Meeting(Record):
     both: Bool[Tensor, "height width"]
     points: Float[Tensor, "ray 3"]
     points_true: Float[Tensor, "ray 3"]
+    center_world: Float[Tensor, " 3"]
     hits: Hits
     faces: Int[Tensor, "face 3"]
 
@@ -124,6 +126,18 @@ class Meeting(Record):
     def coverage(self) -> float:
         """Share of the rays that meet the truth which meet the mesh too."""
         return float(self.both.sum() / self.valid.sum())
+
+    @property
+    def points_world(self) -> Float[Tensor, "ray 3"]:
+        """Where the rays meet the mesh, frame of the truth."""
+        return self.center_world.to(self.points) + self.points
+
+    def only(self, where: Bool[Tensor, "height width"]) -> "Meeting":
+        """Count all other rays as misses of the mesh."""
+        kept = where[self.both]
+        return self.replace(
+            both=self.both & where, points=self.points[kept], points_true=self.points_true[kept]
+        )
 
     def interpolate(
         self, per_vertex: Float[Tensor, "vertex channel"]
@@ -180,6 +194,7 @@ def meet_in_view(
         both=both,
         points=hits.distance[both][:, None].to(rays) * rays,
         points_true=depth_true[both][:, None].to(rays) * rays,
+        center_world=cameras_true.centers_world[view],
         hits=hits,
         faces=mesh.faces,
     )

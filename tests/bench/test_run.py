@@ -8,7 +8,7 @@ from pimper_torch.bench import run as runner
 from pimper_torch.bench.config import BenchConfig
 from pimper_torch.bench.inputs import Inputs
 from pimper_torch.bench.methods import Outcome, method_named
-from pimper_torch.bench.panels import error_along_rays, meet_truth
+from pimper_torch.bench.panels import error_along_rays
 from pimper_torch.bench.rows import read_json
 from pimper_torch.bench.run import BENCH_NAMES, run_bench
 from pimper_torch.errors import (
@@ -20,12 +20,15 @@ from pimper_torch.errors import (
 from pimper_torch.geometry.frames import transform
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.metrics import TrueSurface
+from pimper_torch.metrics.in_view import meet_truth
 from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
 from pimper_torch.scenes import Body, render_bodies, sparse_scene
 from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.lights import wandering_lights
 from pimper_torch.scenes.meshes import icosphere
 from pimper_torch.scenes.noise import random_speckle
+
+RIGHT = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +135,33 @@ def test_methods_are_measured_alike_and_failures_have_rows(staged, tmp_path):
     assert lost.relative_error is None
 
 
+def test_figures_over_pixels_that_all_methods_cover_stand_beside_each_ones_own(staged, tmp_path):
+    def half(scene, coarse):
+        outcome = of_radius(1.0)(scene, coarse)
+        mesh = outcome.estimate.mesh
+        # The side that the reference camera sees obliquely is left out.
+        kept = (mesh.vertices_world[mesh.faces].mean(dim=1) @ RIGHT) > 0
+        mesh = mesh.replace(faces=mesh.faces[kept], normals_world=mesh.vertices_world)
+        return outcome.replace(estimate=outcome.estimate.replace(mesh=mesh))
+
+    staged["half"] = half
+    config = BenchConfig(samples=3000, scenes=("ball",), methods=("half", "larger", "lost"))
+    part, larger, lost = run_bench(config, tmp_path / "out").rows
+    assert 30 < part.coverage_percent < 70
+    assert larger.coverage_percent == 100.0
+    assert part.common_percent == larger.common_percent == part.coverage_percent
+    assert_close(part.common_relative_error, part.relative_error, atol=1e-4, rtol=0)
+    assert_close(part.common_mean_normal_deg, part.mean_normal_deg, atol=1e-3, rtol=0)
+    assert larger.common_relative_error > 1
+    assert abs(larger.common_relative_error - larger.relative_error) > 0.01
+    assert lost.common_percent is None
+    alone = run_bench(
+        BenchConfig(samples=3000, scenes=("ball",), methods=("larger",)), tmp_path / "alone"
+    ).rows[0]
+    assert alone.common_percent == alone.coverage_percent
+    assert_close(alone.common_relative_error, alone.relative_error, atol=1e-4, rtol=0)
+
+
 def test_the_folder_holds_table_sheet_heat_maps_and_surfaces(staged, tmp_path):
     config = BenchConfig(samples=3000, scenes=("ball",), methods=("larger", "lost"))
     table = run_bench(config, tmp_path / "out")
@@ -185,18 +215,18 @@ def test_a_scene_without_cameras_has_a_row_for_every_method(staged, tmp_path, mo
 
 
 def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball):
-    shift = torch.eye(4).double()
+    shift, identity = torch.eye(4).double(), torch.eye(4).double()
     camera = ball.maps.cameras.cam_from_world[0]
     shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
     mesh = ball.capture.truth.mesh
     moved = mesh.replace(vertices_world=transform(shift, mesh.vertices_world))
-    error = error_along_rays(meet_truth(moved, ball.maps), ball.maps)
+    error = error_along_rays(meet_truth(moved, identity, ball.maps, 0), ball.maps)
     foreground = ball.maps.truth.foreground[0]
     assert torch.equal(error.isnan(), ~foreground)
     middle = error[22, 30]
     assert_close(middle, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
     half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
-    missed = error_along_rays(meet_truth(half, ball.maps), ball.maps).isinf()
+    missed = error_along_rays(meet_truth(half, identity, ball.maps, 0), ball.maps).isinf()
     assert 0.3 < missed[foreground].float().mean() < 0.7
 
 

@@ -44,6 +44,12 @@ FULL = Row(
     median_normal_deg=1.75,
     mean_shape_normal_deg=3.5,
     median_shape_normal_deg=2.25,
+    common_percent=72.0,
+    common_relative_error=0.75,
+    common_mean_normal_deg=1.5,
+    common_median_normal_deg=0.25,
+    common_mean_shape_normal_deg=1.25,
+    common_median_shape_normal_deg=0.125,
     pitted_percent=0.5,
     chamfer=0.125,
     accuracy=0.1,
@@ -110,6 +116,12 @@ def test_every_figure_stands_in_its_own_column():
         "shape, °": "3.50",
         "shape median, °": "2.25",
         "pitted, %": "0.50",
+        "covered by all, %": "72.0",
+        "3D error there, %": "0.75",
+        "normals there, °": "1.50",
+        "median there, °": "0.25",
+        "shape there, °": "1.25",
+        "shape median there, °": "0.12",
         "Chamfer, %": "0.125",
         "accuracy, %": "0.100",
         "complete, %": "0.140",
@@ -123,7 +135,7 @@ def test_markdown_lines_are_of_one_width_and_numbers_stand_to_the_right():
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert len({len(line) for line in lines}) == 1
     rule = lines[1].split("|")[1:-1]
-    assert [word.strip().endswith(":") for word in rule] == [False] * 2 + [True] * 19 + [False]
+    assert [word.strip().endswith(":") for word in rule] == [False] * 2 + [True] * 25 + [False]
     points = [line.index(".", line.index("mug")) for line in (lines[2], lines[4])]
     assert points[0] == points[1]  # decimal points of one column stand under one another
 
@@ -131,7 +143,7 @@ def test_markdown_lines_are_of_one_width_and_numbers_stand_to_the_right():
 def test_columns_that_no_row_fills_are_left_out():
     bare = FULL.replace(f_scores=(), chamfer=None, relative_error=math.nan)
     parts = columns([bare, EMPTY])
-    assert [len(part) for part in parts.values()] == [7, 6, 2]
+    assert [len(part) for part in parts.values()] == [7, 6, 6, 2]
     headings = [column.heading for part in parts.values() for column in part]
     assert "Chamfer, %" not in headings
     assert "3D error, %" not in headings
@@ -206,7 +218,7 @@ def test_the_terminal_shows_the_same_cells_in_tables_no_wider_than_it():
     assert "…" not in text
     for word in ("PiMPeR †", "6.69", "24.7", "1,234", "1.23", "0.125", "99.2"):
         assert word in text
-    assert text.count("default") == 3
+    assert text.count("default") == 4
     assert text.count("PiMPeR") == 2  # its distances of surfaces were not published
 
 

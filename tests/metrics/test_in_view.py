@@ -10,6 +10,7 @@ from pimper_torch.metrics import (
     mean_absolute_depth_error,
     mean_angular_error_deg,
 )
+from pimper_torch.metrics.visible import joined
 from pimper_torch.records import Truth
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
@@ -67,6 +68,54 @@ def test_a_true_mesh_serves_where_there_are_no_maps(make):
     assert found.coverage == 1.0  # the table counts for nothing
     assert found.pixels == alone.pixels
     assert found.shape_normals.mean_deg < 1e-3
+
+
+def on_a_table(make):
+    """A ball on a large table, and cameras that look down on both."""
+    ball = make.sphere(level=4)
+    table = make.square(height=-1.0, side=20.0)
+    table = table.replace(vertices_world=table.vertices_world - torch.tensor([10.0, 10.0, 0.0]))
+    return ball, table, make.cameras(count=1)
+
+
+def half_of(mesh):
+    right = mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0
+    return mesh.replace(faces=mesh.faces[right])
+
+
+def test_rays_through_a_hole_that_meet_the_table_are_misses(make):
+    ball, table, cameras = on_a_table(make)
+    half = half_of(ball)
+    capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
+    alone = compare_along_rays(half, IDENTITY, capture, 0)
+    found = compare_along_rays(joined(half, table), IDENTITY, capture, 0)
+    unknown = compare_along_rays(
+        joined(half, table), IDENTITY, make.capture_of(ball, cameras=cameras), 0
+    )
+    assert 0.4 < alone.coverage < 0.8
+    assert found.coverage == alone.coverage
+    assert found.relative_error == pytest.approx(alone.relative_error, abs=1e-6)
+    assert unknown.coverage == 1.0  # where nobody knows the table, its error is the object's
+    assert unknown.relative_error > 20
+
+
+def test_a_surface_behind_the_true_one_is_no_table(make):
+    ball, table, cameras = on_a_table(make)
+    small = ball.replace(vertices_world=0.9 * ball.vertices_world)
+    capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
+    found = compare_along_rays(joined(small, table), IDENTITY, capture, 0)
+    alone = compare_along_rays(small, IDENTITY, capture, 0)
+    assert found.coverage == alone.coverage
+    raised = table.replace(vertices_world=table.vertices_world + torch.tensor([0.0, 0.0, 0.5]))
+    before = compare_along_rays(joined(ball, raised), IDENTITY, capture, 0)
+    assert before.coverage == 1.0  # in front of the object it is an error, not a miss
+
+
+def test_a_mesh_of_the_table_alone_is_refused(make):
+    ball, table, cameras = on_a_table(make)
+    capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
+    with pytest.raises(InputError, match="lies on the surroundings"):
+        compare_along_rays(table, IDENTITY, capture, 0)
 
 
 def test_maps_on_a_larger_raster_than_the_photograph_are_compared_inside_it(make):
