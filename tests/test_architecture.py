@@ -27,6 +27,7 @@ ROOMS = [
     "linalg",
     "sfm",
     "outlines",
+    "rims",
     "coarse",
     "patches",
     "photometry",

@@ -20,6 +20,7 @@ from pimper_torch.records.patches import (
 )
 from pimper_torch.records.reconstruction import Reconstruction, StageReport
 from pimper_torch.records.record import Record
+from pimper_torch.records.rims import RimPoints, RimRays
 from pimper_torch.records.scene import (
     CoarseMesh,
     FacetPoints,
@@ -54,6 +55,8 @@ __all__ = [
     "Reconstruction",
     "Record",
     "Registered",
+    "RimPoints",
+    "RimRays",
     "SparseScene",
     "StageReport",
     "StopCause",

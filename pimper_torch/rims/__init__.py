@@ -1,0 +1,1 @@
+"""Outlines as constraints on the surface: it is tangent to the rays through them."""
