@@ -18,7 +18,9 @@ from pimper_torch.geometry.surfaces import (
     face_pairs,
     side_lengths,
 )
+from pimper_torch.outlines.hull import Hull
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
+from pimper_torch.rims.constraints import Rims
 
 # A lattice vertex lies on an edge when its coordinate opposite to it is below this: lattices
 # have far fewer than a million pieces.
@@ -81,11 +83,14 @@ class Adapt(nn.Module):
         self,
         swept: SweptPatches,
         surface: Surface,
+        rims: Rims | None = None,
     ) -> CoarseMesh:
         """Adapt the mesh that the patches stand on to the surface that was found.
 
-        Lengths count in samples of these patches; the residual is their photometry's. A facet
-        that shows in two views has data, whether or not it is lit there.
+        Lengths count in samples of these patches; the residual is their photometry's. Where
+        outlines tell what the object is, facets in their visual hull stay, and no others.
+        Elsewhere those with data do: a facet that shows in two views has some, whether or not it
+        is lit there.
         """
         patches = swept.patches
         residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
@@ -97,7 +102,16 @@ class Adapt(nn.Module):
             residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
             seen = seen.index_copy(0, templates.facet, heights.num_views >= _SEEING)
         spacing = float(patches.buckets[0].spacing[0].detach())
-        return adapt(patches.coarse, surface, spacing, self.config, residual=residual, seen=seen)
+        stays = None if rims is None else within(rims.hull, surface, patches.num_patches)
+        return adapt(
+            patches.coarse,
+            surface,
+            spacing,
+            self.config,
+            residual=residual,
+            seen=seen,
+            stays=stays,
+        )
 
 
 def adapt(
@@ -108,6 +122,7 @@ def adapt(
     *,
     residual: Float[Tensor, " facet"] | None = None,
     seen: Bool[Tensor, " facet"] | None = None,
+    stays: Bool[Tensor, " facet"] | None = None,
 ) -> CoarseMesh:
     """Fit the coarse mesh to the surface that was found on it.
 
@@ -124,6 +139,7 @@ def adapt(
         config: Settings.
         residual: Of the photometry, one a facet, in any unit; NaN for none.
         seen: True for facets that have data whatever the surface's confidence says.
+        stays: The facets that are kept, if it is known; those with data otherwise.
 
     Returns:
         The adapted mesh. Its normals are the piecewise linear fit to the surface's. A vertex
@@ -145,7 +161,9 @@ def adapt(
     edges, face_edge = face_edges(faces)
     corners, middles = _on_surface(old, faces, edges, face_edge, surface)
     with torch.no_grad():
-        kept = _with_data(old, faces, surface, seen, config.max_hole)
+        kept = stays
+        if kept is None or not bool(kept.any()):
+            kept = _with_data(old, faces, surface, seen, config.max_hole)
         severity = _severity(corners, faces, surface, spacing, residual, config)
         side = _side(corners, faces) / spacing
         small = (side < config.min_samples) | ~kept
@@ -171,6 +189,12 @@ def _require_lattice(coarse: CoarseMesh, surface: Surface) -> None:
             f"adapt: the surface lies on {found} facets, the coarse mesh has {count}; needed: the "
             "surface that was made on this mesh. Hand over the two of the same round."
         )
+
+
+def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]:
+    """Mark facets with a vertex of the surface in the hull, or less than a voxel outside."""
+    inside = hull.depth_of(surface.vertices_world.detach()) > -hull.spacing
+    return torch.bincount(surface.facet[inside], minlength=count) > 0
 
 
 def _on_surface(

@@ -9,15 +9,13 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.visibility import Hits, RayCaster
-from pimper_torch.records import FacetPoints, Record
+from pimper_torch.records import Record
 
 # A direction that leaves the surface at a flatter angle than this (cosine) tells no height.
-_LEAST_FACING = 0.2
+LEAST_FACING = 0.2
 
 # Heights along a direction cannot follow normals that are further from it than this (cosine).
 _UPRIGHT = 0.1
@@ -190,7 +188,7 @@ def swept_heights(
         correlated: Vertices in a window, which have one offset.
         common: What neighbours are too high by alike, in windows of their own.
     """
-    known = ((information > 0) & (facing > _LEAST_FACING)).nonzero()[:, 0]
+    known = ((information > 0) & (facing > LEAST_FACING)).nonzero()[:, 0]
     steep = facing[known]
     together = 1 / (information[known] * steep.square())
     each = together / correlated
@@ -204,68 +202,3 @@ def swept_heights(
         information=1 / together,
         correlated=together / each,
     )
-
-
-def cloud_points(
-    points: FacetPoints,
-    surface: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    carried: Float[Tensor, " vertex"],
-    directions: Float[Tensor, "vertex 3"],
-    reach: float,
-    finest: float | Float[Tensor, ""],
-) -> Evidence:
-    """Say that points of the cloud lie on the surface.
-
-    Each lifts the surface where it lies above or below it along the nearest vertex's direction,
-    and with it the vertex next to that place. To share it out among three vertices would be
-    right to a further order; but it would tie these a thousand times as strongly as slopes do,
-    by entries of the wrong sign for multigrid.
-
-    Args:
-        points: With covariances.
-        surface: Where the vertices lie now.
-        faces: Of the lattice.
-        carried: Heights of the vertices now.
-        directions: ``d``, unit.
-        reach: Points further off are not of this surface.
-        finest: Deviation that the surest point has, of the surface between its vertices.
-
-    Differentiable; which vertex and which face are nearest is constant.
-    """
-    tree = cKDTree(surface.detach().cpu().numpy())
-    _, nearest = tree.query(points.points_world.detach().cpu().numpy())
-    line = directions[torch.as_tensor(nearest, device=faces.device)]
-    hits = _above_or_below(surface, faces, points.points_world.to(line), line)
-    lift = -hits.distance
-    met = (hits.face >= 0) & (lift.abs() <= reach)
-    corners, share, line = faces[hits.face[met]], hits.barycentric[met], line[met]
-    vertex = corners.gather(1, share.argmax(dim=1, keepdim=True))
-    facing = (directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(_LEAST_FACING)
-    covariance = points.covariance_world[met].to(line)
-    variance = torch.einsum("pi,pij,pj->p", line, covariance, line)
-    return Evidence(
-        unknowns=vertex,
-        coefficients=torch.ones_like(facing)[:, None],
-        targets=carried[vertex[:, 0]] + lift[met] / facing,
-        information=1 / variance.clamp_min(finest**2),
-        correlated=torch.ones_like(variance),
-    )
-
-
-def _above_or_below(
-    surface: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    places: Float[Tensor, "point 3"],
-    line: Float[Tensor, "point 3"],
-) -> Hits:
-    """Find where the line through each place meets the nearer of the faces on both sides."""
-    caster = RayCaster(surface, faces)
-    ahead, behind = caster.cast(places, line), caster.cast(places, -line)
-    first = ahead.distance <= behind.distance
-    nearer = Hits(
-        face=torch.where(first, ahead.face, behind.face),
-        distance=torch.where(first, ahead.distance, -behind.distance),
-        barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
-    )
-    return nearer.refined(surface, faces, places, line)

@@ -10,13 +10,13 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.fusion.bands import coarse_part
+from pimper_torch.fusion.contacts import Ground, cloud_points, rim_tangents
 from pimper_torch.fusion.continuation import about_mean, continued, enclosed
 from pimper_torch.fusion.drift import MEDIAN_OF_TILT, common_height, drift
 from pimper_torch.fusion.estimate import Fused, fuse_evidence
 from pimper_torch.fusion.evidence import (
     Common,
     Evidence,
-    cloud_points,
     kept_slopes,
     kept_steps,
     slopes,
@@ -37,6 +37,7 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
 )
+from pimper_torch.rims.constraints import Rims
 
 # Information that every vertex holds to where it is by, in units of one over its spacing
 # squared: as if it were known to 100 spacings. It decides where nothing else does.
@@ -66,6 +67,7 @@ class FuseConfig:
         slopes: Whether normals take part.
         heights: Whether swept heights do.
         points: Whether the cloud's points do.
+        rims: Whether the rays through the outlines do.
         drift_rounds: How often the tilt that all normals of a facet share, and the height that
             all swept heights of a facet are off by, are estimated, and the tilt taken out; 0
             trusts both at all wavelengths.
@@ -79,6 +81,7 @@ class FuseConfig:
     slopes: bool = True
     heights: bool = True
     points: bool = True
+    rims: bool = True
     drift_rounds: int = 2
     noise_rounds: int = 3
     outlier_samples: float = 4.0
@@ -88,7 +91,7 @@ class FuseConfig:
             require(getattr(self, name) > 0, f"fuse.{name}", getattr(self, name), "above 0")
         require(self.drift_rounds >= 0, "fuse.drift_rounds", self.drift_rounds, "0 or more")
         require(self.noise_rounds >= 1, "fuse.noise_rounds", self.noise_rounds, "1 or more")
-        some = self.slopes or self.heights or self.points
+        some = self.slopes or self.heights or self.points or self.rims
         require(some, "fuse.slopes", self.slopes, "true unless heights or points are")
 
 
@@ -124,17 +127,17 @@ class Fuse(nn.Module):
 
     Unknown is the height of every lattice vertex along the coarse mesh's smoothed normal.
     Evidence is linear in it: edges are at right angles to photometric normals, the sweep knows
-    heights, the cloud's points lie on the surface, and where no light tells anything the surface
-    keeps the slopes it has, or continues those of lit ground that encloses it
-    (:mod:`~pimper_torch.fusion.continuation`). Across contours and folds, as seen along the
-    directions, no normal can be followed, and heights go on differing as they do. Each kind comes
-    with the variances that its source claims; what these must be multiplied by is estimated from
-    the residuals (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet err alike, as they
-    were found under one light: the tilt they share is estimated from the positions and taken out.
-    So do swept heights: what they are off by together is estimated from the other kinds, and they
-    count for no more than that lets them know (:mod:`~pimper_torch.fusion.drift`). Detail is that
-    of normals trusted singly, the coarse shape that of normals known to err alike
-    (:mod:`~pimper_torch.fusion.bands`).
+    heights, the cloud's points lie on the surface, rays through the outlines touch it, and where
+    no light tells anything the surface keeps the slopes it has, or continues those of lit ground
+    that encloses it (:mod:`~pimper_torch.fusion.continuation`). Across contours and folds, as seen
+    along the directions, no normal can be followed, and heights go on differing as they do. Each
+    kind comes with the variances that its source claims; what these must be multiplied by is
+    estimated from the residuals (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet err
+    alike, as they were found under one light: the tilt they share is estimated from the positions
+    and taken out. So do swept heights: what they are off by together is estimated from the other
+    kinds, and they count for no more than that lets them know
+    (:mod:`~pimper_torch.fusion.drift`). Detail is that of normals trusted singly, the coarse shape
+    that of normals known to err alike (:mod:`~pimper_torch.fusion.bands`).
 
     The surface's normals are its own; its albedo is continued over what no light tells,
     without confidence. Differentiable in templates, normals, albedo, confidence, swept heights
@@ -146,8 +149,12 @@ class Fuse(nn.Module):
         super().__init__()
         self.config = config or FuseConfig()
 
-    def forward(self, swept: SweptPatches) -> Surface:
+    def forward(self, swept: SweptPatches, rims: Rims | None = None) -> Surface:
         """Fuse what is known of all patches.
+
+        Args:
+            swept: Photometry and swept heights of all patches.
+            rims: What outlines say about the surface; ``None`` without outlines.
 
         The convergence's residual is the root mean square distance that the surface moved, in
         scene units; its iterations are the solves.
@@ -176,7 +183,7 @@ class Fuse(nn.Module):
             spacing=spacing.median(),
             correlated=swept.averaged / config.samples_per_vertex**2,
         )
-        fused, solves = self._solved(task, self._points(task, swept))
+        fused, solves = self._solved(task, self._points(task, swept, rims))
         heights = fused.heights.to(union.heights)
         vertices = lattice.points + heights[:, None] * directions
         moved = (heights - union.heights).detach()
@@ -204,22 +211,23 @@ class Fuse(nn.Module):
         told = union.heights, union.offsets, union.information, facing
         return [swept_heights(*told, task.correlated, common)]
 
-    def _points(self, task: _Task, swept: SweptPatches) -> list[Evidence]:
-        """List what the cloud knows."""
+    def _points(self, task: _Task, swept: SweptPatches, rims: Rims | None) -> list[Evidence]:
+        """List the places that the surface passes through: the cloud's points, and rims."""
+        ground = Ground(
+            places=task.places,
+            faces=task.lattice.faces,
+            heights=task.union.heights,
+            directions=task.directions,
+            reach=float(_REACH * task.spacing.detach()),
+            finest=_FINEST * task.spacing,
+        )
+        found = []
         cloud = swept.patches.coarse.points
-        if not self.config.points or cloud is None:
-            return []
-        return [
-            cloud_points(
-                cloud,
-                task.places,
-                task.lattice.faces,
-                task.union.heights,
-                task.directions,
-                float(_REACH * task.spacing.detach()),
-                _FINEST * task.spacing,
-            )
-        ]
+        if self.config.points and cloud is not None:
+            found.append(cloud_points(cloud, ground))
+        if self.config.rims and rims is not None:
+            found.append(rim_tangents(rims.touching(task.places, task.shape), ground))
+        return found
 
     def _solved(self, task: _Task, points: list[Evidence]) -> tuple[Fused, int]:
         config, union = self.config, task.union

@@ -5,11 +5,12 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.coarse.adapt import AdaptConfig, adapt
+from pimper_torch.coarse.adapt import AdaptConfig, adapt, within
 from pimper_torch.coarse.fill import delaunay
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import boundary_vertices, face_normals, vertex_normals
+from pimper_torch.outlines.hull import Hull
 from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
 from pimper_torch.scenes.meshes import icosphere
 
@@ -133,6 +134,30 @@ def test_a_closed_mesh_stays_closed_and_nears_the_ball(generator):
     count = len(coarse.mesh.faces)
     surface = surface_on(coarse, lambda points: normalize(points, dim=1))
     assert len(adapt(coarse, surface, SPACING, config).mesh.faces) == count
+
+
+def test_facets_in_the_hull_stay_whatever_is_known_of_them_and_no_others(generator):
+    vertices, faces = icosphere(2)
+    coarse = coarse_of(vertices, faces)
+    grid = torch.linspace(-1.5, 1.5, 31).double()
+    x, y, z = torch.meshgrid(grid, grid, grid, indexing="ij")
+    # Half a ball: the plane z = -0.2 cuts it.
+    distance = torch.minimum(1.05 - (x**2 + y**2 + z**2).sqrt(), z + 0.2)
+    hull = Hull(origin_world=grid[:1].expand(3), spacing=grid[1] - grid[0], distance=distance)
+    surface = surface_on(
+        coarse,
+        lambda points: points,
+        spacing=0.1,
+        confidence=lambda at: (at.points[:, 2] < 0).double(),
+    )
+    stays = within(hull, surface, len(faces))
+    high, low = vertices[faces][..., 2].amax(dim=1), vertices[faces][..., 2].amin(dim=1)
+    assert stays[low > -0.2].all()
+    assert not stays[high < -0.35].any()
+    found = adapt(coarse, surface, 0.1, stays=stays)
+    assert len(found.mesh.faces) == int(stays.sum())  # nothing is known of the upper half
+    without = adapt(coarse, surface, 0.1)
+    assert (without.mesh.vertices_world[:, 2] < 0.4).all()
 
 
 def test_only_where_the_residual_is_high_if_nothing_else_is(generator):

@@ -3,9 +3,9 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.fusion.contacts import Ground, cloud_points, rim_tangents
 from pimper_torch.fusion.evidence import (
     Common,
-    cloud_points,
     kept_slopes,
     kept_steps,
     slopes,
@@ -15,7 +15,7 @@ from pimper_torch.fusion.evidence import (
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.metrics.derivatives import check_derivatives
-from pimper_torch.records import FacetPoints
+from pimper_torch.records import FacetPoints, RimPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -140,9 +140,15 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
     cloud = FacetPoints(
         points_world=points, covariance_world=covariance, facet=torch.zeros(40, dtype=torch.long)
     )
-    found = cloud_points(
-        cloud, lattice.points, lattice.faces, carried, along, reach=1.0, finest=1e-9
+    ground = Ground(
+        places=lattice.points,
+        faces=lattice.faces,
+        heights=carried,
+        directions=along,
+        reach=1.0,
+        finest=1e-9,
     )
+    found = cloud_points(cloud, ground)
     assert len(found.targets) == 40
     assert found.unknowns.shape == (40, 1)
     assert_close(found.coefficients, torch.ones(40, 1).double())
@@ -155,21 +161,49 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
     raised = torch.cat([xy, 0.3 * xy[:, :1] + 0.02], dim=1)
     above = cloud_points(
         cloud.replace(points_world=raised),
-        leaning,
-        lattice.faces,
-        leaning[:, 2],
-        UP.expand_as(along),
-        reach=1.0,
-        finest=1e-9,
+        ground.replace(places=leaning, heights=leaning[:, 2], directions=UP.expand_as(along)),
     )
     assert_close(above.targets - leaning[above.unknowns[:, 0], 2], torch.full((40,), 0.02).double())
     # Uncertain across, sure along: only what is across a slanting line blurs it.
     assert (1 / found.information < 0.05).all()
     assert (1 / found.information >= 1e-4).all()
-    near = cloud_points(
-        cloud, lattice.points, lattice.faces, carried, along, reach=0.01, finest=1e-9
-    )
+    near = cloud_points(cloud, ground.replace(reach=0.01))
     assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())
+
+
+def test_rims_are_planes_that_touch_the_surface(lattice, generator):
+    # A plane that leans; directions that are not at right angles to it.
+    slope = 0.3
+    tilted = lattice.points + (slope * lattice.points[:, :1]) * UP
+    normal = normalize(torch.tensor([-slope, 0.0, 1.0]).double(), dim=0)
+    along = normalize(torch.tensor([0.2, 0.1, 1.0]).double(), dim=0).expand_as(tilted)
+    ground = Ground(
+        places=tilted,
+        faces=lattice.faces,
+        heights=torch.zeros(len(tilted), dtype=torch.float64),
+        directions=along,
+        reach=1.0,
+        finest=1e-9,
+    )
+    middle = torch.tensor([0.5, 0.5, 0.15]).double()
+    ray = torch.linalg.cross(normal, normalize(torch.randn(3, generator=generator).double(), dim=0))
+    # Where on its ray the place is taken does not matter: 0.04 above the plane, all along.
+    shifts = 0.2 * (torch.rand(30, 1, generator=generator, dtype=torch.float64) - 0.5)
+    places = middle + 0.04 * normal + shifts * normalize(ray, dim=0)
+    rims = RimPoints(
+        points_world=places,
+        normals_world=normal.expand(30, 3),
+        variance=torch.full((30,), 1e-4).double(),
+        view=torch.zeros(30, dtype=torch.long),
+        ray=torch.arange(30),
+    )
+    found = rim_tangents(rims, ground)
+    facing = float(along[0] @ normal)
+    assert_close(found.targets, torch.full((30,), 0.04 / facing).double())
+    assert_close(1 / found.information, torch.full((30,), 1e-4 / facing**2).double())
+    # What a direction runs along cannot be reached by heights: nothing is said.
+    beside = rims.replace(normals_world=torch.tensor([0.0, 1.0, 0.0]).double().expand(30, 3))
+    assert len(rim_tangents(beside, ground).targets) == 0
 
 
 @pytest.mark.parametrize("kind", ["slopes", "kept_slopes", "kept_steps", "swept_heights"])
@@ -233,7 +267,15 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(lattice
         raised = x["heights"] + x["all"]
         surface = lattice.points + raised[:, None] * along
         points = cloud.replace(points_world=x["points"])
-        found = cloud_points(points, surface, lattice.faces, raised, along, 9.0, 1e-3)
+        ground = Ground(
+            places=surface,
+            faces=lattice.faces,
+            heights=raised,
+            directions=along,
+            reach=9.0,
+            finest=1e-3,
+        )
+        found = cloud_points(points, ground)
         return {"target": found.targets}
 
     inputs = {"heights": height, "points": places, "all": torch.zeros(()).double()}

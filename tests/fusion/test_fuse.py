@@ -9,7 +9,7 @@ from pimper_torch.coarse.adapt import Adapt
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.geometry.surfaces import face_edges
-from pimper_torch.records import FacetPoints
+from pimper_torch.records import FacetPoints, RimPoints
 from pimper_torch.sweep.sweep import Sweep
 
 
@@ -150,6 +150,41 @@ def test_heights_that_err_alike_do_not_outvote_points(swept):
     assert off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(misled)).median() > 0.5
     # Heights that are right still help: they know more than a few points.
     assert off_plane(lifted, Fuse()(known)).abs().quantile(0.9) < 0.05
+
+
+class Touching:
+    """Rims that touch at given places, whatever the surface."""
+
+    def __init__(self, points, normal, sigma):
+        self.points, self.normal, self.sigma = points, normal, sigma
+
+    def touching(self, points_world, normals_world):
+        return RimPoints(
+            points_world=self.points,
+            normals_world=self.normal.expand_as(self.points),
+            variance=torch.full_like(self.points[:, 0], self.sigma**2),
+            view=torch.zeros(len(self.points), dtype=torch.long),
+            ray=torch.arange(len(self.points)),
+        )
+
+
+def test_rims_bring_the_surface_to_where_it_touches_them(swept):
+    lifted, given = swept(1.0)
+    spacing = float(given.patches.buckets[0].spacing[0])
+    along = torch.tensor([1.0, 0.0, 0.0]).double()
+    ray = normalize(along - (along @ lifted.normal) * lifted.normal, dim=0)
+    points = near_plane(lifted, 0.0, count=60)
+    # A rim may touch anywhere on its ray, which lies in the plane.
+    points = points + 3 * spacing * torch.linspace(-1, 1, 60).double()[:, None] * ray
+    rims = Touching(points, lifted.normal, 0.1 * spacing)
+    silent = FuseConfig(heights=False, points=False)
+    assert off_plane(lifted, Fuse(silent)(given, rims)).abs().quantile(0.9) < 0.1
+    without = Fuse(FuseConfig(heights=False, points=False, rims=False))(given, rims)
+    assert (off_plane(lifted, without) - lifted.height).abs().max() < 0.05
+    # A tenth of them lie beside the object: the others outvote them.
+    points[::10] += 5 * spacing * lifted.normal
+    wrong = Fuse(silent)(given, Touching(points, lifted.normal, 0.1 * spacing))
+    assert off_plane(lifted, wrong).abs().quantile(0.9) < 0.3
 
 
 def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
@@ -293,4 +328,4 @@ def test_the_surface_has_the_slope_of_its_differences_by_normals_and_offsets(swe
 
 def test_without_any_evidence_nothing_can_be_fused():
     with pytest.raises(ConfigError, match="slopes"):
-        FuseConfig(slopes=False, heights=False, points=False)
+        FuseConfig(slopes=False, heights=False, points=False, rims=False)

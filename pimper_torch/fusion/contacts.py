@@ -1,0 +1,112 @@
+"""Places that the surface passes through, as evidence for its heights.
+
+Each lifts the surface where it lies above or below it along the nearest vertex's direction, and
+with it the vertex next to that place. To share it out among three vertices would be right to a
+further order; but it would tie these a thousand times as strongly as slopes do, by entries of the
+wrong sign for multigrid.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pimper_torch.fusion.evidence import LEAST_FACING, Evidence
+from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.records import FacetPoints, Record, RimPoints
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Ground(Record):
+    """The surface that heights are counted from.
+
+    Attributes:
+        places: Of the lattice's vertices now.
+        faces: Of the lattice.
+        heights: Of the vertices now.
+        directions: ``d``, unit.
+        reach: Places further off are not of this surface.
+        finest: Deviation that the surest place has, of the surface between its vertices.
+    """
+
+    places: Float[Tensor, "vertex 3"]
+    faces: Int[Tensor, "face 3"]
+    heights: Float[Tensor, " vertex"]
+    directions: Float[Tensor, "vertex 3"]
+    reach: float
+    finest: float | Float[Tensor, ""]
+
+    def lines_at(self, places: Float[Tensor, "place 3"]) -> Float[Tensor, "place 3"]:
+        """Give the direction of the vertex nearest to each place; which that is is constant."""
+        tree = cKDTree(self.places.detach().cpu().numpy())
+        _, nearest = tree.query(places.detach().cpu().numpy())
+        return self.directions[torch.as_tensor(nearest, device=self.faces.device)]
+
+
+def cloud_points(points: FacetPoints, ground: Ground) -> Evidence:
+    """Say that points of the cloud lie on the surface.
+
+    Differentiable; which vertex and which face are nearest is constant.
+    """
+    line = ground.lines_at(points.points_world)
+    covariance = points.covariance_world.to(line)
+    variance = torch.einsum("pi,pij,pj->p", line, covariance, line)
+    return _passing(points.points_world.to(line), line, variance, ground)
+
+
+def rim_tangents(rims: RimPoints, ground: Ground) -> Evidence:
+    """Say that the surface touches the rays through the outlines.
+
+    A ray lies in the plane that touches the surface there, so that where on the ray the place is
+    matters little. Where directions run along that plane, heights cannot bring the surface to it.
+
+    Differentiable; where the rays touch, and which vertex and face are nearest, is constant.
+    """
+    line = ground.lines_at(rims.points_world)
+    facing = (line * rims.normals_world.to(line)).sum(dim=-1)
+    told = facing.detach() > LEAST_FACING
+    variance = rims.variance.to(line)[told] / facing[told].square()
+    return _passing(rims.points_world.to(line)[told], line[told], variance, ground)
+
+
+def _passing(
+    places: Float[Tensor, "place 3"],
+    line: Float[Tensor, "place 3"],
+    variance: Float[Tensor, " place"],
+    ground: Ground,
+) -> Evidence:
+    """Say that the surface passes through places, known along their lines by a variance."""
+    hits = _above_or_below(ground.places, ground.faces, places, line)
+    lift = -hits.distance
+    met = (hits.face >= 0) & (lift.abs() <= ground.reach)
+    corners, share, line = ground.faces[hits.face[met]], hits.barycentric[met], line[met]
+    vertex = corners.gather(1, share.argmax(dim=1, keepdim=True))
+    facing = (ground.directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(LEAST_FACING)
+    variance = variance[met]
+    return Evidence(
+        unknowns=vertex,
+        coefficients=torch.ones_like(facing)[:, None],
+        targets=ground.heights[vertex[:, 0]] + lift[met] / facing,
+        information=1 / variance.clamp_min(ground.finest**2),
+        correlated=torch.ones_like(variance),
+    )
+
+
+def _above_or_below(
+    surface: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    places: Float[Tensor, "point 3"],
+    line: Float[Tensor, "point 3"],
+) -> Hits:
+    """Find where the line through each place meets the nearer of the faces on both sides."""
+    caster = RayCaster(surface, faces)
+    ahead, behind = caster.cast(places, line), caster.cast(places, -line)
+    first = ahead.distance <= behind.distance
+    nearer = Hits(
+        face=torch.where(first, ahead.face, behind.face),
+        distance=torch.where(first, ahead.distance, -behind.distance),
+        barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
+    )
+    return nearer.refined(surface, faces, places, line)
