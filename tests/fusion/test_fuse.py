@@ -10,6 +10,7 @@ from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.records import FacetPoints, RimPoints
+from pimper_torch.rims.constraints import Rims
 from pimper_torch.sweep.sweep import Sweep
 
 
@@ -152,20 +153,21 @@ def test_heights_that_err_alike_do_not_outvote_points(swept):
     assert off_plane(lifted, Fuse()(known)).abs().quantile(0.9) < 0.05
 
 
-class Touching:
+class Touching(Rims):
     """Rims that touch at given places, whatever the surface."""
 
     def __init__(self, points, normal, sigma):
-        self.points, self.normal, self.sigma = points, normal, sigma
+        told = RimPoints(
+            points_world=points,
+            normals_world=normal.expand_as(points),
+            variance=torch.full_like(points[:, 0], sigma**2),
+            view=torch.zeros(len(points), dtype=torch.long),
+            ray=torch.arange(len(points)),
+        )
+        object.__setattr__(self, "told", told)
 
     def touching(self, points_world, normals_world):
-        return RimPoints(
-            points_world=self.points,
-            normals_world=self.normal.expand_as(self.points),
-            variance=torch.full_like(self.points[:, 0], self.sigma**2),
-            view=torch.zeros(len(self.points), dtype=torch.long),
-            ray=torch.arange(len(self.points)),
-        )
+        return self.told
 
 
 def test_rims_bring_the_surface_to_where_it_touches_them(swept):
