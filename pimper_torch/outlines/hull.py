@@ -63,11 +63,13 @@ class Hull(Record):
         field = self.distance.clamp_min(-float((high - low).norm()))
         value = grid_sample(
             field[None, None],
-            place.flip(-1).reshape(1, -1, 1, 1, 3),
+            place.flip(-1).reshape(1, -1, 1, 1, 3).to(field),
             padding_mode="border",
             align_corners=True,
         )
-        return value.reshape(points_world.shape[:-1]) - (points_world - within).norm(dim=-1)
+        return value.reshape(points_world.shape[:-1]).to(within) - (points_world - within).norm(
+            dim=-1
+        )
 
 
 def visual_hull(

@@ -1,12 +1,17 @@
 """What the outlines say about the surface, as one record that stages hand on."""
 
+import warnings
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from pimper_torch.outlines.hull import Hull
-from pimper_torch.records import Cameras, Record, RimPoints, RimRays
+from pimper_torch.errors import PimperWarning
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.outlines.hull import Hull, visual_hull
+from pimper_torch.records import Cameras, Outlines, Record, RimPoints, RimRays
+from pimper_torch.rims.contours import RimConfig, rim_rays
 from pimper_torch.rims.touching import rim_points
 
 
@@ -34,3 +39,73 @@ class Rims(Record):
             normals_world: Theirs, unit, outward.
         """
         return rim_points(self.rays, self.cameras, self.hull, points_world, normals_world)
+
+
+class Rim(nn.Module):
+    """Turn outlines into constraints on the surface; a constant to autograd."""
+
+    def __init__(self, config: RimConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or RimConfig()
+
+    @torch.no_grad()
+    def forward(self, outlines: Outlines | None, cameras: Cameras) -> Rims | None:
+        """Cast rays through the outlines and build their visual hull.
+
+        Args:
+            outlines: ``None`` where everything is the object.
+            cameras: Of the same views.
+
+        Returns:
+            ``None`` without outlines, and, with a warning, where they have no place in common.
+        """
+        if outlines is None:
+            return None
+        box = box_round(outlines, cameras)
+        hull = None
+        if box is not None:  # voxels need no more than single precision
+            hull = visual_hull(outlines, cameras.to(torch.float32), box.float())
+        if hull is None:
+            warnings.warn(
+                PimperWarning(
+                    "rims: the outlines of the views have no place in common, so that they say "
+                    "nothing about the surface. Look at the masks: do they show the same object "
+                    "in all photographs?"
+                ),
+                stacklevel=2,
+            )
+            return None
+        rays = rim_rays(outlines, cameras, self.config)
+        return Rims(rays=rays, cameras=cameras, hull=hull)
+
+
+def box_round(outlines: Outlines, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
+    """Give the corners of a box that holds what the outlines show.
+
+    Its middle is nearest to the rays through the middles of the outlines' bounding boxes; from
+    there it reaches as far as the largest of them, seen from its camera, and half as far again:
+    an outline may be cut by the photograph's border.
+
+    Returns:
+        ``None`` where fewer than two trusted views show anything.
+    """
+    views = (outlines.trusted & outlines.masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
+    if len(views) < 2:
+        return None
+    like = cameras.intrinsics
+    rays, halves = [], []
+    for view in views:
+        rows, columns = (outlines.masks[view].any(dim=1 - axis).nonzero() for axis in (0, 1))
+        low = torch.stack([columns.amin(), rows.amin()]).to(like)
+        high = torch.stack([columns.amax(), rows.amax()]).to(like) + 1
+        camera = cameras.cam_from_world[view], cameras.intrinsics[view]
+        rays.append(rays_through((low + high)[None] / 2, *camera)[0])
+        halves.append((high - low).norm() / 2 / cameras.intrinsics[view, 0, 0])
+    rays_world, eyes = torch.stack(rays), cameras.centers_world[views]
+    along = rays_world / rays_world.norm(dim=1, keepdim=True)
+    across = torch.eye(3).to(like) - along[:, :, None] * along[:, None, :]
+    right = (across @ eyes[..., None])[..., 0].sum(dim=0)
+    middle = torch.linalg.lstsq(across.sum(dim=0), right[:, None]).solution[:, 0]
+    distance = (middle - eyes).norm(dim=1)
+    reach = 1.5 * (distance * torch.stack(halves)).amax()
+    return torch.stack([middle - reach, middle + reach])

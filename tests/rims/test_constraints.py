@@ -1,0 +1,40 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.rims.constraints import Rim, box_round
+from tests.rims.shapes import PIXEL, ball, outlines_of, two_balls
+
+
+@pytest.mark.parametrize("shape", [ball, two_balls])
+def test_a_box_holds_what_the_outlines_show_and_not_much_more(cameras, shape):
+    low, high = box_round(outlines_of(shape, cameras), cameras)
+    assert (low < -1.1).all()
+    assert (high > 1.1).all()
+    assert (high - low).max() < 2 * 2.4
+
+
+def test_rims_of_a_ball_touch_it(cameras):
+    rims = Rim()(outlines_of(ball, cameras), cameras)
+    assert rims is not None
+    generator = torch.Generator().manual_seed(7)
+    points = normalize(torch.randn(4000, 3, generator=generator, dtype=torch.float64), dim=1)
+    found = rims.touching(points, points)
+    assert len(found.points_world) > 0.9 * len(rims.rays.view)
+    assert (found.points_world.norm(dim=1) - 1).abs().median() < 0.5 * PIXEL
+    # Deep in the middle, and out of it beside the ball.
+    depth = rims.hull.depth_of(torch.tensor([[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]]))
+    assert depth[0] > 0.9
+    assert depth[1] < -0.1
+
+
+def test_without_outlines_there_are_no_rims(cameras):
+    assert Rim()(None, cameras) is None
+
+
+def test_outlines_without_a_common_place_are_told_of(cameras):
+    outlines = outlines_of(ball, cameras)
+    nothing = outlines.replace(inside=torch.zeros_like(outlines.inside))
+    with pytest.warns(PimperWarning, match="no place in common"):
+        assert Rim()(nothing, cameras) is None
