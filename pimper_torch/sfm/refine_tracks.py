@@ -6,13 +6,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.radiometry import SATURATED
-from pimper_torch.records import Cameras, Lens, Views, pairs_table
+from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reprojection import observation_errors
-from pimper_torch.sfm.sightings import Sightings, SightingSettings, sight
+from pimper_torch.sfm.sightings import Sightings, SightingSettings, log_pictures, sight
 from pimper_torch.sfm.tangents import tangents
 from pimper_torch.sfm.undistort import pinholes_for, undistorted
 
@@ -64,11 +63,12 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
         The same views. Points that nothing agrees about are left out.
     """
     for _ in range(settings.rounds):
-        pictures = _gray(views, model.lenses)
+        raster = (views.num_views, *views.images.shape[-2:])
+        pictures = log_pictures(undistorted(views, model.lenses), raster)
         cameras = Cameras(
             intrinsics=pinholes_for(model.lenses),
             cam_from_world=model.cam_from_world,
-            sizes_px=pictures.sizes_px,
+            sizes_px=views.sizes_px.cpu(),
         )
         planes = tangents(model.points_world, model.observed, cameras)
         found = sight(pictures, cameras, planes, settings.sightings)
@@ -77,18 +77,6 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
             return model
         model = _adjusted(renewed, aligned, settings)
     return model
-
-
-def _gray(views: Views, lenses: tuple[Lens, ...]) -> Views:
-    """Undistort what patches are compared by: one channel, saturated where one of three is."""
-    gray = torch.zeros_like(views.images[:, :1], device="cpu")
-    valid = torch.zeros_like(views.images[:, 0], device="cpu", dtype=torch.bool)
-    for index, (image, inside) in enumerate(undistorted(views, lenses)):
-        height, width = inside.shape
-        brightest, mean = image.detach().amax(dim=0), image.detach().mean(dim=0)
-        gray[index, 0, :height, :width] = torch.where(brightest >= SATURATED, brightest, mean)
-        valid[index, :height, :width] = inside
-    return views.replace(images=gray, masks=valid).to("cpu")
 
 
 def _renewed(

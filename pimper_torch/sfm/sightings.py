@@ -11,6 +11,7 @@ deserve it, Lindenberger et al., Pixel-perfect structure-from-motion, ICCV 2021,
 features in the place of the logarithm.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +22,7 @@ from torch.nn.functional import grid_sample, pad
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.progress import track
 from pimper_torch.radiometry import SATURATED
-from pimper_torch.records import Cameras, Record, Views
+from pimper_torch.records import Cameras, Record
 from pimper_torch.sfm.tangents import Tangents, plane_homographies
 
 # Share of the median radiance below which the logarithm fades: darker is noise.
@@ -66,6 +67,47 @@ class SightingSettings:
     min_correlation: float = 0.8
     max_shift_px: float = 3.0
     max_deviation_px: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Pictures(Record):
+    """What patches are looked up in.
+
+    Attributes:
+        log: Of the gray radiance.
+        unusable: 1 where a pixel cannot be used.
+    """
+
+    log: Float[Tensor, "view height width"]
+    unusable: UInt8[Tensor, "view height width"]
+
+
+def log_pictures(
+    photographs: Iterable[tuple[Float[Tensor, "_ _ _"], Bool[Tensor, "_ _"]]],
+    raster: tuple[int, int, int],
+) -> Pictures:
+    """Take logarithms of photographs one by one, so that no others are held.
+
+    Args:
+        photographs: Radiance, channels first, and where it is valid; of any sizes.
+        raster: How many there are, and the height and width that they are padded to.
+
+    Returns:
+        On the CPU, float32, a constant to autograd. Pixels that are padding, invalid, not finite
+        or saturated in one channel are unusable.
+    """
+    log = torch.zeros(raster)
+    unusable = torch.ones(raster, dtype=torch.uint8)
+    for index, (image, valid) in enumerate(photographs):
+        height, width = valid.shape
+        radiance = image.detach()
+        usable = valid & radiance.isfinite().all(dim=0) & (radiance.amax(dim=0) < SATURATED)
+        log[index, :height, :width] = torch.where(usable, radiance.mean(dim=0), 0)
+        unusable[index, :height, :width] = ~usable
+    some = log[:, ::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE]
+    some = some[some > 0]
+    floor = _DARK * some.median() if len(some) else torch.ones(())
+    return Pictures(log=log.add_(floor.clamp_min(1e-6)).log_(), unusable=unusable)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -128,7 +170,7 @@ class _Window:
 
 
 def sight(
-    views: Views, cameras: Cameras, tangents: Tangents, settings: SightingSettings
+    pictures: Pictures, cameras: Cameras, tangents: Tangents, settings: SightingSettings
 ) -> Sightings:
     """Find points in all views that may show them.
 
@@ -136,7 +178,7 @@ def sight(
     taken. In the other views it is where the same patch is found.
 
     Args:
-        views: Undistorted.
+        pictures: Of the undistorted photographs.
         cameras: Theirs, float64.
         tangents: Of the points.
         settings: When a point counts as found.
@@ -146,11 +188,10 @@ def sight(
         the point. A constant to autograd.
     """
     with torch.no_grad():
-        pictures = _log_pictures(views)
         window = _Window(settings.radius_px, like=pictures.log)
         templates = _templates(pictures, cameras, tangents, window)
         parts = []
-        for view in track(range(views.num_views)):
+        for view in track(range(len(pictures.log))):
             wanted = tangents.candidates[:, view] & templates.usable
             for some in torch.split(torch.nonzero(wanted)[:, 0], _AT_ONCE):
                 homographies = plane_homographies(tangents, cameras, view, some)
@@ -169,39 +210,12 @@ def sight(
         point = torch.cat([point, own])
         view_ = torch.cat([view_, tangents.reference[own]])
         pixels = torch.cat([pixels, _own(tangents, cameras)[own]])
-        order = torch.argsort(point * views.num_views + view_)
+        order = torch.argsort(point * len(pictures.log) + view_)
         return Sightings(point=point[order], view=view_[order], pixels=pixels[order])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Pictures(Record):
-    """What patches are looked up in.
-
-    Attributes:
-        log: Of the gray radiance.
-        unusable: 1 where a pixel cannot be used.
-    """
-
-    log: Float[Tensor, "view height width"]
-    unusable: UInt8[Tensor, "view height width"]
-
-
-def _log_pictures(views: Views) -> _Pictures:
-    log = torch.empty_like(views.images[:, 0], dtype=torch.float32)
-    unusable = torch.empty_like(views.images[:, 0], dtype=torch.uint8)
-    inside = views.inside if views.masks is None else views.inside & views.masks
-    for index, image in enumerate(views.images):
-        usable = inside[index] & image.isfinite().all(dim=0) & (image.amax(dim=0) < SATURATED)
-        log[index] = torch.where(usable, image.mean(dim=0), 0)
-        unusable[index] = ~usable
-    some = log[:, ::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE]
-    some = some[some > 0]
-    floor = _DARK * some.median() if len(some) else torch.ones(())
-    return _Pictures(log=log.add_(floor.clamp_min(1e-6)).log_(), unusable=unusable)
-
-
 def _templates(
-    pictures: _Pictures,
+    pictures: Pictures,
     cameras: Cameras,
     tangents: Tangents,
     window: _Window,
@@ -232,7 +246,7 @@ def _templates(
 
 
 def _aligned(
-    pictures: _Pictures,
+    pictures: Pictures,
     view: int,
     homographies: Float[Tensor, "point 3 3"],
     templates: _Templates,

@@ -11,9 +11,11 @@ from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.progress import track
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Lens, Views
+from pimper_torch.sfm.binding import release_memory
 from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_pixels
 
 _MOST_ZOOM = 1.25
+_AT_ONCE = 2**17  # pixels that are distorted at a time: rays and powers of radii take memory
 _TOUCHED = 1e-3  # share of saturated light in a pixel; below is the rounding of its weights
 
 
@@ -33,14 +35,15 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
         half; what touches a saturated pixel is saturated. Differentiable in the radiance. A
         view without distortion is left untouched.
     """
-    images = torch.zeros_like(views.images)
+    images = torch.empty_like(views.images)  # takes memory only where it is written
     valid = torch.zeros_like(views.images[:, 0], dtype=torch.bool)
+    whole = views.masks is None
     for index, (image, inside) in enumerate(undistorted(views, lenses)):
         height, width = inside.shape
+        images[index, :, height:], images[index, :, :, width:] = 0, 0
         images[index, :, :height, :width], valid[index, :height, :width] = image, inside
-    masks = views.masks
-    if masks is not None or not bool((valid == views.inside).all()):
-        masks = valid
+        whole = whole and bool(inside.all())
+    masks = None if whole else valid
     return views.replace(images=images, masks=masks), pinholes_for(lenses).to(views.images)
 
 
@@ -58,6 +61,7 @@ def undistorted(
         if lens not in grids:
             # The last alone, for grids are large.
             grids = {lens: None if is_pinhole(lens) else _grid(lens, like=views.images)}
+        release_memory()  # of the grid, and of the photograph before
         yield _undistort_image(views, index, lens, grids[lens])
 
 
@@ -91,7 +95,7 @@ def _undistort_image(
     if grid is None:
         return image, torch.ones_like(image[0], dtype=torch.bool) if mask is None else mask
     places, inside = grid
-    radiance = torch.where(inside, _sampled(image, places), 0)
+    radiance = _sampled(image, places).masked_fill_(~inside, 0)
     saturated = image >= SATURATED
     if bool(saturated.any()):
         touched = _sampled(saturated.to(image), places) > _TOUCHED
@@ -140,6 +144,10 @@ def photograph_pixels(lens: Lens) -> Float[Tensor, "height width 2"]:
     """
     K = pinhole_for(lens)
     pixels = pixel_centers(lens.width, lens.height, like=K).reshape(-1, 2)
-    plane = (pixels - K[:2, 2]) / K.diagonal()[:2]
-    rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
-    return distort(lens, rays).reshape(lens.height, lens.width, 2)
+    found = torch.empty_like(pixels)
+    parts = torch.split(pixels, _AT_ONCE), torch.split(found, _AT_ONCE)
+    for some, into in zip(*parts, strict=True):
+        plane = (some - K[:2, 2]) / K.diagonal()[:2]
+        rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
+        into.copy_(distort(lens, rays))
+    return found.reshape(lens.height, lens.width, 2)

@@ -15,6 +15,7 @@ from PIL import Image
 
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
+from pimper_torch.sfm.binding import release_memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +67,7 @@ def workspace(views: Views, threads: int) -> Iterator[Workspace]:
         space.masks.mkdir()
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(lambda index: _write(views, index, space), range(views.num_views)))
+        release_memory()
         yield space
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.sightings import SightingSettings, sight
+from pimper_torch.sfm.sightings import SightingSettings, log_pictures, sight
 from pimper_torch.sfm.tangents import tangents
 from tests.sfm import ball
 
@@ -19,6 +19,12 @@ def scene():
     return cameras, planes, pixels
 
 
+def pictures(views):
+    valid = views.inside if views.masks is None else views.masks
+    raster = (views.num_views, *views.images.shape[-2:])
+    return log_pictures(zip(views.images, valid, strict=True), raster)
+
+
 def errors(found, pixels):
     return (found.pixels - pixels[found.view, found.point]).norm(dim=1)
 
@@ -26,7 +32,9 @@ def errors(found, pixels):
 @pytest.mark.parametrize("lit", [False, True], ids=["one light", "another light each"])
 def test_points_are_found_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
     cameras, planes, pixels = scene
-    found = sight(ball.photographs(cameras, lit=lit, wall=True), cameras, planes, SETTINGS)
+    found = sight(
+        pictures(ball.photographs(cameras, lit=lit, wall=True)), cameras, planes, SETTINGS
+    )
     assert len(found.point) > 0.85 * 6 * 150
     assert errors(found, pixels).median() < (0.05 if lit else 0.02)
 
@@ -36,7 +44,9 @@ def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
     turned = cameras.cam_from_world.clone()
     turned[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels
     wrong = cameras.replace(cam_from_world=turned)
-    found = sight(ball.photographs(cameras, lit=False, wall=True), wrong, planes, SETTINGS)
+    found = sight(
+        pictures(ball.photographs(cameras, lit=False, wall=True)), wrong, planes, SETTINGS
+    )
     mine = (found.view == 3) & (planes.reference[found.point] != 3)
     # The reference's pixel is where the wrong camera has it, so its own points are left out.
     right, _ = project(planes.points_world, cameras.cam_from_world[3], cameras.intrinsics[3])
@@ -49,7 +59,7 @@ def test_what_stands_before_the_point_is_not_taken_for_it(scene):
     views = ball.photographs(cameras, wall=True)
     images = views.images.clone()
     images[2] = 0.2 * torch.rand(1, ball.HEIGHT, ball.WIDTH).double()
-    found = sight(views.replace(images=images), cameras, planes, SETTINGS)
+    found = sight(pictures(views.replace(images=images)), cameras, planes, SETTINGS)
     other = planes.reference[found.point] != 2
     assert not (found.view[other] == 2).any()
 
@@ -65,7 +75,7 @@ def test_patches_that_a_view_does_not_have_are_not_found(scene, how):
     else:
         value = 1.0 if how == "saturated" else torch.nan
         views = views.replace(images=torch.where(left[:, None], value, views.images))
-    found = sight(views, cameras, planes, SETTINGS)
+    found = sight(pictures(views), cameras, planes, SETTINGS)
     here = found.view == 1
     assert here.any()
     assert (found.pixels[here, 0] > ball.WIDTH / 2 - 8).all()
@@ -76,7 +86,7 @@ def test_where_nothing_has_texture_nothing_is_found(scene):
     cameras, planes, _ = scene
     views = ball.photographs(cameras, wall=True)
     plain = views.replace(images=torch.full_like(views.images, 0.3))
-    assert len(sight(plain, cameras, planes, SETTINGS).point) == 0
+    assert len(sight(pictures(plain), cameras, planes, SETTINGS).point) == 0
 
 
 def test_a_stripe_tells_no_place_along_itself(scene):
@@ -89,13 +99,13 @@ def test_a_stripe_tells_no_place_along_itself(scene):
         + 0.2 * stripes
         + 0.02 * torch.rand(6, 1, ball.HEIGHT, ball.WIDTH, generator=noise, dtype=torch.float64)
     )
-    found = sight(views.replace(images=images), cameras, planes, SETTINGS)
+    found = sight(pictures(views.replace(images=images)), cameras, planes, SETTINGS)
     assert len(found.point) < 0.05 * 6 * 150
 
 
 def test_sightings_are_sorted_and_the_reference_sees_what_others_found(scene):
     cameras, planes, pixels = scene
-    found = sight(ball.photographs(cameras, wall=True), cameras, planes, SETTINGS)
+    found = sight(pictures(ball.photographs(cameras, wall=True)), cameras, planes, SETTINGS)
     key = found.point * 6 + found.view
     assert (key.diff() > 0).all()
     own = found.view == planes.reference[found.point]
@@ -103,3 +113,26 @@ def test_sightings_are_sorted_and_the_reference_sees_what_others_found(scene):
     torch.testing.assert_close(
         found.pixels[own], pixels[found.view[own], found.point[own]], rtol=0, atol=1e-9
     )
+
+
+def test_pictures_are_logarithms_of_gray_above_a_fiftieth_of_the_median():
+    wide = torch.full((3, 8, 12), 0.5, dtype=torch.float64)
+    wide[0] = 0.2
+    wide[:, 0, 0] = torch.tensor([0.1, 1.0, 0.1])  # saturated in one channel
+    wide[1, 0, 1] = torch.nan
+    wide[:, 0, 2] = 0  # black
+    small = torch.full((3, 4, 6), 0.4)
+    valid = torch.ones(8, 12, dtype=torch.bool)
+    valid[7, 11] = False
+    found = log_pictures([(wide, valid), (small, valid[:4, :6])], (2, 8, 12))
+
+    usable = torch.zeros(2, 8, 12, dtype=torch.bool)
+    usable[0] = valid
+    usable[0, 0, :2] = False
+    usable[1, :4, :6] = True
+    assert torch.equal(found.unusable == 0, usable)
+    gray = torch.zeros(2, 8, 12)
+    gray[0], gray[1] = 0.4, 0.4
+    gray[0, 0, 2] = 0
+    expected = (gray + 0.02 * 0.4).log()
+    torch.testing.assert_close(found.log[usable], expected[usable])

@@ -102,6 +102,15 @@ def test_a_drawn_mask_moves_with_the_photograph():
     assert (undistorted.masks[0] == (source[..., 0] < 11.0))[clear].all()
 
 
+def test_pixels_of_a_large_photograph_are_those_that_the_lens_images():
+    lens = bent(500, 400, 0.02)  # more pixels than are distorted at a time
+    K = pinhole_for(lens)
+    pixels = pixel_centers(500, 400, like=K).reshape(-1, 2)
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
+    expected = distort(lens, torch.linalg.solve(K, homogeneous.mT).mT)
+    torch.testing.assert_close(photograph_pixels(lens).reshape(-1, 2), expected, equal_nan=True)
+
+
 def test_undistortion_lets_gradients_through():
     views = ramp_views([(6, 5)])
     lens = bent(6, 5, 0.3)
