@@ -5,7 +5,9 @@ what the runs warned of. With ``--reference MODEL``, a COLMAP model whose images
 photographs' names, or a folder with LLFF's ``poses_bounds.npy``, each view's rotation is compared
 with the model's; a view more than 2 degrees off counts as wrong. With ``--truth FOLDER``, as
 ``pimper render`` writes it, focal lengths and the places of the object's points are compared: where
-exact rays put them, after the similarity on cameras and after the best.
+exact rays put them, after the similarity on cameras and after the best. With several ``--seeds``
+each gets a row: matches and models are found with random numbers. With ``--threads 1`` a seed
+gives the same figures again.
 """
 
 import argparse
@@ -14,6 +16,7 @@ import resource
 import sys
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -94,6 +97,8 @@ def main() -> None:
     parser.add_argument("--masks", type=Path, help="folder of masks, white on the object")
     parser.add_argument("--max-size", type=int, default=0, help="longest side in pixels")
     parser.add_argument("--only", nargs="*", default=[], help="parts of the variants' names")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="one row each")
+    parser.add_argument("--threads", type=int, default=0, help="0 for all cores")
     options = parser.parse_args()
     truth = None
     if options.truth is not None:
@@ -105,13 +110,23 @@ def main() -> None:
         say("| " + " | ".join(COLUMNS) + " |")
         say("|---|" + "--:|" * (len(COLUMNS) - 1))
         told = []
-        for name, config in variants().items():
-            if not options.only or any(part in name for part in options.only):
-                with warnings.catch_warnings(record=True) as caught:
-                    warnings.simplefilter("always", PimperWarning)
-                    say(f"| {name} | {row(views, config, options.reference, truth)} |")
-                told += [f"{name}: {warning.message}" for warning in caught]
+        for name, config in chosen(options.only, options.seeds).items():
+            config = dataclasses.replace(config, threads=options.threads)
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", PimperWarning)
+                say(f"| {name} | {row(views, config, options.reference, truth)} |")
+            told += [f"{name}: {warning.message}" for warning in caught]
         say("".join(f"\n{line}\n" for line in told))
+
+
+def chosen(only: Sequence[str], seeds: Sequence[int]) -> dict[str, ReconstructConfig]:
+    """Take the settings whose names hold one of some parts, or all, once a seed."""
+    return {
+        name if len(seeds) == 1 else f"{name}, seed {seed}": dataclasses.replace(config, seed=seed)
+        for name, config in variants().items()
+        if not only or any(part in name for part in only)
+        for seed in seeds
+    }
 
 
 def say(line: str) -> None:
