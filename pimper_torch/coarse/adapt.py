@@ -87,10 +87,9 @@ class Adapt(nn.Module):
     ) -> CoarseMesh:
         """Adapt the mesh that the patches stand on to the surface that was found.
 
-        Lengths count in samples of these patches; the residual is their photometry's. Where
-        outlines tell what the object is, facets in their visual hull stay, and no others.
-        Elsewhere those with data do: a facet that shows in two views has some, whether or not it
-        is lit there.
+        Lengths count in samples of these patches; the residual is their photometry's. A facet
+        that shows in two views has data, whether or not it is lit there. Facets outside the
+        outlines' visual hull are dropped.
         """
         patches = swept.patches
         residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
@@ -102,7 +101,7 @@ class Adapt(nn.Module):
             residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
             seen = seen.index_copy(0, templates.facet, heights.num_views >= _SEEING)
         spacing = float(patches.buckets[0].spacing[0].detach())
-        stays = None if rims is None else within(rims.hull, surface, patches.num_patches)
+        inside = None if rims is None else within(rims.hull, surface, patches.num_patches)
         return adapt(
             patches.coarse,
             surface,
@@ -110,7 +109,7 @@ class Adapt(nn.Module):
             self.config,
             residual=residual,
             seen=seen,
-            stays=stays,
+            inside=inside,
         )
 
 
@@ -122,7 +121,7 @@ def adapt(
     *,
     residual: Float[Tensor, " facet"] | None = None,
     seen: Bool[Tensor, " facet"] | None = None,
-    stays: Bool[Tensor, " facet"] | None = None,
+    inside: Bool[Tensor, " facet"] | None = None,
 ) -> CoarseMesh:
     """Fit the coarse mesh to the surface that was found on it.
 
@@ -139,7 +138,7 @@ def adapt(
         config: Settings.
         residual: Of the photometry, one a facet, in any unit; NaN for none.
         seen: True for facets that have data whatever the surface's confidence says.
-        stays: The facets that are kept, if it is known; those with data otherwise.
+        inside: False for facets that are not of the object, whatever data they have.
 
     Returns:
         The adapted mesh. Its normals are the piecewise linear fit to the surface's. A vertex
@@ -161,9 +160,9 @@ def adapt(
     edges, face_edge = face_edges(faces)
     corners, middles = _on_surface(old, faces, edges, face_edge, surface)
     with torch.no_grad():
-        kept = stays
-        if kept is None or not bool(kept.any()):
-            kept = _with_data(old, faces, surface, seen, config.max_hole)
+        kept = _with_data(old, faces, surface, seen, config.max_hole)
+        if inside is not None and bool((kept & inside).any()):
+            kept = kept & inside
         severity = _severity(corners, faces, surface, spacing, residual, config)
         side = _side(corners, faces) / spacing
         small = (side < config.min_samples) | ~kept

@@ -136,7 +136,7 @@ def test_a_closed_mesh_stays_closed_and_nears_the_ball(generator):
     assert len(adapt(coarse, surface, SPACING, config).mesh.faces) == count
 
 
-def test_facets_in_the_hull_stay_whatever_is_known_of_them_and_no_others(generator):
+def test_facets_outside_the_hull_are_dropped(generator):
     vertices, faces = icosphere(2)
     coarse = coarse_of(vertices, faces)
     grid = torch.linspace(-1.5, 1.5, 31).double()
@@ -144,20 +144,15 @@ def test_facets_in_the_hull_stay_whatever_is_known_of_them_and_no_others(generat
     # Half a ball: the plane z = -0.2 cuts it.
     distance = torch.minimum(1.05 - (x**2 + y**2 + z**2).sqrt(), z + 0.2)
     hull = Hull(origin_world=grid[:1].expand(3), spacing=grid[1] - grid[0], distance=distance)
-    surface = surface_on(
-        coarse,
-        lambda points: points,
-        spacing=0.1,
-        confidence=lambda at: (at.points[:, 2] < 0).double(),
-    )
-    stays = within(hull, surface, len(faces))
+    surface = surface_on(coarse, lambda points: points, spacing=0.1)
+    inside = within(hull, surface, len(faces))
     high, low = vertices[faces][..., 2].amax(dim=1), vertices[faces][..., 2].amin(dim=1)
-    assert stays[low > -0.2].all()
-    assert not stays[high < -0.35].any()
-    found = adapt(coarse, surface, 0.1, stays=stays)
-    assert len(found.mesh.faces) == int(stays.sum())  # nothing is known of the upper half
-    without = adapt(coarse, surface, 0.1)
-    assert (without.mesh.vertices_world[:, 2] < 0.4).all()
+    assert inside[low > -0.2].all()
+    assert not inside[high < -0.35].any()
+    found = adapt(coarse, surface, 0.1, inside=inside)
+    assert len(found.mesh.faces) == int(inside.sum())
+    nowhere = torch.zeros_like(inside)
+    assert len(adapt(coarse, surface, 0.1, inside=nowhere).mesh.faces) == len(faces)
 
 
 def test_only_where_the_residual_is_high_if_nothing_else_is(generator):
