@@ -13,6 +13,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.components import face_components, vertex_fans
 from pimper_torch.geometry.surfaces import (
+    corners_of,
     face_edges,
     face_normals,
     face_pairs,
@@ -29,7 +30,7 @@ _ON_EDGE = 1e-6
 # Share of a facet's lattice vertices that must lie within the distance it is said to depart by.
 _DEPARTURE_SHARE = 0.9
 
-# Views that a facet has to show in to stay, whatever light tells of it.
+# Views that a facet has to show in to stay, without outlines, whatever light tells of it.
 _SEEING = 2
 
 # A facet smaller than this share of what it was before its corners moved has collapsed.
@@ -88,8 +89,9 @@ class Adapt(nn.Module):
         """Adapt the mesh that the patches stand on to the surface that was found.
 
         Lengths count in samples of these patches; the residual is their photometry's. A facet
-        that shows in two views has data, whether or not it is lit there. Facets outside the
-        outlines' visual hull are dropped.
+        that shows in two views has data, whether or not it is lit there. Inside the outlines'
+        visual hull one view is enough, as at the ends of an arc, or none beside a facet that
+        shows: contours run through both. Facets outside the hull are dropped.
         """
         patches = swept.patches
         residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
@@ -99,9 +101,14 @@ class Adapt(nn.Module):
         ):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
-            seen = seen.index_copy(0, templates.facet, heights.num_views >= _SEEING)
+            enough = heights.num_views >= (_SEEING if rims is None else 1)
+            seen = seen.index_copy(0, templates.facet, enough)
         spacing = float(patches.buckets[0].spacing[0].detach())
-        inside = None if rims is None else within(rims.hull, surface, patches.num_patches)
+        inside = None
+        if rims is not None:
+            mesh = patches.coarse.mesh
+            seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
+            inside = within(rims.hull, surface, patches.num_patches)
         return adapt(
             patches.coarse,
             surface,

@@ -75,7 +75,9 @@ def triangulation_angles(
     observed: Bool[Tensor, "point view"],
     centers_world: Float[Tensor, "view 3"],
 ) -> Float[Tensor, " point"]:
-    """Give each point's widest angle between two rays that saw it, in radians."""
+    """Give each point's widest angle between two rays that saw it, in radians; 0 without two."""
+    if len(centers_world) == 0:
+        return torch.zeros_like(points_world[:, 0])
     widest = []
     for points, seen in zip(
         torch.split(points_world, _POINTS), torch.split(observed, _POINTS), strict=True

@@ -100,3 +100,12 @@ def barycentric_2d(
     beta = (ap[..., 0] * ac[..., 1] - ap[..., 1] * ac[..., 0]) / area
     gamma = (ab[..., 0] * ap[..., 1] - ab[..., 1] * ap[..., 0]) / area
     return torch.stack([1 - beta - gamma, beta, gamma], dim=-1)
+
+
+def corners_of(
+    faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, " face"], num_vertices: int
+) -> Bool[Tensor, " {num_vertices}"]:
+    """Mark the vertices of some faces."""
+    marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
+    marked[faces[chosen].flatten()] = True
+    return marked

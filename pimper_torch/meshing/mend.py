@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from pimper_torch.config import require
 from pimper_torch.geometry.components import vertex_components
-from pimper_torch.geometry.surfaces import boundary_vertices, vertex_normals
+from pimper_torch.geometry.surfaces import boundary_vertices, corners_of, vertex_normals
 from pimper_torch.meshing.faults import faults
 from pimper_torch.meshing.groups import diagonal, small_groups
-from pimper_torch.meshing.plates import corners_of, least_bent
+from pimper_torch.meshing.plates import least_bent
 from pimper_torch.records import Surface
 
 # Rings of sound vertices that a place which stays broken may take in, one at a time.

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.geometry.surfaces import corners_of, face_edges
 from pimper_torch.linalg.systems import solutions
 
 
@@ -56,12 +56,3 @@ def least_bent(
     (found,) = solutions(rows.long(), cols.long(), values, side, what="the mending")
     (moved,) = torch.nonzero(free, as_tuple=True)
     return vertices.index_copy(0, moved, found.to(vertices))
-
-
-def corners_of(
-    faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, " face"], num_vertices: int
-) -> Bool[Tensor, " {num_vertices}"]:
-    """Mark the vertices of some faces."""
-    marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
-    marked[faces[chosen].flatten()] = True
-    return marked
