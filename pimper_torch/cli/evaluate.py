@@ -26,6 +26,7 @@ from pimper_torch.metrics.alignment import Method
 from pimper_torch.metrics.evaluate import EvaluateConfig, Evaluation, chosen_views, evaluate
 from pimper_torch.metrics.icp import IcpConfig
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
+from pimper_torch.viz.calibration import draw_calibration
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
 
@@ -97,6 +98,7 @@ class Job:
     result: Path
     truth: Path
     out: Path | None
+    calibration: Path | None = None
     options: EvaluateOptions = field(default_factory=EvaluateOptions)
 
 
@@ -108,9 +110,16 @@ def run(command: str, arguments: Sequence[str]) -> None:
     """
     job = parse(arguments)
     config = job.options.config()
-    if job.out is not None:
-        _check_writable(job.out)
+    for path in (job.out, job.calibration):
+        if path is not None:
+            _check_writable(path)
     estimate = read_estimate(job.result)
+    if job.calibration is not None and estimate.mesh.expected_error is None:
+        raise InputError(
+            f"{job.result}: tells no expected error, so there is nothing to calibrate; needed: a "
+            "result with `expected_error` at its vertices, as `pimper reconstruct` writes it "
+            "unless `fuse.error_draws` is 0."
+        )
     truth = read_truth(job, estimate, config)
     evaluation = evaluate(estimate, truth.capture, config, maps=truth.maps, dtu=truth.protocol)
     console = Console()
@@ -118,6 +127,9 @@ def run(command: str, arguments: Sequence[str]) -> None:
     if job.out is not None:
         write_report(evaluation, job)
         console.print(f"{job.out} has all figures.", highlight=False, soft_wrap=True)
+    if job.calibration is not None:
+        _draw(evaluation, job.calibration)
+        console.print(f"{job.calibration} is drawn.", highlight=False, soft_wrap=True)
 
 
 def parse(arguments: Sequence[str]) -> Job:
@@ -131,6 +143,7 @@ def parse(arguments: Sequence[str]) -> Job:
         result: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULT")],
         truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")],
         out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
+        calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
         options: Annotated[EvaluateOptions, tyro.conf.arg(name="")] = EvaluateOptions(),
     ) -> Job:
         """Measure a result against the truth, each figure under its own named convention.
@@ -139,9 +152,11 @@ def parse(arguments: Sequence[str]) -> Job:
             result: Folder that `pimper reconstruct` wrote, or a mesh of any method.
             truth: Folder of a rendered scene or of a data set, or a mesh.
             out: JSON file for all figures; a former one is replaced.
+            calibration: PNG file for the calibration curve of a result that tells its expected
+                error; a former one is replaced.
             options: The measuring.
         """
-        return Job(result=result, truth=truth, out=out, options=options)
+        return Job(result=result, truth=truth, out=out, calibration=calibration, options=options)
 
     return tyro.cli(evaluate, prog="pimper evaluate", args=list(arguments))
 
@@ -281,13 +296,31 @@ def write_report(evaluation: Evaluation, job: Job) -> None:
         raise OutputError(f"{job.out}: cannot be written ({error.strerror}).") from error
 
 
+def _draw(evaluation: Evaluation, path: Path) -> None:
+    """Draw expected against true error in per cent of the diagonal."""
+    surface = evaluation.surface
+    if surface is None or surface.calibration is None:
+        raise InputError(
+            "too little of the result belongs to the object to calibrate its expected error. "
+            "Check the alignment."
+        )
+    bins, percent = surface.calibration.bins, 100 / surface.diagonal
+    draw_calibration(
+        [percent * one.expected for one in bins],
+        [percent * one.root_mean_square for one in bins],
+        [percent * one.robust for one in bins],
+        "% of the diagonal",
+        path,
+    )
+
+
 def _check_writable(path: Path) -> None:
-    """Refuse, before the work, a report that cannot be written.
+    """Refuse, before the work, a file that cannot be written.
 
     Raises:
         OutputError: The path is a folder, or lies in none.
     """
     if path.is_dir():
-        raise OutputError(f"{path}: is a folder; needed: the name of a JSON file.")
+        raise OutputError(f"{path}: is a folder; needed: the name of a file.")
     if not path.resolve().parent.is_dir():
         raise OutputError(f"{path}: its folder is not there. Make it, or write elsewhere.")

@@ -36,15 +36,28 @@ _LEAST_LEFT = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Fused(Record):
-    """The heights, and how far each kind of evidence was right about itself.
+    """The heights, how far each kind of evidence was right about itself, and the last system.
 
     Attributes:
         heights: Of all vertices, float64.
         factors: What the variances that each kind claims were multiplied by.
+        kinds: Of evidence.
+        weights: Of every equation of each kind; outliers have less than 1.
+        hold: Information that vertices keep their start by.
     """
 
     heights: Float[Tensor, " vertex"]
     factors: tuple[float, ...]
+    kinds: tuple[Evidence, ...]
+    weights: tuple[Float[Tensor, " _"], ...]
+    hold: Float[Tensor, " vertex"]
+
+    def matrix(
+        self,
+    ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
+        """Give rows, columns and values of the matrix that was solved last."""
+        factors = [self.hold.new_tensor(factor).double() for factor in self.factors]
+        return _system(self.kinds, self.weights, factors, torch.zeros_like(self.hold), self.hold)[0]
 
 
 def fuse_evidence(
@@ -89,7 +102,13 @@ def fuse_evidence(
             weights[place] = 1 / (1 + square / (CAUCHY_TUNING**2 * factors[place]))
     entries, rhs = _system(kinds, weights, factors, start, hold)
     (heights,) = solutions(*entries, rhs, what="the fusion", tolerance=_ACCURACY)
-    return Fused(heights=heights, factors=tuple(float(factor.detach()) for factor in factors))
+    return Fused(
+        heights=heights,
+        factors=tuple(float(factor.detach()) for factor in factors),
+        kinds=tuple(kinds),
+        weights=tuple(weight.detach() for weight in weights),
+        hold=hold.detach(),
+    )
 
 
 def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:

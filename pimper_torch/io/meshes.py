@@ -20,13 +20,21 @@ from pimper_torch.radiometry import linear_from_srgb, to_bytes
 from pimper_torch.records import Mesh
 from pimper_torch.viz.maps import albedo_scale
 
+# One number a vertex, written and read under the names of the record's fields.
+_TOLD = ("confidence", "expected_error")
+
 
 def write_ply(mesh: Mesh, path: Path) -> None:
-    """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, ``confidence``."""
+    """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, what is told of errors.
+
+    These are the properties ``confidence`` and ``expected_error``, the latter in scene units.
+    """
     colors = None if mesh.albedo is None else to_bytes(_colors(mesh)).cpu().numpy()
     attributes = {}
-    if mesh.confidence is not None:
-        attributes["confidence"] = mesh.confidence.detach().cpu().float().numpy()
+    for name in _TOLD:
+        told = getattr(mesh, name)
+        if told is not None:
+            attributes[name] = told.detach().cpu().float().numpy()
     plain = _trimesh(mesh, colors)
     plain.vertex_attributes.update(attributes)
     path.write_bytes(trimesh.exchange.ply.export_ply(plain, vertex_normal=True))
@@ -37,8 +45,8 @@ def read_mesh(path: Path | str) -> Mesh:
 
     Faces of more corners are split, the parts of a scene put together; vertices keep their
     order and number. Vertex normals are kept if the file has some; colours are taken for
-    albedo (sRGB undone, except in glTF, whose colours are linear); a ``confidence`` of PLY
-    is kept too. A point cloud becomes a mesh without faces.
+    albedo (sRGB undone, except in glTF, whose colours are linear); ``confidence`` and
+    ``expected_error`` of PLY are kept too. A point cloud becomes a mesh without faces.
 
     Args:
         path: The file. Textures and materials beside it are not looked at.
@@ -111,7 +119,7 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
         encoded = encoded[:, :3] / (255 if np.asarray(colors).dtype.kind in "ui" else 1)
     raw = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
     written = getattr(getattr(raw, "dtype", None), "names", None) or raw
-    confidence = _rows(raw["confidence"]) if "confidence" in written else None
+    told = {name: _rows(raw[name]) if name in written else None for name in _TOLD}
     if normals is None and {"nx", "ny", "nz"} <= set(written):  # of a cloud, trimesh drops them
         normals = _rows(np.stack([np.ravel(raw[axis]) for axis in ("nx", "ny", "nz")], axis=1))
     return Mesh(
@@ -121,7 +129,7 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
         if normals is None
         else normalize(rotate(scene_from_part, normals), dim=-1),
         albedo=encoded if linear or encoded is None else linear_from_srgb(encoded),
-        confidence=None if confidence is None else confidence.reshape(-1),
+        **{name: None if one is None else one.reshape(-1) for name, one in told.items()},
     )
 
 
@@ -149,7 +157,7 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
         faces=torch.cat(faces),
         normals_world=all_of([part.normals_world for part in parts]),
         albedo=all_of([part.albedo for part in parts]),
-        confidence=all_of([part.confidence for part in parts]),
+        **{name: all_of([getattr(part, name) for part in parts]) for name in _TOLD},
     )
 
 

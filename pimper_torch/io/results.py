@@ -48,13 +48,14 @@ def write_result(
     ===============  ==============================================================
     file             what
     ===============  ==============================================================
-    `mesh.ply`       vertex normals, albedo as sRGB colour, confidence; binary
+    `mesh.ply`       vertex normals, albedo as sRGB colour, confidence, expected error
+                     in the unit of the vertices; binary
     `mesh.glb`       the same for viewers, albedo linear as glTF wants it
     `sparse/`        COLMAP model, in the mesh's frame
     `normals.png`    reference view: red right, green up, blue to the viewer
     `albedo.png`     reference view, sRGB, scaled into [0, 1]
     `depth.npz`      reference view: depth along z (NaN where the mesh is not seen),
-                     mask, confidence, intrinsics, cam_from_world, name
+                     mask, confidence, expected_error if known, intrinsics, cam_from_world, name
     `lights.json`    light of every view, averaged and for each patch, world frame
     `config.yaml`    every setting of the run
     `summary.json`   counts, times, memory, convergence
@@ -102,11 +103,13 @@ def _write_maps(result: Reconstruction, folder: Path) -> None:
 
 def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
     reference, cameras = result.coarse.reference, result.cameras
+    error = maps.expected_error
     np.savez_compressed(
         path,
         depth=_array(maps.depth),
         mask=maps.seen.numpy(),
         confidence=_array(maps.confidence),
+        **({} if error is None else {"expected_error": _array(error)}),
         intrinsics=_array(cameras.intrinsics[reference]),
         cam_from_world=_array(cameras.cam_from_world[reference]),
         name=np.array(result.scene.views.names[reference]),

@@ -21,6 +21,8 @@ class ExtractConfig:
 
     Attributes:
         min_confidence: Vertices with no more than this have no support of their own.
+        max_expected_error: Faces with a vertex that is expected to be further off are cut out;
+            a share of the surface's extent (diagonal of its bounding box). Infinite keeps all.
         max_hole: Connected vertices without support stay, as a filled hole, when they
             extend over no more than this share of the surface's extent (both diagonals
             of bounding boxes).
@@ -34,6 +36,7 @@ class ExtractConfig:
     """
 
     min_confidence: float = 0.0
+    max_expected_error: float = 0.01
     max_hole: float = 1.0
     max_stretch: float = 10.0
     overturned: Literal["folded", "all", "none"] = "folded"
@@ -41,6 +44,9 @@ class ExtractConfig:
 
     def __post_init__(self) -> None:
         require(0 <= self.min_confidence < 1, "min_confidence", self.min_confidence, "in [0, 1)")
+        require(
+            self.max_expected_error > 0, "max_expected_error", self.max_expected_error, "above 0"
+        )
         require(self.max_hole >= 0, "max_hole", self.max_hole, "0 or more")
         require(self.max_stretch > 1, "max_stretch", self.max_stretch, "above 1")
         require(0 <= self.min_piece <= 1, "min_piece", self.min_piece, "in [0, 1]")
@@ -78,6 +84,9 @@ class Extract(nn.Module):
         max_hole = self.config.max_hole * diagonal(vertices)
         filled = small_groups(vertices, surface.faces, ~supported, max_hole)
         keep = (supported | filled)[surface.faces].all(dim=1)
+        error, bound = surface.expected_error, self.config.max_expected_error
+        if error is not None:
+            keep &= (error <= bound * diagonal(vertices))[surface.faces].all(dim=1)
         with_support = int(keep.sum())
         faces = surface.faces[keep & ~self._spikes(surface)]
         if len(faces) == 0:
@@ -85,6 +94,7 @@ class Extract(nn.Module):
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
                 f"{len(faces)} of those are no spikes; at least one is needed. Lower "
                 f"`extract.min_confidence` (now {self.config.min_confidence}), raise "
+                f"`extract.max_expected_error` (now {bound}) or "
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the share "
                 "of missing data that the report gives."
             )
@@ -96,6 +106,7 @@ class Extract(nn.Module):
             normals_world=normalize(surface.normals_world[source], dim=-1),
             albedo=surface.albedo[source],
             confidence=surface.confidence[source],
+            expected_error=None if error is None else error[source],
         )
 
     def _spikes(self, surface: Surface) -> Bool[Tensor, " face"]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from pimper_torch.metrics.calibration import Calibration
 from pimper_torch.metrics.distances import DistanceFigures, SurfaceComparison, TwoSided
 from pimper_torch.metrics.dtu import CAP_MM, THINNING_MM, DtuFigures
 from pimper_torch.metrics.evaluate import Evaluation
@@ -92,6 +93,25 @@ def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
     if surface.seen is not None and surface.seen_share is not None:
         part = f"the {_share(surface.seen_share)} of it seen from {surface.seen_from} places"
         yield from _two_sided_rows(surface.seen, " (seen)", part)
+    if surface.calibration is not None:
+        yield from _calibration_rows(surface.calibration, surface.diagonal)
+
+
+def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[Row]:
+    yield Row(
+        name="expected_error",
+        value=f"{found.ratio:.2f}; {_share(found.within_one)}, {_share(found.within_two)}; "
+        f"{found.rank_correlation:.2f}",
+        meaning="true over expected error, 1 if calibrated; true error within one and two "
+        "expected, 68 and 95 % if calibrated; rank correlation",
+    )
+    for which, one in (("surest", found.bins[0]), ("least sure", found.bins[-1])):
+        yield Row(
+            name=f"{which} tenth",
+            value=f"{_number(100 * one.expected / diagonal)} %; "
+            f"{_number(100 * one.root_mean_square / diagonal)} %",
+            meaning="expected error; true error, root mean squares",
+        )
 
 
 def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[Row]:

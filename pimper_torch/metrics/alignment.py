@@ -121,11 +121,12 @@ def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Camer
 def carry(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
     """Put a mesh in the frame of the truth by a similarity, in float64 on the CPU."""
     mesh = mesh.to("cpu")
-    _, rotation = split_similarity(truth_from_world)
-    normals = mesh.normals_world
+    scale, rotation = split_similarity(truth_from_world)
+    normals, error = mesh.normals_world, mesh.expected_error
     return mesh.replace(
         vertices_world=transform(truth_from_world.cpu().double(), mesh.vertices_world.double()),
         normals_world=None if normals is None else normals.double() @ rotation.cpu().double().mT,
+        expected_error=None if error is None else float(scale) * error.double(),
     )
 
 

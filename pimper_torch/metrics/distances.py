@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.metrics.calibration import Calibration, calibrate
 from pimper_torch.metrics.sampling import sample_surface
 from pimper_torch.metrics.visible import count_seeing
 from pimper_torch.records import Capture, Mesh, Record
@@ -88,6 +89,8 @@ class SurfaceComparison(Record):
             nobody knows which it is, or none is.
         seen_from: How many places of the camera.
         seen_share: Share of the truth that is seen so; ``None`` if nobody knows.
+        calibration: Of the estimate's expected error, over its samples that count for the
+            accuracy; ``None`` if it tells none.
     """
 
     diagonal: float
@@ -97,6 +100,7 @@ class SurfaceComparison(Record):
     seen: TwoSided | None
     seen_from: int
     seen_share: float | None
+    calibration: Calibration | None = None
 
 
 class TrueSurface:
@@ -146,12 +150,16 @@ class TrueSurface:
             InputError: The estimate has no extent.
         """
         self._generator.set_state(self._state)  # the order of the estimates changes nothing
-        ours = sample_surface(mesh, self._samples, self._generator).points
+        drawn = sample_surface(mesh, self._samples, self._generator)
+        ours = drawn.points
         to_truth = self._object.query(ours).distance
         aside = torch.zeros(len(ours), dtype=torch.bool)
         if self._surroundings is not None:
             aside = self._surroundings.query(ours).distance < to_truth
         to_truth = to_truth[~aside]
+        calibration = None
+        if mesh.expected_error is not None:
+            calibration = calibrate(drawn.interpolate(mesh.expected_error)[~aside], to_truth)
         to_estimate = NearestSurface(mesh).query(self._points).distance
 
         def two_sided(distances: Float[Tensor, " sample"]) -> TwoSided | None:
@@ -168,6 +176,7 @@ class TrueSurface:
             seen=None if seen is None else two_sided(to_estimate[seen]),
             seen_from=self._seen_from,
             seen_share=None if seen is None else float(seen.double().mean()),
+            calibration=calibration,
         )
 
 

@@ -19,10 +19,19 @@ class SurfaceSamples(Record):
     Attributes:
         points: World, float64.
         normals: Of the faces they lie in, unit; ``None`` for a point cloud.
+        corners: Vertices that each lies between; the one that it is of a point cloud.
+        shares: Of these; they add up to 1.
     """
 
     points: Float[Tensor, "sample 3"]
     normals: Float[Tensor, "sample 3"] | None
+    corners: Int[Tensor, "sample corner"]
+    shares: Float[Tensor, "sample corner"]
+
+    def interpolate(self, per_vertex: Float[Tensor, " vertex"]) -> Float[Tensor, " sample"]:
+        """Blend what is known at the vertices of the surface."""
+        values = per_vertex.detach().to(self.shares)[self.corners]
+        return (self.shares * values).sum(dim=1)
 
 
 def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> SurfaceSamples:
@@ -46,7 +55,13 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
         raise InputError("the surface has no vertices; needed: a mesh or a point cloud.")
     if len(faces) == 0:
         chosen = torch.randperm(len(vertices), generator=generator)[:count]
-        return SurfaceSamples(points=vertices[chosen], normals=None)
+        corners = chosen[:, None]
+        return SurfaceSamples(
+            points=vertices[chosen],
+            normals=None,
+            corners=corners,
+            shares=torch.ones_like(corners, dtype=torch.float64),
+        )
     normals = face_normals(vertices, faces)
     ends = normals.norm(dim=1).cumsum(dim=0)
     if not float(ends[-1]) > 0:
@@ -60,7 +75,12 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
     u, v = torch.where(fold, 1 - u, u), torch.where(fold, 1 - v, v)
     a, b, c = vertices[faces[face]].unbind(dim=1)
     points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    return SurfaceSamples(points=points, normals=normalize(normals[face], dim=1))
+    return SurfaceSamples(
+        points=points,
+        normals=normalize(normals[face], dim=1),
+        corners=faces[face],
+        shares=torch.stack([1 - u - v, u, v], dim=1),
+    )
 
 
 def _drawn(

@@ -27,7 +27,6 @@ from pimper_torch.records.scene import (
     Lens,
     Mesh,
     SparseScene,
-    Support,
     pairs_table,
 )
 from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
@@ -61,7 +60,6 @@ __all__ = [
     "SparseScene",
     "StageReport",
     "StopCause",
-    "Support",
     "Surface",
     "SweptPatches",
     "Templates",

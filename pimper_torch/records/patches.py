@@ -303,6 +303,8 @@ class Surface(Record):
         albedo: Linear, up to one scale; continued from round about where no light tells it.
         confidence: In [0, 1]; 0 where no view determined the vertex.
         convergence: Of the refinement, one entry.
+        expected_error: Standard error of each vertex across the surface, scene units, given the
+            cameras; ``None`` where nobody tells.
     """
 
     vertices_world: Float[Tensor, "vertex 3"]
@@ -313,6 +315,7 @@ class Surface(Record):
     albedo: Float[Tensor, "vertex channel"]
     confidence: Float[Tensor, " vertex"]
     convergence: Convergence
+    expected_error: Float[Tensor, " vertex"] | None = None
 
     @property
     def mesh(self) -> Mesh:
@@ -323,4 +326,5 @@ class Surface(Record):
             normals_world=self.normals_world,
             albedo=self.albedo,
             confidence=self.confidence,
+            expected_error=self.expected_error,
         )

@@ -1,7 +1,6 @@
 """What structure from motion finds, and triangle meshes."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -82,6 +81,8 @@ class Mesh(Record):
         normals_world: Unit, outward, one a vertex.
         albedo: Linear, one a vertex, up to one scale for the whole mesh.
         confidence: In [0, 1], one a vertex: how well the photographs determine it.
+        expected_error: Scene units, one a vertex: its standard error across the surface, given
+            the cameras.
     """
 
     vertices_world: Float[Tensor, "vertex 3"]
@@ -89,6 +90,7 @@ class Mesh(Record):
     normals_world: Float[Tensor, "vertex 3"] | None = None
     albedo: Float[Tensor, "vertex channel"] | None = None
     confidence: Float[Tensor, " vertex"] | None = None
+    expected_error: Float[Tensor, " vertex"] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -106,19 +108,6 @@ class FacetPoints(Record):
     facet: Int[Tensor, " point"]
 
 
-class Support(IntEnum):
-    """What tells where a facet lies, the best of it."""
-
-    NOTHING = 0
-    """It closes the surface."""
-    LIGHT = 1
-    """Views show it lit, so that shading can tell its shape."""
-    RIM = 2
-    """Rays through the outlines touch it."""
-    POINTS = 3
-    """Points matched between views lie on it."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CoarseMesh(Record):
     """The few hundred facets that the pieces of the method stand on.
@@ -131,8 +120,6 @@ class CoarseMesh(Record):
         covariance_world: Of each vertex that is a point, scene units squared; zero for the
             others. ``None`` for a mesh that comes from elsewhere.
         points: The cloud between the vertices; ``None`` for a mesh from elsewhere.
-        support: What tells where each facet lies, a value of :class:`Support`; ``None`` where
-            nobody asked.
     """
 
     mesh: Mesh
@@ -140,4 +127,3 @@ class CoarseMesh(Record):
     is_point: Bool[Tensor, " vertex"]
     covariance_world: Float[Tensor, "vertex 3 3"] | None = None
     points: FacetPoints | None = None
-    support: Int[Tensor, " face"] | None = None

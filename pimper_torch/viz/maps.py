@@ -25,6 +25,7 @@ class ViewMaps(Record):
         normals_cam: Unit, camera frame, as the mesh carries them; zero where nothing is seen.
         albedo: As the mesh carries it; zero where nothing is seen.
         confidence: The same.
+        expected_error: The same, scene units; ``None`` where the mesh carries none.
     """
 
     seen: Bool[Tensor, "height width"]
@@ -32,6 +33,7 @@ class ViewMaps(Record):
     normals_cam: Float[Tensor, "height width 3"]
     albedo: Float[Tensor, "height width channel"]
     confidence: Float[Tensor, "height width"]
+    expected_error: Float[Tensor, "height width"] | None = None
 
 
 def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None) -> ViewMaps:
@@ -54,6 +56,7 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
         normals = vertex_normals(vertices, mesh.faces)
     albedo = torch.full_like(vertices, _GREY) if mesh.albedo is None else mesh.albedo
     confidence = torch.ones_like(vertices[:, 0]) if mesh.confidence is None else mesh.confidence
+    error = mesh.expected_error
     seen = hits.face >= 0
     shown = normalize(hits.interpolate(normals, mesh.faces), dim=-1)
     return ViewMaps(
@@ -62,6 +65,9 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
         normals_cam=rotate(cameras.cam_from_world[view], shown),
         albedo=hits.interpolate(albedo, mesh.faces),
         confidence=hits.interpolate(confidence[:, None], mesh.faces)[..., 0],
+        expected_error=None
+        if error is None
+        else hits.interpolate(error[:, None], mesh.faces)[..., 0],
     )
 
 

@@ -2,10 +2,11 @@ import json
 
 import pytest
 import torch
+from PIL import Image
 
 from pimper_torch.cli.evaluate import named_as
 from pimper_torch.cli.main import main
-from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Capture, Estimate, Mesh, Truth, Views
 from pimper_torch.scenes.config import SceneConfig
 from pimper_torch.scenes.meshes import icosphere
@@ -69,6 +70,24 @@ def test_the_true_mesh_of_a_rendered_scene_has_no_error(rendering, capsys):
     assert "along the rays of view_001.png" in told  # the middle one
     assert "100.0 %" in told
     assert "seen from 3 places" in told
+
+
+def test_expected_against_true_error_is_drawn(ball, tmp_path, capsys):
+    larger = sphere(tmp_path / "larger.ply", 1.1)
+    drawing, out = tmp_path / "calibration.png", tmp_path / "report.json"
+    assert run(larger, ball, "--calibration", drawing) == 2
+    assert "tells no expected error" in capsys.readouterr().err
+    mesh = read_mesh(larger)
+    told = mesh.replace(expected_error=0.05 * (2 + mesh.vertices_world[:, 2]))
+    write_ply(told, larger)
+    assert run(larger, ball, "--samples", 3000, "--calibration", drawing, "-o", out) == 0
+    assert str(drawing) in capsys.readouterr().out
+    assert Image.open(drawing).size[0] > 300
+    found = json.loads(out.read_text())["surface"]["calibration"]
+    assert len(found["bins"]) == 10
+    assert found["ratio"] == pytest.approx(0.1 / 0.1 / 0.6745, rel=0.1)
+    assert run(larger, ball, "--calibration", tmp_path / "nowhere" / "one.png") == 2
+    assert "folder is not there" in capsys.readouterr().err
 
 
 def test_views_may_be_named(rendering, tmp_path, capsys):

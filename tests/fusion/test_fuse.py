@@ -209,6 +209,42 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
     assert pimple.abs().max() < 0.1
 
 
+def noisy(lifted, given, points: float, turn: float, seed: int):
+    """Add noise to normals, radians, and give the cloud noisy points, in samples."""
+    generator = torch.Generator().manual_seed(seed)
+    spacing = float(given.patches.buckets[0].spacing[0])
+    buckets = []
+    for found in given.photometric.buckets:
+        noise = torch.randn(found.normals_patch.shape, generator=generator, dtype=torch.float64)
+        wrong = normalize(found.normals_patch + turn * noise, dim=-1)
+        buckets.append(found.replace(normals_patch=wrong))
+    turned = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
+    cloud = near_plane(lifted, 0.0)
+    cloud = cloud + points * spacing * torch.randn(cloud.shape, generator=generator).double()
+    return with_points(turned, cloud, points * spacing)
+
+
+def test_the_expected_error_is_the_true_one_on_noise_of_two_levels(swept):
+    lifted, given = swept(0.5)
+    spacing = float(given.patches.buckets[0].spacing[0])
+    fuse = Fuse(FuseConfig(heights=False, drift_rounds=1, noise_rounds=2))
+    median = []
+    for points, turn in ((0.05, 0.02), (0.4, 0.1)):
+        ratios, expected = [], []
+        for seed in range(3):
+            surface = fuse(noisy(lifted, given, points, turn, seed))
+            error = surface.expected_error / spacing
+            off = off_plane(lifted, surface).abs()
+            ratios.append(float((off / error).median() / 0.6745))
+            expected.append(float(error.median()))
+        # A plane through 24 points has three errors, so that one draw of noise varies by two.
+        assert 0.4 < sorted(ratios)[1] < 2.5
+        median.append(sorted(expected)[1])
+    assert 3 < median[1] / median[0] < 12  # noise is 8 and 5 times as large
+    silent = Fuse(FuseConfig(heights=False, drift_rounds=1, noise_rounds=2, error_draws=0))
+    assert silent(noisy(lifted, given, 0.1, 0.05, 0)).expected_error is None
+
+
 def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
     lifted, given = swept(0.8)
     nothing = tuple(

@@ -21,6 +21,7 @@ def mesh():
         normals_world=normalize(normals, dim=1),
         albedo=torch.rand(5, 3, generator=generator, dtype=torch.float64),
         confidence=torch.rand(5, generator=generator, dtype=torch.float64),
+        expected_error=torch.rand(5, generator=generator, dtype=torch.float64),
     )
 
 
@@ -35,6 +36,7 @@ def test_a_mesh_comes_back_from_its_file(mesh, write, suffix, tmp_path):
     assert_close(read.albedo, mesh.albedo * albedo_scale(mesh), rtol=0, atol=0.006)
     if suffix == ".ply":
         assert_close(read.confidence, mesh.confidence, rtol=0, atol=1e-7)
+        assert_close(read.expected_error, mesh.expected_error, rtol=0, atol=1e-7)
 
 
 def test_parts_of_a_scene_stand_where_the_scene_puts_them(tmp_path):

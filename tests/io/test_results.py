@@ -121,6 +121,16 @@ def test_depth_leads_back_to_the_surface(reconstruction, tmp_path):
     assert (z - 0.5 * torch.exp(-3 * (x**2 + y**2))).abs().max() < 0.02
     assert len(rows) > 500
     assert found["depth"][~found["mask"]].isnan().all()
+    assert "expected_error" not in found  # this result tells none
+
+
+def test_the_expected_error_is_written_where_the_result_tells_it(reconstruction, tmp_path):
+    told = reconstruction.mesh.replace(expected_error=reconstruction.mesh.vertices_world[:, 2])
+    write_result(reconstruction.replace(mesh=told), Config(), tmp_path / "out")
+    with np.load(tmp_path / "out" / "depth.npz", allow_pickle=False) as stored:
+        found, mask = torch.from_numpy(stored["expected_error"]), stored["mask"]
+    assert 0.45 < found.max() <= 0.5  # blended over the bump, which is so high
+    assert (found[~torch.from_numpy(mask)] == 0).all()
 
 
 def test_normals_and_albedo_are_pictures_of_the_reference_photographs_size(

@@ -159,8 +159,30 @@ def test_a_surface_without_enough_support_is_refused():
         )
 
 
+def test_what_is_expected_to_be_too_far_off_is_cut_out():
+    surface = sheet()
+    share = columns(surface) / (SIDE - 1) / 10
+    told = surface.replace(expected_error=share * diagonal(surface.vertices_world))
+    mesh = Extract(ExtractConfig(max_expected_error=0.05))(told)
+    assert columns(mesh).max() == (SIDE - 1) / 2
+    assert len(mesh.faces) == len(surface.faces) // 2
+    kept = mesh.vertices_world[:, 0] / (SIDE - 1) / 10 * diagonal(surface.vertices_world)
+    assert_close(mesh.expected_error, kept)  # each with its own vertex
+    assert len(Extract(ExtractConfig(max_expected_error=0.11))(told).faces) == len(surface.faces)
+    with pytest.raises(ReconstructionError, match="max_expected_error"):
+        Extract(ExtractConfig(max_expected_error=1e-9))(
+            surface.replace(expected_error=1 + 0 * share)
+        )
+
+
 @pytest.mark.parametrize(
-    ("name", "value"), [("min_confidence", 1.0), ("max_hole", -0.1), ("max_stretch", 1.0)]
+    ("name", "value"),
+    [
+        ("min_confidence", 1.0),
+        ("max_expected_error", 0.0),
+        ("max_hole", -0.1),
+        ("max_stretch", 1.0),
+    ],
 )
 def test_settings_that_mean_nothing_are_refused(name, value):
     with pytest.raises(ConfigError, match=name):

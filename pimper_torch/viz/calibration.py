@@ -1,0 +1,42 @@
+"""Expected against true error as a figure."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+_SIZE_IN = 4.5
+
+
+def draw_calibration(
+    expected: Sequence[float],
+    root_mean_square: Sequence[float],
+    robust: Sequence[float],
+    unit: str,
+    path: Path,
+) -> None:
+    """Draw the calibration curve on logarithmic axes, and the diagonal that is right.
+
+    Args:
+        expected: Errors of the bins.
+        root_mean_square: Of their true errors.
+        robust: The same, blind to outliers.
+        unit: Of all errors.
+        path: PNG file.
+    """
+    # Local, so that importing the package does not load matplotlib; Figure without pyplot
+    # leaves no global state behind.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(_SIZE_IN, _SIZE_IN), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    ends = [f([*expected, *robust, *root_mean_square]) for f in (min, max)]
+    axes.plot(ends, ends, color="0.7", label="calibrated")
+    axes.plot(expected, root_mean_square, "o-", label="root mean square")
+    axes.plot(expected, robust, "s--", label="median / 0.6745")
+    axes.set(
+        xscale="log", yscale="log", xlabel=f"expected error, {unit}", ylabel=f"true error, {unit}"
+    )
+    axes.set_aspect("equal")
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=150)

@@ -1,0 +1,177 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.fusion.bands import coarse_part
+from pimper_torch.fusion.estimate import fuse_evidence
+from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.fusion.expected_error import expected_error
+from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.surfaces import face_edges
+
+# Standard errors from so many draws are off by 4 %; of all vertices, by three times that.
+DRAWS, CLOSE = 300, 0.13
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(92)
+
+
+@pytest.fixture(scope="module")
+def square():
+    """Four facets round the middle of a square, subdivided."""
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]]).double()
+    facets = torch.tensor([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    return subdivide(corners, facets, torch.full((4,), 0.15).double()), facets
+
+
+def differences(lattice, deviation, correlated=1.0, judged=True):
+    """Say how heights differ along all edges."""
+    edges = face_edges(lattice.faces)[0]
+    length = (lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]]).norm(dim=1)
+    return Evidence(
+        unknowns=edges,
+        coefficients=torch.tensor([-1.0, 1.0]).double().expand(len(edges), 2),
+        targets=torch.zeros(len(edges)).double(),
+        information=1 / (correlated * (deviation * length) ** 2),
+        correlated=torch.full_like(length, correlated),
+        judged=judged,
+    )
+
+
+def heights(lattice, deviation, correlated=1.0, vertices=None):
+    vertices = torch.arange(len(lattice.points)) if vertices is None else vertices
+    ones = torch.ones(len(vertices)).double()
+    return Evidence(
+        unknowns=vertices[:, None],
+        coefficients=ones[:, None],
+        targets=0 * ones,
+        information=ones / (correlated * deviation**2),
+        correlated=correlated * ones,
+    )
+
+
+def solved(lattice, *kinds):
+    count = len(lattice.points)
+    hold = torch.full((count,), 1e-6).double()
+    return fuse_evidence(kinds, torch.zeros(count).double(), hold, rounds=1)
+
+
+def dense(fused):
+    """The matrix that was solved, and what each target is multiplied by."""
+    count = len(fused.hold)
+    rows = []
+    for kind in fused.kinds:
+        jacobian = torch.zeros(len(kind.targets), count).double()
+        jacobian.scatter_add_(1, kind.unknowns, kind.coefficients)
+        rows.append(jacobian)
+    jacobian = torch.cat([*rows, torch.eye(count).double()])
+    weight = torch.cat([*(kind.information for kind in fused.kinds), fused.hold])
+    matrix = jacobian.mT @ (weight[:, None] * jacobian)
+    return matrix, torch.linalg.solve(matrix, jacobian.mT * weight)
+
+
+def near(found, expected):
+    assert ((found / expected - 1).abs() < CLOSE).all()
+
+
+@pytest.mark.parametrize("deviation", [0.01, 0.1])
+def test_independent_noise_gives_the_diagonal_of_the_inverse(square, deviation):
+    lattice, facets = square
+    fused = solved(lattice, differences(lattice, 0.02), heights(lattice, deviation))
+    found = expected_error(fused, fused, lattice, facets, DRAWS)
+    near(found, torch.linalg.inv(dense(fused)[0]).diagonal().sqrt())
+
+
+def test_what_a_facet_errs_by_together_does_not_average_out(square):
+    lattice, facets = square
+    sure, alike = heights(lattice, 0.05), heights(lattice, 0.05, correlated=12.0)
+    tied = differences(lattice, 0.02)
+    fused = solved(lattice, tied, alike)
+    found = expected_error(fused, fused, lattice, facets, DRAWS)
+    # Oracle: the covariance of the targets, written out.
+    facet = lattice.facet
+    count = torch.bincount(facet)[facet].double()
+    share = (11 / (count - 1)).clamp_max(1)
+    together = (share[:, None] * share).sqrt() * (facet[:, None] == facet)
+    covariance = 0.05**2 * (together + torch.diag(1 - share))
+    _, answer = dense(fused)
+    edges = len(tied.targets)
+    total = answer[:, :edges] @ torch.diag(1 / tied.information) @ answer[:, :edges].mT
+    own = answer[:, edges : edges + len(facet)]
+    total = total + own @ covariance @ own.mT
+    near(found, total.diagonal().sqrt())
+    trusting = solved(lattice, tied, sure)
+    assert (found > 1.5 * expected_error(trusting, trusting, lattice, facets, DRAWS)).all()
+
+
+def test_a_tilt_of_a_facet_turns_edges_by_where_they_point(square):
+    lattice, facets = square
+    kept = differences(lattice, 0.1, judged=False)  # all of it is alike
+    fused = solved(lattice, kept, heights(lattice, 0.01, vertices=torch.tensor([0])))
+    found = expected_error(fused, fused, lattice, facets, DRAWS)
+    # Oracle: one tilt of 0.1 a facet, along both axes of the plane.
+    edges = kept.unknowns
+    along = normalize(lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]], dim=1)
+    facet = lattice.facet[edges[:, 0]]
+    alike = (along @ along.mT) * (facet[:, None] == facet)
+    deviation = kept.information.rsqrt()
+    covariance = deviation[:, None] * deviation * alike
+    _, answer = dense(fused)
+    own = answer[:, : len(edges)]
+    total = own @ covariance @ own.mT
+    total = total + 0.01**2 * answer[:, len(edges) : len(edges) + 1].square() * torch.eye(len(own))
+    near(found[1:], total.diagonal().sqrt()[1:])
+
+
+def test_detail_of_one_solve_and_shape_of_another_err_by_the_same_noise(square):
+    lattice, facets = square
+    tied = differences(lattice, 0.03, correlated=9.0)
+    fine = solved(lattice, differences(lattice, 0.03), heights(lattice, 0.1))
+    coarse = solved(lattice, tied, heights(lattice, 0.1))
+    found = expected_error(fine, coarse, lattice, facets, DRAWS)
+    eye = torch.eye(len(lattice.points)).double()
+    low = torch.stack([coarse_part(one, lattice, facets) for one in eye], dim=1)
+    (_, of_fine), (_, of_coarse) = dense(fine), dense(coarse)
+    answer = of_fine + low @ (of_coarse - of_fine)
+    # Noise is that of the coarse solve: on a facet, edges share a part of it.
+    edges = tied.unknowns
+    along = normalize(lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]], dim=1)
+    facet = lattice.facet[edges[:, 0]]
+    count = torch.bincount(facet)[facet].double()
+    share = (8 / (count - 1)).clamp_max(1)
+    together = (share[:, None] * share).sqrt() * (along @ along.mT) * (facet[:, None] == facet)
+    deviation = (tied.information * 9).rsqrt()
+    covariance = deviation[:, None] * deviation * (together + torch.diag(1 - share))
+    own, rest = answer[:, : len(edges)], answer[:, len(edges) : len(edges) + len(eye)]
+    total = own @ covariance @ own.mT + 0.1**2 * rest @ rest.mT
+    near(found, total.diagonal().sqrt())
+
+
+def test_what_nothing_tells_may_be_anywhere(square):
+    lattice, facets = square
+    known = heights(lattice, 0.01, vertices=torch.arange(10))
+    fused = solved(lattice, known)
+    found = expected_error(fused, fused, lattice, facets, 20)
+    assert (found[:10] < 0.03).all()
+    assert (found[10:] > 300).all()  # held by 1e-6
+
+
+def test_outliers_that_lost_their_weight_are_no_part_of_the_noise(square, generator):
+    lattice, facets = square
+    told = heights(lattice, 0.05)
+    noise = 0.05 * torch.randn(len(told.targets), generator=generator, dtype=torch.float64)
+    wild = noise.clone()
+    wild[::15] += 3.0
+    count = len(lattice.points)
+    hold = torch.full((count,), 1e-6).double()
+    tied = differences(lattice, 0.02)
+    plain, spoiled = (
+        fuse_evidence([tied, told.replace(targets=one)], torch.zeros(count).double(), hold, 6)
+        for one in (noise, wild)
+    )
+    clean = expected_error(plain, plain, lattice, facets, DRAWS)
+    found = expected_error(spoiled, spoiled, lattice, facets, DRAWS)
+    assert_close(found.mean(), clean.mean(), rtol=0.25, atol=0)
