@@ -1,4 +1,4 @@
-"""OpenMVS, if the user has it: depth maps, Delaunay and graph cut, optional refinement."""
+"""OpenMVS, if the user has it: depth maps, Delaunay and graph cut, refinement."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,7 +56,7 @@ class OpenMvsConfig:
     folder: Path | None = None
     resolution_level: int = 1
     min_resolution_px: int = 640
-    refine: bool = False
+    refine: bool = True
     threads: int = 0
     max_minutes: float = 120.0
     keep_in: Path | None = None
@@ -71,7 +71,7 @@ class OpenMvsConfig:
 
 
 class OpenMvs(nn.Module):
-    """Depth maps by patch match, a mesh that explains their visibility, maybe refined."""
+    """Depth maps by patch match, a mesh that explains their visibility, refined."""
 
     def __init__(self, config: OpenMvsConfig | None = None) -> None:
         super().__init__()
@@ -130,7 +130,7 @@ class _Run:
         points = ("-p", "scene_dense.ply") if self._names_points() else ()
         path, printed = self._call(RECONSTRUCT, "-i", _DENSE, *points, leaves=(_MESH,))
         last = RECONSTRUCT
-        if config.refine:
+        if config.refine and path.is_file():
             path, printed = self._call(REFINE, "-i", _DENSE, "--mesh-file", _MESH, leaves=_REFINED)
             last = REFINE
         return read_surface(path, last.name, printed)

@@ -88,7 +88,8 @@ def install(tmp_path, triangle, *, points=False, finds=True, names=PROGRAMS):
 @pytest.mark.parametrize("points", [False, True], ids=["old version", "new version"])
 def test_the_mesh_comes_back_in_the_scenes_frame(reconstruction, triangle, tmp_path, points):
     install(tmp_path, triangle, points=points)
-    estimate = OpenMvs()(reconstruction.scene, reconstruction.coarse)
+    plain = OpenMvs(OpenMvsConfig(refine=False))
+    estimate = plain(reconstruction.scene, reconstruction.coarse)
     assert_close(estimate.mesh.vertices_world, triangle.vertices_world)
     assert torch.equal(estimate.mesh.faces, triangle.faces)
     assert estimate.names == ("a.png", "b.png", "c.png")
@@ -96,9 +97,9 @@ def test_the_mesh_comes_back_in_the_scenes_frame(reconstruction, triangle, tmp_p
     assert not list(tmp_path.glob("pimper-*"))
 
 
-def test_the_refined_mesh_comes_back_if_it_was_asked_for(reconstruction, triangle, tmp_path):
+def test_the_refined_mesh_comes_back_unless_it_was_refused(reconstruction, triangle, tmp_path):
     install(tmp_path, triangle)
-    estimate = OpenMvs(OpenMvsConfig(refine=True))(reconstruction.scene, reconstruction.coarse)
+    estimate = OpenMvs()(reconstruction.scene, reconstruction.coarse)
     assert_close(estimate.mesh.vertices_world, triangle.vertices_world + 1)
 
 

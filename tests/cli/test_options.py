@@ -11,7 +11,7 @@ from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.errors import ConfigError
 from pimper_torch.io import results
-from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.pipeline import PimperConfig
 from pimper_torch.records import Mesh
 from pimper_torch.scenes.meshes import icosphere
@@ -32,6 +32,8 @@ RUNS = {
         "--elevation-deg 40 --sway-deg 2 --light point --lamp-distance 3 --irradiance 0.5 "
         "--ambient 0.2 --flash 0.1 --bounces 1 --exposure 1.2 --read-noise 0.01 --shot-noise 0.01 "
         "--supersample 2 --bits 16 --encoding linear --up y --specular 0.1 --roughness 0.2",
+        "{ball} --out {out} {tiny} --albedo 0.6 0.5 0.4 --table patterned --turn-deg 30",
+        "{ball} --out {out} {tiny} --conductor copper --environment changing",
         "{ball} -o {out} {tiny} --path turntable --fixed-lamp --fixed-room --fixed-table",
         "{ball} -o {out} {tiny} --path turntable --no-fixed-lamp --no-fixed-room --no-fixed-table",
     ],
@@ -40,6 +42,7 @@ RUNS = {
         "view_000 view_001 --thresholds-percent 0.5 1 --seen-from 2 --alignment icp "
         "--trimmed-share 0.1 --icp-distance point",
         "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500",
+        "{told} {true_mesh} --samples 500 --calibration {out}.png",
     ],
     "bench": [
         "--out {out} --scale quick --scenes {scene} --methods smoothed --masks --cameras true "
@@ -68,8 +71,12 @@ def world(tmp_path_factory, dtu):
     scene = folder / "scene"
     small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1"
     assert main(["render", str(folder / "ball.ply"), "-o", str(scene), *small.split()]) == 0
+    true_mesh = read_mesh(scene / "truth" / "mesh.ply")
+    told = true_mesh.replace(expected_error=0.01 + 0.01 * true_mesh.vertices_world[:, 2])
+    write_ply(told, folder / "told.ply")
     return {
         "ball": folder / "ball.ply",
+        "told": folder / "told.ply",
         "preset": folder / "preset.yaml",
         "scene": scene,
         "photos": scene / "photos",
