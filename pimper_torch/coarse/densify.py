@@ -75,6 +75,11 @@ class DensifyConfig:
             best=self.best_sources,
         )
 
+    def factors(self, longest_px: int) -> tuple[int, ...]:
+        """Give by how much photographs of that size are reduced, the coarsest first."""
+        coarsest = max(1, round(longest_px / self.coarsest_px))
+        return tuple(dict.fromkeys(max(1, coarsest >> rank) for rank in range(self.levels)))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DepthMaps(Record):
@@ -114,11 +119,8 @@ def depth_maps(
     Returns:
         The maps of every resolution, the coarsest first.
     """
-    longest = max(scene.views.images.shape[-2:])
-    coarsest = max(1, round(longest / config.coarsest_px))
-    factors = [max(1, coarsest >> rank) for rank in range(config.levels)]
     maps: list[DepthMaps] = []
-    for factor in dict.fromkeys(factors):
+    for factor in config.factors(max(scene.views.images.shape[-2:])):
         level = level_of(scene, factor)
         found = [
             _search(scene, points, level, view, config, maps[-1] if maps else None)

@@ -9,14 +9,13 @@ from torch import Tensor, nn
 
 from pimper_torch.coarse.brought import checked
 from pimper_torch.coarse.cloud import point_covariances
-from pimper_torch.coarse.densify import DensifyConfig, DepthMaps, depth_maps
-from pimper_torch.coarse.oriented import (
-    OrientedPoints,
-    joined_points,
-    oriented_points,
-    sparse_oriented,
-    thinned,
-    with_common_normals,
+from pimper_torch.coarse.densify import DensifyConfig, DepthMaps
+from pimper_torch.coarse.matched import matched_cloud, pixel_size
+from pimper_torch.coarse.oriented import OrientedPoints
+from pimper_torch.coarse.outlined import (
+    FineSurface,
+    OutlinedConfig,
+    outlined_surface,
 )
 from pimper_torch.coarse.select import frontal_view, named_view
 from pimper_torch.coarse.triangulate import smooth_over_mesh
@@ -32,7 +31,8 @@ from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import triangulation_angles
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
+from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Outlines, SparseScene
+from pimper_torch.rims.constraints import Rim, Rims
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
 
@@ -49,6 +49,8 @@ class EncloseConfig:
         max_reprojection_px: Mean reprojection error it may have.
         min_angle_deg: Widest angle between rays it must have.
         densify: The search for depth maps.
+        outlined: The surface where outlines are known; the settings from ``max_depth`` to
+            ``hole_px`` are of that where they are not.
         cell_px: The points' finest grid; the surface's own has cells twice as wide.
         max_depth: Of the surface's octree, whatever the cell.
         point_weight: Of points against smoothness, in the surface.
@@ -70,6 +72,7 @@ class EncloseConfig:
     max_reprojection_px: float = 1.5
     min_angle_deg: float = 4.0
     densify: DensifyConfig = field(default_factory=DensifyConfig)
+    outlined: OutlinedConfig = field(default_factory=OutlinedConfig)
     cell_px: float = 1.0
     max_depth: int = 10
     point_weight: float = 1.0
@@ -109,12 +112,21 @@ class Enclose(nn.Module):
         self.config = config or EncloseConfig()
 
     @torch.no_grad()
-    def forward(self, scene: SparseScene, mesh: Mesh | None = None) -> CoarseMesh:
-        """Make the coarse mesh of depth maps, or of a mesh that is given.
+    def forward(
+        self,
+        scene: SparseScene,
+        mesh: Mesh | None = None,
+        outlines: Outlines | None = None,
+        rims: Rims | None = None,
+    ) -> CoarseMesh:
+        """Make the coarse mesh of depth maps and outlines, or of a mesh that is given.
 
         Args:
             scene: Photographs, cameras and cloud.
             mesh: A surface in the scene's frame, used instead of the photographs' own.
+            outlines: Where views show the object: all of that gets facets, and nothing else
+                does. ``None``: everything is the object, and what no point is near to gets none.
+            rims: What the outlines say about the surface; made of them when left out.
 
         Raises:
             InputError: No registered photograph has the reference's name, or the mesh that
@@ -128,11 +140,20 @@ class Enclose(nn.Module):
         else:
             reference = frontal_view(scene)
         trusted = self._trusted(scene)
-        if mesh is None:
-            vertices, faces, pixel = self.surface(scene, trusted)
-        else:
+        if rims is None and mesh is None:
+            rims = Rim()(outlines, scene.cameras)
+        fine: FineSurface | None = None
+        if mesh is not None:
             vertices, faces = checked(mesh, scene.cameras)
-            pixel = _pixel_size(scene, trusted) if len(trusted) else float("inf")
+            pixel = pixel_size(scene, trusted) if len(trusted) else float("inf")
+        elif outlines is not None and rims is not None:
+            trusted = trusted[rims.hull.depth_of(scene.points_world[trusted]) > 0]
+            fine = outlined_surface(
+                scene, trusted, outlines, rims, config.densify, config.outlined, config.threads
+            )
+            vertices, faces, pixel = fine.vertices_world, fine.faces, fine.pixel
+        else:
+            vertices, faces, pixel = self.surface(scene, trusted)
         if len(faces) > config.num_facets:
             vertices, faces = _few(vertices, faces, config)
         if mesh is None:
@@ -147,6 +168,7 @@ class Enclose(nn.Module):
             is_point=torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device),
             covariance_world=torch.zeros_like(vertices)[:, :, None].expand(-1, 3, 3),
             points=self._on_facets(scene, trusted, vertices, faces, pixel),
+            support=None if fine is None else fine.support_of(vertices[faces]),
         )
 
     def surface(
@@ -160,11 +182,7 @@ class Enclose(nn.Module):
                 "trusted, and at least 4 are needed. Take more photographs, or relax the filters "
                 "of `enclose`."
             )
-        maps = depth_maps(scene, trusted, config.densify)
-        pixel = _pixel_size(scene, trusted) * maps[-1].factor
-        # The coarsest windows of three reach past contours: they only say where to look.
-        dense = with_common_normals(thinned(oriented_points(maps[-2:]), config.cell_px * pixel))
-        cloud = joined_points(dense, sparse_oriented(scene, trusted, dense, 3 * pixel))
+        cloud, maps, pixel = matched_cloud(scene, trusted, config.densify, config.cell_px)
         if len(cloud.points_world) < 16:
             raise ReconstructionError(
                 f"coarse mesh: {len(cloud.points_world)} points were matched between the "
@@ -172,7 +190,7 @@ class Enclose(nn.Module):
                 "more, or bring a mesh of your own."
             )
         vertices, faces = self._closed(cloud, pixel)
-        kept = self._borne_out(vertices, faces, cloud, maps[-1], pixel)
+        kept = self._borne_out(vertices, faces, cloud, maps, pixel)
         if not bool(kept.any()):
             raise ReconstructionError(
                 f"coarse mesh: none of {len(faces)} faces is borne out by the photographs. "
@@ -217,7 +235,7 @@ class Enclose(nn.Module):
         pixel: float,
     ) -> Bool[Tensor, " face"]:
         config = self.config
-        said = evidence(vertices, faces, maps)
+        said = evidence(vertices, faces, maps.level, maps)
         middle = vertices[faces].mean(dim=1)
         distance = point_distances(middle, cloud.points_world)
         supported = distance <= config.reach_px * pixel
@@ -286,12 +304,3 @@ def _used(
 ) -> tuple[Float[Tensor, "used 3"], Int[Tensor, "face 3"]]:
     used, faces = torch.unique(faces, return_inverse=True)
     return vertices[used], faces
-
-
-def _pixel_size(scene: SparseScene, trusted: Int[Tensor, " trusted"]) -> float:
-    """Give the size of a photograph's pixel at the trusted observations; the median's."""
-    chosen = torch.isin(scene.observation_point, trusted)
-    view, point = scene.observation_view[chosen], scene.observation_point[chosen]
-    frames = scene.cameras.cam_from_world[view]
-    depth = (frames[:, 2, :3] * scene.points_world[point]).sum(dim=-1) + frames[:, 2, 3]
-    return float((depth / scene.cameras.intrinsics[view, 0, 0]).median())

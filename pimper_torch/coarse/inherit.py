@@ -104,6 +104,7 @@ def with_points(
         is_point=was_point & stayed,
         covariance_world=covariance,
         points=points,
+        support=None if coarse.support is None else coarse.support[split.parent[number >= 0]],
     )
 
 

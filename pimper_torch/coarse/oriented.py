@@ -70,6 +70,12 @@ class OrientedPoints(Record):
         )
 
 
+def no_points(like: Float[Tensor, "..."]) -> OrientedPoints:
+    """Give a cloud without points, with the device and dtype of ``like``."""
+    none = like.new_zeros(0, 3)
+    return OrientedPoints(points_world=none, normals_world=none, noise=none[:, 0])
+
+
 def joined_points(*clouds: OrientedPoints) -> OrientedPoints:
     """Put clouds in one."""
     return OrientedPoints(

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DepthMaps
+from pimper_torch.coarse.matching import Level
 from pimper_torch.geometry.components import component_areas, face_components, graph_components
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals, face_pairs, side_lengths
@@ -42,10 +43,20 @@ class Evidence(Record):
 
 
 def evidence(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], maps: DepthMaps
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    level: Level,
+    maps: DepthMaps | None,
 ) -> Evidence:
-    """Ask every view about the middle of every face."""
-    level, cameras = maps.level, maps.level.cameras
+    """Ask every view about the middle of every face.
+
+    Args:
+        vertices: Of the surface.
+        faces: Of it.
+        level: Photographs, at the resolution of the depth maps.
+        maps: What lies behind a face; without, nothing does.
+    """
+    cameras = level.cameras
     middle = vertices[faces].mean(dim=1)
     normals = normalize(face_normals(vertices, faces), dim=-1)
     side = side_lengths(vertices[faces]).amax(dim=1)
@@ -59,8 +70,9 @@ def evidence(
         asked, column, row, depth = asked[facing], column[facing], row[facing], depth[facing]
         column = column.clamp_max(level.tone.shape[-1] - 1)
         row = row.clamp_max(level.tone.shape[-2] - 1)
-        behind = maps.inverse_depth[view, row, column] + _DENIED_STEPS * maps.step[view]
-        denied[asked] += maps.valid[view, row, column] & (1 / depth > behind)
+        if maps is not None:
+            behind = maps.inverse_depth[view, row, column] + _DENIED_STEPS * maps.step[view]
+            denied[asked] += maps.valid[view, row, column] & (1 / depth > behind)
         open_ = ~caster.occluded(middle[asked], center, 0.5 * side[asked])
         open_ &= level.usable[view, row, column]
         seen[asked] += open_

@@ -27,6 +27,7 @@ from pimper_torch.records.scene import (
     Lens,
     Mesh,
     SparseScene,
+    Support,
     pairs_table,
 )
 from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
@@ -60,6 +61,7 @@ __all__ = [
     "SparseScene",
     "StageReport",
     "StopCause",
+    "Support",
     "Surface",
     "SweptPatches",
     "Templates",

@@ -1,6 +1,7 @@
 """What structure from motion finds, and triangle meshes."""
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -108,6 +109,19 @@ class FacetPoints(Record):
     facet: Int[Tensor, " point"]
 
 
+class Support(IntEnum):
+    """What tells where a facet lies, the best of it."""
+
+    NOTHING = 0
+    """It closes the surface."""
+    LIGHT = 1
+    """Views show it lit, so that shading can tell its shape."""
+    RIM = 2
+    """Rays through the outlines touch it."""
+    POINTS = 3
+    """Points matched between views lie on it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CoarseMesh(Record):
     """The few hundred facets that the pieces of the method stand on.
@@ -120,6 +134,8 @@ class CoarseMesh(Record):
         covariance_world: Of each vertex that is a point, scene units squared; zero for the
             others. ``None`` for a mesh that comes from elsewhere.
         points: The cloud between the vertices; ``None`` for a mesh from elsewhere.
+        support: What tells where each facet lies, a value of :class:`Support`; ``None`` where
+            nobody asked.
     """
 
     mesh: Mesh
@@ -127,3 +143,4 @@ class CoarseMesh(Record):
     is_point: Bool[Tensor, " vertex"]
     covariance_world: Float[Tensor, "vertex 3 3"] | None = None
     points: FacetPoints | None = None
+    support: Int[Tensor, " face"] | None = None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -63,7 +63,8 @@ def rim_points(
         rays: Of the outlines.
         cameras: Of all views.
         hull: Of the same outlines.
-        points_world: Of the surface as far as it is known: a cloud or a mesh's vertices.
+        points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
+            any, places are in the middle of what is in the hull.
         normals_world: Theirs, unit, outward.
         config: Settings.
 
@@ -78,7 +79,7 @@ def rim_points(
     low, high = _depths_in_box(hull, centers, rays.rays_world)
     depth = low + torch.linspace(0, 1, config.steps).to(low) * (high - low)
     pixel = depth.mean(dim=1) / focal
-    surface = _SignedDistance(points_world, normals_world)
+    surface = _SignedDistance(points_world, normals_world) if len(points_world) else None
     cost = _costs(rays, centers, depth, hull, config.tolerance_px * pixel, surface)
     clear = ~ambiguous(cost, config.ambiguous_px * pixel)
     (met,) = torch.nonzero(cost.isfinite().any(dim=1) & clear, as_tuple=True)
@@ -107,17 +108,21 @@ class _SignedDistance:
     def __init__(self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]) -> None:
         places = points.detach().cpu().double().numpy()
         self._points, self._normals, self._tree = points, normals, cKDTree(places)
-        reach, _ = self._tree.query(places, k=[min(_NEIGHBOURS, len(places))])
-        self._radius = torch.from_numpy(np.asarray(reach)[:, 0]).to(points)
 
     def __call__(self, places: Float[Tensor, "place 3"]) -> Float[Tensor, " place"]:
         _, nearest = self._tree.query(places.detach().cpu().double().numpy())
         index = torch.from_numpy(nearest).to(self._points.device)
         offset, normals = places - self._points[index], self._normals[index]
         height = (offset * normals).sum(dim=1)
-        beside = (offset - height[:, None] * normals).norm(dim=1) - self._radius[index]
+        beside = (offset - height[:, None] * normals).norm(dim=1) - self._radii(index)
         away = torch.hypot(height, beside.clamp_min(0))
         return torch.where(height < -_ALONG_NORMAL * away, -away, away)
+
+    def _radii(self, index: Int[Tensor, " place"]) -> Float[Tensor, " place"]:
+        some, place = torch.unique(index, return_inverse=True)
+        count = min(_NEIGHBOURS, len(self._points))
+        reach, _ = self._tree.query(self._points[some].detach().cpu().double().numpy(), k=[count])
+        return torch.from_numpy(np.asarray(reach)[:, 0]).to(self._points)[place]
 
 
 def _depths_in_box(
@@ -138,12 +143,18 @@ def _costs(
     depth: Float[Tensor, "ray step"],
     hull: Hull,
     tolerance: Float[Tensor, " ray"],
-    surface: _SignedDistance,
+    surface: _SignedDistance | None,
 ) -> Float[Tensor, "ray step"]:
-    """Give the signed distance to the surface along the rays; infinite outside the hull."""
+    """Give the signed distance to the surface along the rays; infinite outside the hull.
+
+    Without a surface it is the distance to the middle of what is in the hull.
+    """
     places = centers[:, None] + depth[..., None] * rays.rays_world[:, None]
     inside = hull.depth_of(places.to(hull.distance)) >= -tolerance[:, None].to(hull.distance)
     inside &= depth > 0
+    if surface is None:
+        middle = (inside * depth).sum(dim=1) / inside.sum(dim=1).clamp_min(1)
+        return torch.where(inside, (depth - middle[:, None]).abs(), torch.inf)
     cost = torch.full_like(depth, torch.inf)
     cost[inside] = surface(places[inside])
     return cost

@@ -6,6 +6,7 @@ from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.render import render_shape
 from pimper_torch.scenes.shapes import Sphere
 from pimper_torch.scenes.sparse import sparse_scene
+from tests.coarse.ball import all_round, photographed
 
 
 @pytest.fixture(scope="session")
@@ -15,3 +16,9 @@ def dome_cloud() -> SparseScene:
     lights = torch.tensor([[0.4, 0.0, 0.0, 0.4]], dtype=torch.float64).expand(5, 4)
     scene = render_shape(Sphere(), cameras, lights, lambda points: torch.ones_like(points))
     return sparse_scene(scene, 1000, torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="session")
+def round_about() -> SparseScene:
+    """A ball seen from 12 places all round."""
+    return photographed(all_round())

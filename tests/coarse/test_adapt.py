@@ -9,7 +9,12 @@ from pimper_torch.coarse.adapt import AdaptConfig, adapt, within
 from pimper_torch.coarse.fill import delaunay
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.geometry.lattice import subdivide
-from pimper_torch.geometry.surfaces import boundary_vertices, face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import (
+    barycentric_2d,
+    boundary_vertices,
+    face_normals,
+    vertex_normals,
+)
 from pimper_torch.outlines.hull import Hull
 from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
 from pimper_torch.scenes.meshes import icosphere
@@ -72,6 +77,23 @@ def dome(points):
 def edge_counts(faces):
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
     return torch.unique(edges, dim=0, return_counts=True)[1]
+
+
+def wavy(points):
+    lift = 0.05 * torch.sin(9 * points[:, 0])
+    return torch.cat([points[:, :2], points[:, 2:] + lift[:, None]], dim=1)
+
+
+def test_parts_of_a_facet_have_its_support(generator):
+    coarse = sheet(generator)
+    coarse = coarse.replace(support=torch.arange(len(coarse.mesh.faces)) % 4)
+    found = adapt(coarse, surface_on(coarse, wavy), SPACING)
+    assert len(found.mesh.faces) > len(coarse.mesh.faces)
+    middle = found.mesh.vertices_world[found.mesh.faces].mean(dim=1)[:, :2]
+    corners = coarse.mesh.vertices_world[coarse.mesh.faces][..., :2]
+    place = barycentric_2d(middle[:, None], corners[None])
+    parent = place.amin(dim=-1).argmax(dim=1)
+    assert bool((found.support == coarse.support[parent]).all())
 
 
 def test_a_surface_that_fits_changes_nothing(generator):

@@ -10,55 +10,9 @@ from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals, face_pairs
 from pimper_torch.records import Mesh
-from pimper_torch.scenes.cameras import arc_cameras, look_at, pinholes
+from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.meshes import icosphere
-from pimper_torch.scenes.render import render_shape
-from pimper_torch.scenes.shapes import Sphere
-from pimper_torch.scenes.sparse import sparse_scene
-
-SETTINGS = EncloseConfig(
-    num_facets=600,
-    densify=DensifyConfig(coarsest_px=120, levels=1, most_hypotheses=48),
-    hole_px=12.0,
-)
-
-
-def mottled(points):
-    """Waves in many directions, fine enough to be matched, none of them twice."""
-    generator = torch.Generator().manual_seed(3)
-    waves = 14 * torch.randn(24, 3, generator=generator, dtype=torch.float64).to(points)
-    phases = torch.arange(24).to(points)
-    tone = torch.sin(points @ waves.T + phases).mean(dim=-1, keepdim=True)
-    return (0.5 + 1.2 * tone).clamp(0.05, 1).expand_as(points)
-
-
-def photographed(cameras):
-    generator = torch.Generator().manual_seed(0)
-    count = cameras.num_views
-    # The lamp goes with the camera and is never quite the same.
-    towards = normalize(cameras.centers_world, dim=-1)
-    aside = 0.4 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    lights = torch.cat(
-        [
-            0.2 + 0.2 * torch.rand(count, 1, generator=generator, dtype=torch.float64),
-            0.5 * normalize(towards + aside, dim=-1),
-        ],
-        dim=-1,
-    )
-    scene = render_shape(Sphere(), cameras, lights, mottled)
-    return sparse_scene(scene, 400, generator)
-
-
-@pytest.fixture(scope="module")
-def round_about():
-    """A ball seen from 12 places all round."""
-    place = torch.arange(12, dtype=torch.float64)
-    height = 1 - (2 * place + 1) / 12
-    azimuth = place * torch.pi * (3 - 5**0.5)
-    ring = (1 - height.square()).sqrt()
-    eyes = 4 * torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), height], dim=-1)
-    frames = look_at(eyes, torch.zeros(3).double(), torch.tensor([0.1, 0.2, 1.0]).double())
-    return photographed(pinholes(frames, 180.0, 120, 100))
+from tests.coarse.ball import SETTINGS, photographed
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +48,7 @@ def test_facets_carry_the_cloud(enclosed, round_about):
     assert ((points.points_world - corners.mean(dim=1)).norm(dim=-1) < 1.2 * reach).all()
     assert points.covariance_world.shape == (len(points.facet), 3, 3)
     assert not enclosed.is_point.any()
+    assert enclosed.support is None  # told where there are outlines
 
 
 def test_a_few_views_on_an_arc_give_the_side_that_they_see():

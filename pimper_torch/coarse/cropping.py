@@ -1,0 +1,57 @@
+"""The part of the photographs that shows the object."""
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from pimper_torch.geometry.pixels import crop_intrinsics
+from pimper_torch.records import Outlines, SparseScene
+
+# Pixels kept round the outlines: windows reach beyond what they match.
+_MARGIN = 8
+
+
+def cropped(scene: SparseScene, outlines: Outlines) -> SparseScene:
+    """Cut every photograph to its outline's bounding box, and mask it.
+
+    The photographs share one raster: the largest box's. Views without an outline keep their
+    left upper corner, masked. Cameras follow; observations keep their pixels, which are those
+    of the photographs before undistortion.
+
+    Args:
+        scene: Photographs and cameras.
+        outlines: Of all views; those not trusted mask their photographs too.
+    """
+    boxes = _boxes(outlines, scene.cameras.sizes_px)
+    low = boxes[:, 0]
+    size = boxes[:, 1] - low
+    width, height = size.amax(dim=0).tolist()
+    views, masks = scene.views, outlines.masks
+    images = views.images.new_zeros(views.num_views, views.images.shape[1], height, width)
+    shown = torch.zeros_like(images[:, 0], dtype=torch.bool)
+    intrinsics = scene.cameras.intrinsics.clone()
+    for view, ((left, top), (w, h)) in enumerate(zip(low.tolist(), size.tolist(), strict=True)):
+        rows, columns = slice(top, top + h), slice(left, left + w)
+        images[view, :, :h, :w] = views.images[view, :, rows, columns]
+        shown[view, :h, :w] = masks[view, rows, columns]
+        intrinsics[view] = crop_intrinsics(intrinsics[view], float(left), float(top))
+    return scene.replace(
+        views=views.replace(images=images, masks=shown, sizes_px=size),
+        cameras=scene.cameras.replace(intrinsics=intrinsics, sizes_px=size),
+    )
+
+
+def _boxes(outlines: Outlines, sizes_px: Int[Tensor, "view 2"]) -> Int[Tensor, "view 2 2"]:
+    """Give the corners of boxes round the outlines, first inside, then outside."""
+    masks = outlines.masks
+    ends = []
+    for along in (masks.any(dim=1), masks.any(dim=2)):  # columns, then rows
+        places = torch.arange(along.shape[1], device=along.device)
+        first = torch.where(along, places, along.shape[1]).amin(dim=1) - _MARGIN
+        last = torch.where(along, places, -1).amax(dim=1) + 1 + _MARGIN
+        ends.append(torch.stack([first, last], dim=1))
+    boxes = torch.stack(ends, dim=2)
+    empty = ~masks.flatten(1).any(dim=1)
+    boxes = torch.where(empty[:, None, None], boxes.new_tensor([[0, 0], [1, 1]]), boxes)
+    limit = sizes_px.to(boxes)[:, None]
+    return torch.minimum(boxes.clamp_min(0), limit)

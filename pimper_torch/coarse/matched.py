@@ -1,0 +1,56 @@
+"""The cloud that the coarse surface goes through: matched densely, sparse where that is not."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.coarse.densify import DensifyConfig, DepthMaps, depth_maps
+from pimper_torch.coarse.oriented import (
+    OrientedPoints,
+    joined_points,
+    oriented_points,
+    sparse_oriented,
+    thinned,
+    with_common_normals,
+)
+from pimper_torch.records import Cameras, SparseScene
+
+
+def matched_cloud(
+    scene: SparseScene,
+    trusted: Int[Tensor, " trusted"],
+    config: DensifyConfig,
+    cell_px: float,
+) -> tuple[OrientedPoints, DepthMaps, float]:
+    """Match the photographs densely, and make one cloud of what was found.
+
+    Args:
+        scene: Photographs, cameras and cloud.
+        trusted: Points of the cloud, 4 at least.
+        config: Settings.
+        cell_px: Of the cloud's finest grid, pixels of the finest depth maps.
+
+    Returns:
+        The cloud, the finest depth maps, and the size of their pixels there, scene units.
+    """
+    maps = depth_maps(scene, trusted, config)
+    pixel = pixel_size(scene, trusted) * maps[-1].factor
+    # The coarsest windows of three reach past contours: they only say where to look.
+    dense = with_common_normals(thinned(oriented_points(maps[-2:]), cell_px * pixel))
+    cloud = joined_points(dense, sparse_oriented(scene, trusted, dense, 3 * pixel))
+    return cloud, maps[-1], pixel
+
+
+def pixel_size(scene: SparseScene, trusted: Int[Tensor, " trusted"]) -> float:
+    """Give the size of a photograph's pixel at the trusted observations; the median's."""
+    chosen = torch.isin(scene.observation_point, trusted)
+    view, point = scene.observation_view[chosen], scene.observation_point[chosen]
+    frames = scene.cameras.cam_from_world[view]
+    depth = (frames[:, 2, :3] * scene.points_world[point]).sum(dim=-1) + frames[:, 2, 3]
+    return float((depth / scene.cameras.intrinsics[view, 0, 0]).median())
+
+
+def pixel_size_at(place: Float[Tensor, " 3"], cameras: Cameras) -> float:
+    """Give the size of a photograph's pixel at a place; the median of the views'."""
+    away = (cameras.centers_world - place).norm(dim=1)
+    return float((away / cameras.intrinsics[:, 0, 0]).median())

@@ -1,0 +1,289 @@
+"""The coarse surface inside outlines: points where there is texture, rims, smooth between them."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.coarse.cropping import cropped
+from pimper_torch.coarse.densify import DensifyConfig
+from pimper_torch.coarse.matched import matched_cloud, pixel_size_at
+from pimper_torch.coarse.matching import level_of
+from pimper_torch.coarse.oriented import OrientedPoints, joined_points, no_points
+from pimper_torch.coarse.trim import (
+    Evidence,
+    evidence,
+    point_distances,
+    supported_pieces,
+    without_small_holes,
+)
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.records import Cameras, Outlines, Record, RimPoints, SparseScene, Support
+from pimper_torch.rims.constraints import Rims
+from pimper_torch.sfm.surfaces import poisson_surface
+
+# Barycentric coordinates of the places that tell what supports a facet.
+_PLACES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
+
+# Cosine between a surface's normal and the ray to a camera, above which it faces that.
+_FACING = 0.1
+
+# Points that make a surface, with rims or without.
+_LEAST_POINTS = 16
+
+# Views that see something behind a face which is a lid; that show a lit one lit.
+_DENYING, _LIGHTING = 2, 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutlinedConfig:
+    """How points and rims become a surface.
+
+    Lengths in pixels are those of the finest depth maps, at the cloud's median depth.
+
+    Attributes:
+        point_px: Of the cloud's finest grid.
+        cell_px: Of the surface's octree.
+        max_depth: Of the octree, whatever the cell.
+        touches: How often the places are found where rims touch the surface, each time on the
+            surface before; the first time on the points.
+        tolerance_px: By which points and surface may lie outside the visual hull.
+        reach_px: A face nearer to a point, or a rim point, than this is supported by it.
+        hole_px: Side of a square as large as the largest hole that is closed.
+        min_share: Of the area that points or rims support, which a piece apart has to have.
+    """
+
+    point_px: float = 1.0
+    cell_px: float = 4.0
+    max_depth: int = 10
+    touches: int = 3
+    tolerance_px: float = 4.0
+    reach_px: float = 4.0
+    hole_px: float = 24.0
+    min_share: float = 0.01
+
+    def __post_init__(self) -> None:
+        name = "enclose.outlined"
+        require(self.cell_px > 0, f"{name}.cell_px", self.cell_px, "above 0")
+        require(2 <= self.max_depth <= 12, f"{name}.max_depth", self.max_depth, "2 to 12")
+        require(self.touches >= 1, f"{name}.touches", self.touches, "1 or more")
+        require(self.tolerance_px >= 0, f"{name}.tolerance_px", self.tolerance_px, "0 or more")
+        require(self.point_px > 0, f"{name}.point_px", self.point_px, "above 0")
+        require(self.reach_px > 0, f"{name}.reach_px", self.reach_px, "above 0")
+        require(0 <= self.min_share < 1, f"{name}.min_share", self.min_share, "in [0, 1)")
+        require(self.hole_px >= 0, f"{name}.hole_px", self.hole_px, "0 or more")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class FineSurface(Record):
+    """The surface before it is simplified to facets.
+
+    Attributes:
+        vertices_world: Its vertices.
+        faces: Its faces.
+        support: What supports each, see :class:`~pimper_torch.records.Support`.
+        pixel: Size of one of the finest depth maps there, scene units.
+    """
+
+    vertices_world: Float[Tensor, "vertex 3"]
+    faces: Int[Tensor, "face 3"]
+    support: Int[Tensor, " face"]
+    pixel: float
+
+    def support_of(self, corners: Float[Tensor, "facet 3 3"]) -> Int[Tensor, " facet"]:
+        """Give facets the support that most of their places have on this surface."""
+        middle = self.vertices_world[self.faces].mean(dim=1)
+        weights = corners.new_tensor(_PLACES) / 6
+        places = torch.einsum("pk,fkc->fpc", weights, corners).flatten(0, 1)
+        tree = cKDTree(middle.detach().cpu().numpy())
+        _, nearest = tree.query(places.detach().cpu().numpy())
+        found = self.support[torch.from_numpy(nearest).to(self.support.device)]
+        return found.reshape(len(corners), len(_PLACES)).mode(dim=1).values
+
+
+def outlined_surface(
+    scene: SparseScene,
+    trusted: Int[Tensor, " trusted"],
+    outlines: Outlines,
+    rims: Rims,
+    densify: DensifyConfig,
+    config: OutlinedConfig,
+    threads: int,
+) -> FineSurface:
+    """Put a surface through matched points and rims, smooth where there are neither.
+
+    Args:
+        scene: Photographs, cameras and cloud.
+        trusted: Points of the cloud inside the visual hull; an object without texture has none.
+        outlines: Of all views.
+        rims: What they say about the surface.
+        densify: How photographs are matched.
+        config: Settings.
+        threads: Of the reconstruction; -1 for all cores.
+
+    Returns:
+        What a view sees of the closed surface. It is closed except where nothing was
+        photographed, and where views look into an opening.
+
+    Raises:
+        ReconstructionError: Outlines and photographs tell of no surface.
+    """
+    part = cropped(scene, outlines)
+    middle = rims.hull.corners_world.mean(dim=0).to(scene.points_world)
+    cloud, maps = no_points(middle), None
+    if len(trusted) >= _LEAST_POINTS:
+        found, maps, pixel = matched_cloud(part, trusted, densify, config.point_px)
+        cloud = found.take(rims.hull.depth_of(found.points_world) > -config.tolerance_px * pixel)
+        level = maps.level
+    else:
+        factor = densify.factors(max(part.views.images.shape[-2:]))[-1]
+        pixel, level = factor * pixel_size_at(middle, scene.cameras), level_of(part, factor)
+    vertices, faces, rim = closed_surface(cloud, rims, pixel, config, threads)
+    said = evidence(vertices, faces, level, maps)
+    middles = vertices[faces].mean(dim=1)
+    support = supports(middles, cloud, rim, said, config.reach_px * pixel)
+    reach = max(config.tolerance_px * pixel, float(rims.hull.spacing))
+    inside = rims.hull.depth_of(middles) > -reach
+    kept = seen_surface(
+        vertices, faces, support, said, inside, (config.hole_px * pixel) ** 2, config.min_share
+    )
+    if not bool(kept.any()):
+        raise ReconstructionError(
+            f"coarse mesh: none of {len(faces)} faces inside the outlines is seen. Look at the "
+            "masks, or leave them out."
+        )
+    used, faces = torch.unique(faces[kept], return_inverse=True)
+    return FineSurface(
+        vertices_world=vertices[used], faces=faces, support=support[kept], pixel=pixel
+    )
+
+
+def closed_surface(
+    cloud: OrientedPoints, rims: Rims, pixel: float, config: OutlinedConfig, threads: int
+) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"], RimPoints]:
+    """Put a closed surface through points, tangent to the rays through the outlines.
+
+    Where each ray touches it follows from the surface, and the surface from where rays touch
+    it: they are found in turn, from the points on. Parts that face no camera tell nothing:
+    behind an object seen from one side the hull is deep, and the surface fills it.
+
+    Args:
+        cloud: Matched points inside the outlines.
+        rims: Rays and visual hull of the same outlines.
+        pixel: Size of one, scene units.
+        config: Settings.
+        threads: Of the reconstruction; -1 for all cores.
+
+    Returns:
+        Vertices, faces, and the rim points that the surface goes through.
+
+    Raises:
+        ReconstructionError: Too few of both.
+    """
+    places, normals = cloud.points_world, cloud.normals_world
+    for _ in range(config.touches):
+        touched = rims.touching(places, normals)
+        rim = OrientedPoints(
+            points_world=touched.points_world.to(cloud.points_world),
+            normals_world=touched.normals_world.to(cloud.points_world),
+            noise=touched.variance.sqrt().to(cloud.noise),
+        )
+        if len(cloud.points_world) + len(touched.ray) < _LEAST_POINTS:
+            raise ReconstructionError(
+                f"coarse mesh: {len(cloud.points_world)} points were matched inside the outlines, "
+                f"and {len(touched.ray)} rays touch the surface there; some hundreds are needed. "
+                "Look at the masks, or bring a mesh of your own."
+            )
+        vertices, faces = _poisson(joined_points(cloud, rim), pixel, config, threads)
+        normals = vertex_normals(vertices, faces)
+        front = facing(vertices, normals, rims.cameras) > _FACING
+        places, normals = vertices[front], normals[front]
+    return vertices, faces, touched
+
+
+def facing(
+    points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"], cameras: Cameras
+) -> Float[Tensor, " point"]:
+    """Give the cosine between a normal and the ray to the camera that it faces best."""
+    best = torch.full_like(points[:, 0], -1)
+    for center in cameras.centers_world.to(points):
+        towards = normalize(center - points, dim=1)
+        best = torch.maximum(best, (towards * normals).sum(dim=1))
+    return best
+
+
+def _poisson(
+    cloud: OrientedPoints, pixel: float, config: OutlinedConfig, threads: int
+) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    points = cloud.points_world
+    # COLMAP works in single precision: a cloud far from the origin is brought there.
+    middle = points.median(dim=0).values
+    extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
+    cells = extent / (config.cell_px * pixel)
+    depth = min(config.max_depth, max(4, round(math.log2(cells))))
+    vertices, faces = poisson_surface(
+        points - middle, cloud.normals_world, depth=depth, point_weight=1.0, threads=threads
+    )
+    return vertices.to(points) + middle, faces.to(points.device)
+
+
+def supports(
+    middle: Float[Tensor, "face 3"],
+    cloud: OrientedPoints,
+    rim: RimPoints,
+    said: Evidence,
+    reach: float,
+) -> Int[Tensor, " face"]:
+    """Tell what supports each face of a fine surface.
+
+    Args:
+        middle: Of the faces.
+        cloud: Matched points.
+        rim: Rim points.
+        said: What the photographs say about the faces.
+        reach: Distance to a point, or a rim point, that supports a face.
+    """
+    found = torch.full_like(said.seen, Support.NOTHING)
+    found[said.lit >= _LIGHTING] = Support.LIGHT
+    for points, support in ((rim.points_world, Support.RIM), (cloud.points_world, Support.POINTS)):
+        if len(points):
+            found[point_distances(middle, points) <= reach] = support
+    return found
+
+
+def seen_surface(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    support: Int[Tensor, " face"],
+    said: Evidence,
+    inside: Bool[Tensor, " face"],
+    largest_hole: float,
+    min_share: float,
+) -> Bool[Tensor, " face"]:
+    """Mark the faces that stay: what a view sees, points and rims, in the visual hull.
+
+    A lid goes: a face without points behind which views see something.
+
+    Args:
+        vertices: Of the closed surface.
+        faces: Of it.
+        support: Of each face.
+        said: What the photographs say about each.
+        inside: True for faces in the visual hull.
+        largest_hole: Area of what is kept nevertheless where the rest surrounds it.
+        min_share: Of the area that points or rims support, which a piece apart has to have.
+    """
+    known = support >= Support.RIM
+    possible = inside & ((said.denied < _DENYING) | (support == Support.POINTS))
+    kept = possible & ((said.seen > 0) | known)
+    kept = without_small_holes(vertices, faces, kept, largest_hole)
+    (chosen,) = torch.nonzero(kept, as_tuple=True)
+    pieces = supported_pieces(vertices, faces[chosen], known[chosen], min_share)
+    kept[chosen[~pieces]] = False
+    return kept

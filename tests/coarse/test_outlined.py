@@ -1,0 +1,156 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.coarse.cropping import cropped
+from pimper_torch.coarse.enclose import Enclose
+from pimper_torch.coarse.oriented import no_points
+from pimper_torch.coarse.outlined import OutlinedConfig, closed_surface, seen_surface
+from pimper_torch.coarse.trim import Evidence
+from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.geometry.components import face_components
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.records import Support
+from pimper_torch.rims.constraints import Rim
+from pimper_torch.scenes.cameras import arc_cameras
+from pimper_torch.scenes.meshes import icosphere
+from tests.coarse.ball import SETTINGS, outlines_of, photographed
+
+
+def white(points):
+    return torch.full_like(points, 0.7)
+
+
+def half_mottled(points):
+    """Waves above the equator, one colour below."""
+    generator = torch.Generator().manual_seed(3)
+    waves = 14 * torch.randn(24, 3, generator=generator, dtype=torch.float64).to(points)
+    tone = torch.sin(points @ waves.T + torch.arange(24).to(points)).mean(dim=-1, keepdim=True)
+    tone = torch.where(points[..., 2:] > 0, (0.5 + 1.2 * tone).clamp(0.05, 1), 0.7)
+    return tone.expand_as(points)
+
+
+def enclosed(scene, some=lambda points: points[:, 2] > -2):
+    """Enclose the ball with its outlines, on some points of its cloud."""
+    errors = torch.where(some(scene.points_world), 0.5, 100.0)
+    scene = scene.replace(reprojection_errors_px=errors.to(scene.reprojection_errors_px))
+    return Enclose(SETTINGS)(scene, None, outlines_of(scene.cameras))
+
+
+def is_closed(mesh):
+    pairs, _ = face_pairs(mesh.faces)
+    return 2 * len(pairs) == 3 * len(mesh.faces) and int(face_components(mesh.faces).max()) == 0
+
+
+def test_a_ball_textured_on_one_half_is_enclosed_whole_and_says_what_supports_it(round_about):
+    scene = photographed(round_about.cameras.to(torch.float64), half_mottled)
+    coarse = enclosed(scene, lambda points: points[:, 2] > 0)
+    mesh = coarse.mesh
+    assert is_closed(mesh)
+    middle = mesh.vertices_world[mesh.faces].mean(dim=1)
+    off = (middle.norm(dim=1) - 1).abs()
+    # A pixel is 0.022 of the radius there.
+    assert off.mean() < 0.02
+    assert off.max() < 0.1
+    above, below = middle[:, 2] > 0.2, middle[:, 2] < -0.2
+    # Views 40 degrees apart match some of it.
+    assert (coarse.support[above] == Support.POINTS).float().mean() > 0.15
+    assert (coarse.support[below] == Support.POINTS).float().mean() < 0.02
+    assert (coarse.support[below] == Support.RIM).float().mean() > 0.3
+    assert (coarse.support >= Support.LIGHT).float().mean() > 0.8
+
+
+def test_a_ball_of_one_colour_is_enclosed_by_its_outlines_alone(round_about):
+    scene = photographed(round_about.cameras.to(torch.float64), white)
+    coarse = enclosed(scene, lambda points: points[:, 2] > 2)
+    assert is_closed(coarse.mesh)
+    assert len(coarse.points.facet) == 0
+    assert not bool((coarse.support == Support.POINTS).any())
+    assert (coarse.mesh.vertices_world.norm(dim=1) - 1).abs().mean() < 0.03
+    outward = normalize(face_normals(coarse.mesh.vertices_world, coarse.mesh.faces), dim=-1)
+    towards = normalize(coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1), dim=-1)
+    assert ((outward * towards).sum(dim=-1) > 0.6).float().mean() > 0.98
+
+
+def test_what_no_view_sees_is_left_out():
+    cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
+    mesh = enclosed(photographed(cameras)).mesh
+    # Views 25 degrees off the middle see 11 degrees beyond the horizon.
+    assert -0.5 < float(mesh.vertices_world[:, 2].min()) < 0.1
+    assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 0.1
+
+
+def test_a_lid_goes_and_small_dents_stay():
+    vertices, faces = icosphere(3)
+    middle = vertices[faces].mean(dim=1)
+    lid, speck = middle[:, 2] > 0.8, middle[:, 2] < -0.97
+    count = torch.full((len(faces),), 3)
+    said = Evidence(seen=count, lit=count, denied=torch.where(lid | speck, 2, 0))
+    support = torch.full_like(count, Support.LIGHT)
+    support[middle[:, 0] > 0.9] = Support.RIM
+    everywhere = torch.ones_like(lid)
+    kept = seen_surface(vertices, faces, support, said, everywhere, 0.3, 0.01)
+    assert bool((kept == ~lid).all())  # the lid's area is 1.2, the speck's 0.2
+    # Nothing goes where points are.
+    support[lid] = Support.POINTS
+    assert bool(seen_surface(vertices, faces, support, said, everywhere, 0.3, 0.01).all())
+
+
+def test_pieces_that_neither_points_nor_rims_support_go():
+    vertices, faces = icosphere(2)
+    two = torch.cat([vertices, 0.3 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
+    first = torch.arange(len(two[1])) < len(faces)
+    count = torch.full((len(two[1]),), 3)
+    said = Evidence(seen=count, lit=count, denied=0 * count)
+    support = torch.where(first, Support.POINTS, Support.LIGHT)
+    kept = seen_surface(*two, support, said, torch.ones_like(first), 0.0, 0.01)
+    assert bool((kept == first).all())
+
+
+def test_the_crop_shows_the_same_at_the_same_places(round_about):
+    outlines = outlines_of(round_about.cameras)
+    part = cropped(round_about, outlines)
+    assert part.views.images.shape[-1] < round_about.views.images.shape[-1]
+    for view in (0, 5):
+        before, _ = project(
+            round_about.points_world,
+            round_about.cameras.cam_from_world[view],
+            round_about.cameras.intrinsics[view],
+        )
+        after, _ = project(
+            round_about.points_world,
+            part.cameras.cam_from_world[view],
+            part.cameras.intrinsics[view],
+        )
+        u, v = before.long().unbind(dim=1)
+        x, y = after.floor().long().unbind(dim=1)
+        shown = outlines.masks[view, v, u]
+        assert shown.sum() > 100
+        assert bool(part.views.masks[view, y, x][shown].all())
+        images, parts = round_about.views.images[view], part.views.images[view]
+        assert_close(parts[:, y[shown], x[shown]], images[:, v[shown], u[shown]])
+
+
+def test_a_view_without_outline_is_masked_whole(round_about):
+    outlines = outlines_of(round_about.cameras)
+    inside = outlines.inside.clone()
+    inside[3] = 0
+    part = cropped(round_about, outlines.replace(inside=inside))
+    assert not bool(part.views.masks[3].any())
+    assert bool(part.views.masks[2].any())
+
+
+def test_too_few_points_and_rims_are_refused(round_about):
+    rims = Rim()(outlines_of(round_about.cameras), round_about.cameras)
+    rims = rims.replace(rays=rims.rays.take(torch.arange(5)))
+    with pytest.raises(ReconstructionError, match="0 points were matched inside the outlines"):
+        closed_surface(no_points(round_about.points_world), rims, 0.02, OutlinedConfig(), 1)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ConfigError, match=r"enclose\.outlined\.touches"):
+        OutlinedConfig(touches=0)
+    with pytest.raises(ConfigError, match=r"enclose\.outlined\.cell_px"):
+        OutlinedConfig(cell_px=0.0)
