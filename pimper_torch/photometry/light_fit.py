@@ -5,15 +5,14 @@ implicit function at the optimum.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
 from pimper_torch.photometry.light_models import LightModel
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+from pimper_torch.photometry.shown import Shown
 
 # A fit is done when a step lowers its cost by less than this share; and iterations and share where
 # gradients are asked for, from which Newton's method goes on.
@@ -22,46 +21,6 @@ _LEAST_GAIN, _AT_REST = 1e-7, (300, 1e-13)
 # Share of the diagonal that is added to the normal equations where they precondition others: that
 # light and albedo share a factor makes them singular.
 _CLOSE = 1e-6
-
-
-@dataclass(frozen=True, kw_only=True)
-class Shown:
-    """What the views show of the samples.
-
-    Attributes:
-        radiance: Gray, linear; zero where not seen.
-        seen: False where missing.
-    """
-
-    radiance: Float[Tensor, "sample view"]
-    seen: Bool[Tensor, "sample view"]
-
-    @cached_property
-    def level(self) -> Float[Tensor, " view"]:
-        """Mean brightness of each view."""
-        return (self.radiance.sum(dim=0) / self.seen.sum(dim=0).clamp_min(1)).abs()
-
-    def residual(
-        self, albedo: Float[Tensor, " sample"], shading: Float[Tensor, "sample view"]
-    ) -> Float[Tensor, "sample view"]:
-        """Give what albedo under this shading leaves to explain."""
-        return torch.where(self.seen, self.radiance - albedo[:, None] * shading, 0)
-
-    def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
-        """Give the scale of Cauchy's loss for each view."""
-        least = 1e-4 * self.level
-        return CAUCHY_TUNING * spread(residual.mT, self.seen.mT).maximum(least)
-
-    def weights(
-        self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]
-    ) -> Float[Tensor, "sample view"]:
-        """Weigh what is seen by Cauchy's function."""
-        return self.seen * cauchy_weights(residual, scale)
-
-    def cost(self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]) -> float:
-        """Give the sum of Cauchy's loss."""
-        relative = residual / torch.where(scale > 0, scale, 1)
-        return float((self.seen * scale**2 * torch.log1p(relative**2)).sum())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,8 +55,8 @@ def _asked(model: LightModel, shown: Shown) -> bool:
 
 def _fit(model: LightModel, shown: Shown, limit: int, least_gain: float) -> LightFit:
     """Step on lights and albedo together: alternation crawls along valleys where both mimic."""
-    gain, albedo = _brightness(shown)
-    lights = model.admit(model.start(gain))
+    lights, albedo = model.start(shown)
+    lights = model.admit(lights)
     shading = model.shade(lights)
     residual = shown.residual(albedo, shading)
     damping = 1e-3
@@ -190,21 +149,10 @@ def _best_albedo(
     Lights and albedo are multiplied, so that after a step of both at once it is not the best.
     """
     for _ in range(2):
-        square = (weight * shading**2).sum(dim=1)
-        product = (weight * shading * shown.radiance).sum(dim=1)
-        albedo = torch.where(square > 0, product / torch.where(square > 0, square, 1), albedo)
+        best = shown.albedo_under(shading, weight)
+        albedo = torch.where(best.isfinite(), best, albedo)
         weight = shown.weights(shown.residual(albedo, shading), scale)
     return albedo
-
-
-def _brightness(shown: Shown) -> tuple[Float[Tensor, " view"], Float[Tensor, " sample"]]:
-    """Take robust brightnesses of views, and of samples relative to their views."""
-    missing = torch.where(shown.seen, shown.radiance, torch.nan)
-    gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
-    known = shown.seen & (gain > 0)
-    ratio = torch.where(known, shown.radiance / gain.clamp_min(1e-300), torch.nan)
-    albedo = ratio.nanmedian(dim=1).values.nan_to_num(nan=0.0)
-    return gain, torch.where(known.any(dim=1), albedo, 0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

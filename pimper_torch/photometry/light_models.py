@@ -6,6 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.photometry.lamp_search import search_lamps
+from pimper_torch.photometry.shown import Shown
+
 # A lamp starts this far away, in mean distances of the samples from their middle, and comes no
 # nearer than the second: inside the scene its light has a pole.
 _FIRST_DISTANCE, _LEAST_DISTANCE = 10.0, 1.3
@@ -25,10 +28,15 @@ class SoftLight:
         """Mark parameters that no bound holds."""
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:]) > 0], dim=1)
 
-    def start(self, gain: Float[Tensor, " view"]) -> Float[Tensor, "view 4"]:
-        """Give lights along the mean normal under which views are as bright as they are."""
+    def start(self, shown: Shown) -> tuple[Float[Tensor, "view 4"], Float[Tensor, " sample"]]:
+        """Give lights along the mean normal under which views are as bright as they are.
+
+        Returns:
+            The lights, and the albedo that goes with them.
+        """
+        gain, albedo = shown.brightness()
         mean = self.basis.mean(dim=0)
-        return gain[:, None] * mean / (mean @ mean).clamp_min(1e-12)
+        return gain[:, None] * mean / (mean @ mean).clamp_min(1e-12), albedo
 
     def shade(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "sample view"]:
         """Give the radiance of albedo 1."""
@@ -59,14 +67,15 @@ class Lamp:
         inner = (lights[:, 4:] > 0) & (lights[:, 4:] < 1 / _LEAST_DISTANCE)
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:4]) > 0, inner], dim=1)
 
-    def start(self, gain: Float[Tensor, " view"]) -> Float[Tensor, "view 5"]:
-        """Give distant lamps along the mean normal, and a fifth of their light as ambient."""
-        mean = self.normals.mean(dim=0)
-        direction = mean / mean.norm().clamp_min(1e-12)
-        lamp = gain[:, None] * direction
-        return torch.cat(
-            [0.2 * gain[:, None], lamp, torch.full_like(lamp[:, :1], 1 / _FIRST_DISTANCE)], dim=1
-        )
+    def start(self, shown: Shown) -> tuple[Float[Tensor, "view 5"], Float[Tensor, " sample"]]:
+        """Search distant lamps; see :func:`~pimper_torch.photometry.lamp_search.search_lamps`.
+
+        Returns:
+            The lights, and the albedo that goes with them.
+        """
+        lights, albedo = search_lamps(shown, self.normals)
+        near = torch.full_like(lights[:, :1], 1 / _FIRST_DISTANCE)
+        return torch.cat([lights, near], dim=1), albedo
 
     def shade(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "sample view"]:
         """Give the radiance of albedo 1."""

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.photometry.light_field import LightField
-from pimper_torch.photometry.light_fit import Shown, fit_lights, with_gradients
+from pimper_torch.photometry.light_fit import fit_lights, with_gradients
 from pimper_torch.photometry.light_models import Lamp, SoftLight
+from pimper_torch.photometry.shown import Shown
 
 # A lamp has one number more than soft light, and must leave smaller residuals than this share.
 _LAMP_GAIN = 0.95

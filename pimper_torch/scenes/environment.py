@@ -1,6 +1,5 @@
 """What surrounds a scene, infinitely far away: the picture that a mirror shows."""
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -8,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.geometry.directions import even_directions
 from pimper_torch.scenes.bodies import Texture
 from pimper_torch.scenes.noise import random_speckle
 
 _WINDOWS = 6
 _WINDOW_RADIANCE = 6.0  # of the brightest wall
-_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,12 +62,3 @@ def random_environment(generator: torch.Generator) -> Environment:
         own_from_world=torch.eye(3, dtype=torch.float64),
     )
     return replace(drawn, scale=1 / float(drawn(even_directions(1 << 14)).mean()))
-
-
-def even_directions(count: int) -> Float[Tensor, "direction 3"]:
-    """Spread unit directions evenly over the sphere, along a Fibonacci spiral; float64."""
-    step = torch.arange(count, dtype=torch.float64)
-    height = 1 - (2 * step + 1) / count
-    radius = (1 - height**2).sqrt()
-    turn = _GOLDEN_ANGLE * step
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=1)

@@ -112,3 +112,26 @@ def test_a_field_without_data_is_dark():
         torch.full((4, 5), torch.nan), torch.zeros(4, 5).bool(), torch.ones(4, 3), torch.ones(4, 3)
     )
     assert (unseen.soft == 0).all()
+
+
+@pytest.mark.parametrize("contrast", [0.3, 0.9])
+def test_lamps_are_found_in_spite_of_what_they_leave_in_shadow(generator, contrast):
+    # What a camera sees of a ball, lit from all sides; in every view a wall shadows a fifth.
+    def unit(rows):
+        return normalize(torch.tensor(rows, dtype=torch.float64), dim=-1)
+
+    normals = normalize(torch.randn(1200, 3, generator=generator, dtype=torch.float64), dim=1)
+    normals = normals[normals @ unit([0.0, -0.8, 0.6]) > 0.2]
+    around = [[0.67, -0.43, 0.45], [-0.06, -0.79, -0.15], [-0.54, -0.35, 0.51], [0.01, 0.36, 0.89]]
+    beside = [[0.48, -0.42, 0.58], [0.02, -0.63, 0.0], [-0.08, 0.18, 0.94], [0.87, -0.16, 0.42]]
+    directions = unit(around + beside)
+    wall = normalize(torch.linalg.cross(directions, unit([0.0, 0, 1]).expand_as(directions)), dim=1)
+    lit = torch.where(normals @ wall.mT > 0.6, 0, (normals @ directions.mT).clamp_min(0))
+    albedo = 1 - contrast * torch.rand(len(normals), generator=generator, dtype=torch.float64)
+    radiance = albedo[:, None] * (0.1 + lit)
+    seen = torch.ones_like(radiance, dtype=torch.bool)
+    field = fit_light_field(radiance, seen, normals, normals, model="lamp")
+    off = (normalize(field.lamp, dim=1) * directions).sum(dim=1).clamp(-1, 1).acos()
+    assert torch.rad2deg(off).max() < 1
+    ambient = field.soft[:, 0] / field.lamp.norm(dim=1)
+    assert_close(ambient, torch.full((8,), 0.1).double(), rtol=0.05, atol=0)

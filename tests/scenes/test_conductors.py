@@ -3,10 +3,11 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.geometry.directions import even_directions
 from pimper_torch.records import Mesh
 from pimper_torch.scenes.bodies import Body
 from pimper_torch.scenes.conductors import CONDUCTORS, Conductor
-from pimper_torch.scenes.environment import even_directions, random_environment
+from pimper_torch.scenes.environment import random_environment
 from pimper_torch.scenes.lights import Lamp
 from pimper_torch.scenes.meshes import icosphere, moved, table
 from pimper_torch.scenes.stage import Stage

@@ -4,6 +4,7 @@ from scipy.spatial import KDTree
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.geometry.directions import even_directions
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
@@ -17,7 +18,6 @@ from pimper_torch.scenes.cameras import (
     handheld_directions,
 )
 from pimper_torch.scenes.config import SceneConfig
-from pimper_torch.scenes.environment import even_directions
 from pimper_torch.scenes.lights import lights_round
 from pimper_torch.scenes.meshes import icosphere
 from pimper_torch.scenes.scene import build_scene

@@ -1,0 +1,18 @@
+"""Directions spread over the sphere."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
+def even_directions(count: int) -> Float[Tensor, "direction 3"]:
+    """Spread unit directions evenly over the sphere, along a Fibonacci spiral; float64."""
+    step = torch.arange(count, dtype=torch.float64)
+    height = 1 - (2 * step + 1) / count
+    radius = (1 - height**2).sqrt()
+    turn = _GOLDEN_ANGLE * step
+    return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=1)

@@ -1,0 +1,67 @@
+"""What the views show of some samples, and what a model of it leaves over."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """What the views show of the samples.
+
+    Attributes:
+        radiance: Gray, linear; zero where not seen.
+        seen: False where missing.
+    """
+
+    radiance: Float[Tensor, "sample view"]
+    seen: Bool[Tensor, "sample view"]
+
+    @cached_property
+    def level(self) -> Float[Tensor, " view"]:
+        """Mean brightness of each view."""
+        return (self.radiance.sum(dim=0) / self.seen.sum(dim=0).clamp_min(1)).abs()
+
+    def residual(
+        self, albedo: Float[Tensor, " sample"], shading: Float[Tensor, "sample view"]
+    ) -> Float[Tensor, "sample view"]:
+        """Give what albedo under this shading leaves to explain."""
+        return torch.where(self.seen, self.radiance - albedo[:, None] * shading, 0)
+
+    def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
+        """Give the scale of Cauchy's loss for each view."""
+        least = 1e-4 * self.level
+        return CAUCHY_TUNING * spread(residual.mT, self.seen.mT).maximum(least)
+
+    def weights(
+        self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]
+    ) -> Float[Tensor, "sample view"]:
+        """Weigh what is seen by Cauchy's function."""
+        return self.seen * cauchy_weights(residual, scale)
+
+    def cost(self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]) -> float:
+        """Give the sum of Cauchy's loss."""
+        relative = residual / torch.where(scale > 0, scale, 1)
+        return float((self.seen * scale**2 * torch.log1p(relative**2)).sum())
+
+    def brightness(self) -> tuple[Float[Tensor, " view"], Float[Tensor, " sample"]]:
+        """Give robust brightnesses of views, and of samples relative to their views."""
+        missing = torch.where(self.seen, self.radiance, torch.nan)
+        gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
+        known = self.seen & (gain > 0)
+        ratio = torch.where(known, self.radiance / gain.clamp_min(1e-300), torch.nan)
+        albedo = ratio.nanmedian(dim=1).values.nan_to_num(nan=0.0)
+        return gain, torch.where(known.any(dim=1), albedo, 0)
+
+    def albedo_under(
+        self, shading: Float[Tensor, "sample view"], weight: Float[Tensor, "sample view"]
+    ) -> Float[Tensor, " sample"]:
+        """Give the albedo that suits shading best in weighted least squares; NaN if none does."""
+        square = (weight * shading**2).sum(dim=1)
+        product = (weight * shading * self.radiance).sum(dim=1)
+        return torch.where(square > 0, product / torch.where(square > 0, square, 1), torch.nan)
