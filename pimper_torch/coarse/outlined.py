@@ -24,6 +24,7 @@ from pimper_torch.coarse.trim import (
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Outlines, Record, RimPoints, SparseScene, Support
 from pimper_torch.rims.constraints import Rims
 from pimper_torch.sfm.surfaces import poisson_surface
@@ -170,8 +171,8 @@ def closed_surface(
     """Put a closed surface through points, tangent to the rays through the outlines.
 
     Where each ray touches it follows from the surface, and the surface from where rays touch
-    it: they are found in turn, from the points on. Parts that face no camera tell nothing:
-    behind an object seen from one side the hull is deep, and the surface fills it.
+    it: they are found in turn, from the points on. Parts that no camera sees tell nothing: behind
+    an object seen from one side the hull is deep, and the surface fills it.
 
     Args:
         cloud: Matched points inside the outlines.
@@ -202,20 +203,33 @@ def closed_surface(
             )
         vertices, faces = _poisson(joined_points(cloud, rim), pixel, config, threads)
         normals = vertex_normals(vertices, faces)
-        front = facing(vertices, normals, rims.cameras) > _FACING
+        front = shown(vertices, faces, normals, rims.cameras, config.cell_px * pixel)
         places, normals = vertices[front], normals[front]
     return vertices, faces, touched
 
 
-def facing(
-    points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"], cameras: Cameras
-) -> Float[Tensor, " point"]:
-    """Give the cosine between a normal and the ray to the camera that it faces best."""
-    best = torch.full_like(points[:, 0], -1)
-    for center in cameras.centers_world.to(points):
-        towards = normalize(center - points, dim=1)
-        best = torch.maximum(best, (towards * normals).sum(dim=1))
-    return best
+def shown(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    normals: Float[Tensor, "vertex 3"],
+    cameras: Cameras,
+    tolerance: float,
+) -> Bool[Tensor, " vertex"]:
+    """Mark the vertices that face a camera and are not hidden from it.
+
+    Args:
+        vertices: Of a surface.
+        faces: Of it.
+        normals: Of its vertices.
+        cameras: That look at it.
+        tolerance: A surface closer than this in front of a vertex does not hide it.
+    """
+    caster, found = RayCaster(vertices, faces), torch.zeros_like(vertices[:, 0], dtype=torch.bool)
+    for center in cameras.centers_world.to(vertices):
+        towards = normalize(center - vertices, dim=1)
+        asked = ((towards * normals).sum(dim=1) > _FACING) & ~found
+        found[asked] = ~caster.occluded(vertices[asked], center, tolerance)
+    return found
 
 
 def _poisson(

@@ -12,8 +12,9 @@ from pimper_torch.config import require
 from pimper_torch.outlines.hull import Hull
 from pimper_torch.records import Cameras, RimPoints, RimRays
 
-# Nearest points tell above from below where the offset is within 60 degrees of their normal.
-_ALONG_NORMAL = 0.5
+# Cosine between the offset from the nearest point's disc and its normal, from which on a place
+# is below the surface: beside the border of what is known, none is.
+_ALONG_NORMAL = 0.9
 
 # Points, itself included, to the last of which a point's disc reaches: those round it in a
 # triangle mesh.

@@ -77,9 +77,12 @@ def test_a_ball_of_one_colour_is_enclosed_by_its_outlines_alone(round_about):
 def test_what_no_view_sees_is_left_out():
     cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
     mesh = enclosed(photographed(cameras)).mesh
-    # Views 25 degrees off the middle see 11 degrees beyond the horizon.
-    assert -0.5 < float(mesh.vertices_world[:, 2].min()) < 0.1
-    assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 0.1
+    # The hull reaches to -2.2; views 25 degrees off the middle see to -0.2, and Poisson runs on
+    # along the last rims for a few facets.
+    assert -0.75 < float(mesh.vertices_world[:, 2].min()) < 0.1
+    off = (mesh.vertices_world.norm(dim=1) - 1).abs()
+    assert off.max() < 0.2
+    assert off[mesh.vertices_world[:, 2] > 0].mean() < 0.02
 
 
 def test_a_lid_goes_and_small_dents_stay():

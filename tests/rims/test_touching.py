@@ -90,6 +90,17 @@ def test_a_ray_that_is_as_near_to_two_surfaces_abstains(cameras):
     assert found.tolist() == [False, True, True, False, False, True]
 
 
+def test_beyond_the_border_of_what_is_known_no_place_is_below_it(cameras):
+    towards = directions(6000)
+    cap = towards[towards[:, 2] > 0.6]
+    rays, found = touched(ball, cameras, cap, cap)
+    # Rays that pass far from the cap know the hull alone, which is the ball within corners.
+    assert len(found.ray) > 0.8 * len(rays.view)
+    assert ball(found.points_world).abs().max() < 0.35
+    near = found.points_world[:, 2] > 0.6
+    assert ball(found.points_world[near]).abs().mean() < 0.5 * PIXEL
+
+
 def test_rays_that_miss_the_hull_have_no_point(cameras):
     outlines = outlines_of(ball, cameras)
     hull = visual_hull(outlines, cameras.to(torch.float32), BOX, num_voxels=32**3)
