@@ -6,7 +6,7 @@ from torch.testing import assert_close
 from pimper_torch.fusion.bands import coarse_part
 from pimper_torch.fusion.estimate import fuse_evidence
 from pimper_torch.fusion.evidence import Evidence
-from pimper_torch.fusion.expected_error import expected_error
+from pimper_torch.fusion.expected_error import expected_error, regions
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import face_edges
 
@@ -21,10 +21,14 @@ def generator() -> torch.Generator:
 
 @pytest.fixture(scope="module")
 def square():
-    """Four facets round the middle of a square, subdivided."""
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]]).double()
-    facets = torch.tensor([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
-    return subdivide(corners, facets, torch.full((4,), 0.15).double()), facets
+    """A square of 32 facets, subdivided; four regions that err alike."""
+    side = torch.linspace(0, 1, 5, dtype=torch.float64)
+    y, x = torch.meshgrid(side, side, indexing="ij")
+    corners = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3)
+    first = (torch.arange(4)[:, None] * 5 + torch.arange(4)).reshape(-1)
+    lower = torch.stack([first, first + 1, first + 6], dim=1)
+    facets = torch.cat([lower, torch.stack([first, first + 6, first + 5], dim=1)])
+    return subdivide(corners, facets, torch.full((32,), 0.1).double()), facets
 
 
 def differences(lattice, deviation, correlated=1.0, judged=True):
@@ -85,7 +89,7 @@ def test_independent_noise_gives_the_diagonal_of_the_inverse(square, deviation):
     near(found, torch.linalg.inv(dense(fused)[0]).diagonal().sqrt())
 
 
-def test_what_a_facet_errs_by_together_does_not_average_out(square):
+def test_what_a_region_errs_by_together_does_not_average_out(square):
     lattice, facets = square
     sure, alike = heights(lattice, 0.05), heights(lattice, 0.05, correlated=12.0)
     tied = differences(lattice, 0.02)
@@ -94,8 +98,9 @@ def test_what_a_facet_errs_by_together_does_not_average_out(square):
     # Oracle: the covariance of the targets, written out.
     facet = lattice.facet
     count = torch.bincount(facet)[facet].double()
-    share = (11 / (count - 1)).clamp_max(1)
-    together = (share[:, None] * share).sqrt() * (facet[:, None] == facet)
+    share = (11 / (count - 1)).clamp(0, 1)
+    region = regions(lattice)[facet]
+    together = (share[:, None] * share).sqrt() * (region[:, None] == region)
     covariance = 0.05**2 * (together + torch.diag(1 - share))
     _, answer = dense(fused)
     edges = len(tied.targets)
@@ -107,17 +112,17 @@ def test_what_a_facet_errs_by_together_does_not_average_out(square):
     assert (found > 1.5 * expected_error(trusting, trusting, lattice, facets, DRAWS)).all()
 
 
-def test_a_tilt_of_a_facet_turns_edges_by_where_they_point(square):
+def test_a_tilt_of_a_region_turns_edges_by_where_they_point(square):
     lattice, facets = square
     kept = differences(lattice, 0.1, judged=False)  # all of it is alike
     fused = solved(lattice, kept, heights(lattice, 0.01, vertices=torch.tensor([0])))
     found = expected_error(fused, fused, lattice, facets, DRAWS)
-    # Oracle: one tilt of 0.1 a facet, along both axes of the plane.
+    # Oracle: one tilt of five times 0.1 a region, along both axes of the plane.
     edges = kept.unknowns
     along = normalize(lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]], dim=1)
-    facet = lattice.facet[edges[:, 0]]
-    alike = (along @ along.mT) * (facet[:, None] == facet)
-    deviation = kept.information.rsqrt()
+    region = regions(lattice)[lattice.facet[edges[:, 0]]]
+    alike = (along @ along.mT) * (region[:, None] == region)
+    deviation = 5 * kept.information.rsqrt()
     covariance = deviation[:, None] * deviation * alike
     _, answer = dense(fused)
     own = answer[:, : len(edges)]
@@ -136,18 +141,45 @@ def test_detail_of_one_solve_and_shape_of_another_err_by_the_same_noise(square):
     low = torch.stack([coarse_part(one, lattice, facets) for one in eye], dim=1)
     (_, of_fine), (_, of_coarse) = dense(fine), dense(coarse)
     answer = of_fine + low @ (of_coarse - of_fine)
-    # Noise is that of the coarse solve: on a facet, edges share a part of it.
+    # Noise is that of the coarse solve: in a region, edges share a part of it.
     edges = tied.unknowns
     along = normalize(lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]], dim=1)
     facet = lattice.facet[edges[:, 0]]
     count = torch.bincount(facet)[facet].double()
-    share = (8 / (count - 1)).clamp_max(1)
-    together = (share[:, None] * share).sqrt() * (along @ along.mT) * (facet[:, None] == facet)
+    share = (8 / (count - 1)).clamp(0, 1)
+    region = regions(lattice)[facet]
+    alike = (along @ along.mT) * (region[:, None] == region)
+    together = (share[:, None] * share).sqrt() * alike
     deviation = (tied.information * 9).rsqrt()
     covariance = deviation[:, None] * deviation * (together + torch.diag(1 - share))
     own, rest = answer[:, : len(edges)], answer[:, len(edges) : len(edges) + len(eye)]
     total = own @ covariance @ own.mT + 0.1**2 * rest @ rest.mT
     near(found, total.diagonal().sqrt())
+
+
+def test_regions_are_a_few_facets_wide(square):
+    lattice, _ = square
+    label = regions(lattice)
+    assert len(label.unique()) == 4
+    middle = lattice.points.new_zeros(32, 3).index_add(0, lattice.facet, lattice.points)
+    middle = middle / torch.bincount(lattice.facet)[:, None]
+    for one in label.unique():
+        extent = middle[label == one].amax(dim=0) - middle[label == one].amin(dim=0)
+        assert extent.max() < 2.5 * 0.27  # the edge of an equilateral facet of their area
+    moved = lattice.replace(points=3 * lattice.points)
+    assert torch.equal(regions(moved), label)  # whatever the scale
+
+
+def test_no_kind_is_taken_to_be_surer_than_it_claims(square, generator):
+    lattice, facets = square
+    exact = [differences(lattice, 0.1), heights(lattice, 0.1)]  # without noise at all
+    count = len(lattice.points)
+    hold = torch.full((count,), 1e-6).double()
+    modest = fuse_evidence(exact, torch.zeros(count).double(), hold, 5)
+    assert max(modest.factors) < 0.5
+    claimed = solved(lattice, *exact)
+    found = expected_error(modest, modest, lattice, facets, DRAWS)
+    assert_close(found, expected_error(claimed, claimed, lattice, facets, DRAWS), rtol=0.1, atol=0)
 
 
 def test_what_nothing_tells_may_be_anywhere(square):

@@ -1,3 +1,4 @@
+import math
 from functools import cache
 
 import pytest
@@ -9,6 +10,7 @@ from pimper_torch.coarse.adapt import Adapt
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.records import FacetPoints, RimPoints
 from pimper_torch.rims.constraints import Rims
 from pimper_torch.sweep.sweep import Sweep
@@ -210,14 +212,16 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
 
 
 def noisy(lifted, given, points: float, turn: float, seed: int):
-    """Add noise to normals, radians, and give the cloud noisy points, in samples."""
+    """Add noise to normals, radians, and to points of the cloud, samples; both say how much."""
     generator = torch.Generator().manual_seed(seed)
     spacing = float(given.patches.buckets[0].spacing[0])
     buckets = []
     for found in given.photometric.buckets:
         noise = torch.randn(found.normals_patch.shape, generator=generator, dtype=torch.float64)
         wrong = normalize(found.normals_patch + turn * noise, dim=-1)
-        buckets.append(found.replace(normals_patch=wrong))
+        sure = 1 / (1 + (turn / math.radians(HALF_CONFIDENCE_DEG)) ** 2)
+        confidence = torch.full_like(found.confidence, sure)
+        buckets.append(found.replace(normals_patch=wrong, confidence=confidence))
     turned = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
     cloud = near_plane(lifted, 0.0)
     cloud = cloud + points * spacing * torch.randn(cloud.shape, generator=generator).double()
