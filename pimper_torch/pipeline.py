@@ -15,6 +15,7 @@ from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.mend import Mend, MendConfig
+from pimper_torch.outlines.outline import Outline, OutlineConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
@@ -64,6 +65,7 @@ class PimperConfig:
     photographs: Encoding = field(default_factory=Encoding)
     rounds: RoundsConfig = field(default_factory=RoundsConfig)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
+    outline: OutlineConfig = field(default_factory=OutlineConfig)
     triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
     enclose: EncloseConfig = field(default_factory=EncloseConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
@@ -103,6 +105,7 @@ class Pimper(nn.Module):
         self.config = config = config or PimperConfig()
         self.observer = observer or Silent()
         self.reconstruct: nn.Module = Reconstruct(config.reconstruct, cache)
+        self.outline = Outline(config.outline)
         self.triangulate: nn.Module = Triangulate(config.triangulate)
         self.enclose: nn.Module = Enclose(config.enclose)
         self.decompose: nn.Module = Decompose(config.decompose)
@@ -135,6 +138,8 @@ class Pimper(nn.Module):
         """
         with recorded(self, self.observer) as report:
             scene = self.reconstruct(views, sparse_model)
+            outlines = self.outline(scene)
+            scene = self.outline.masked(scene, outlines)
             chain = self._in_rounds if self.config.rounds.scales else self._published
             patches, surface = chain(scene, mesh)
             found = self.extract(surface)
@@ -144,6 +149,7 @@ class Pimper(nn.Module):
             coarse=patches.patches.coarse,
             patches=patches,
             report=tuple(report),
+            outlines=outlines,
         )
 
     def _published(self, scene: SparseScene, mesh: Mesh | None) -> tuple[DepthPatches, Surface]:

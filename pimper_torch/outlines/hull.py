@@ -50,6 +50,18 @@ class Hull(Record):
         steps = torch.tensor(self.distance.shape).to(self.origin_world) - 1
         return torch.stack([self.origin_world, self.origin_world + self.spacing * steps])
 
+    def above(self, normal_world: Float[Tensor, "3"], offset: Float[Tensor, ""]) -> "Hull":
+        """Keep what is above the plane where a normal's product with a point is ``offset``."""
+        steps = [torch.arange(count).to(self.distance) for count in self.distance.shape]
+        slopes = self.spacing * normal_world
+        height = (
+            (self.origin_world @ normal_world - offset)
+            + (slopes[0] * steps[0])[:, None, None]
+            + (slopes[1] * steps[1])[:, None]
+            + slopes[2] * steps[2]
+        )
+        return self.replace(distance=torch.minimum(self.distance, height))
+
     def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Say how deep points lie inside the hull; negative outside.
 

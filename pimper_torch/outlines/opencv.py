@@ -3,8 +3,11 @@
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+
+BACKGROUND, OBJECT = cv2.GC_BGD, cv2.GC_FGD
+PERHAPS_BACKGROUND, PERHAPS_OBJECT = cv2.GC_PR_BGD, cv2.GC_PR_FGD
 
 
 def signed_distance(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height width"]:
@@ -23,3 +26,153 @@ def signed_distance(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height
     )
     signed = np.where(drawn > 0, inner - 0.5, 0.5 - outer)
     return torch.from_numpy(signed.astype(np.float32)).to(mask.device)
+
+
+def shrunk(
+    image: Float[Tensor, "channel height width"], width: int, height: int
+) -> Float[Tensor, "channel {height} {width}"]:
+    """Average an image over the pixels of a smaller one."""
+    pixels = image.movedim(0, -1).contiguous().numpy()
+    small = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(small.reshape(height, width, -1)).movedim(-1, 0)
+
+
+def warped(
+    picture: Float[Tensor, "height width"],
+    homography: Float[Tensor, "3 3"],
+    size_px: tuple[int, int],
+) -> Float[Tensor, "high wide"]:
+    """Look up a picture through a homography, bilinearly; NaN beyond its border.
+
+    Args:
+        picture: To look up.
+        homography: From pixels of the result to those of ``picture``.
+        size_px: Width and height of the result.
+    """
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from centres
+    matrix = np.linalg.inv(half) @ homography.double().numpy() @ half
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    found = cv2.warpPerspective(
+        picture.numpy(), matrix, size_px, flags=flags, borderValue=float("nan")
+    )
+    return torch.from_numpy(found)
+
+
+def window_means(
+    maps: Float[Tensor, "map height width"], window: int
+) -> Float[Tensor, "map height width"]:
+    """Average over square windows, mirrored at the border."""
+    pixels = maps.movedim(0, -1).contiguous().numpy()
+    means = cv2.boxFilter(pixels, -1, (window, window)).reshape(pixels.shape)
+    return torch.from_numpy(means).movedim(-1, 0)
+
+
+def grab_cut(
+    colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], rounds: int
+) -> Bool[Tensor, "height width"]:
+    """Cut the object out by two mixtures of colours and a graph cut.
+
+    Rother, Kolmogorov & Blake, GrabCut, SIGGRAPH 2004. Deterministic.
+
+    Args:
+        colours: The photograph.
+        labels: ``BACKGROUND`` or ``OBJECT`` for certain, or ``PERHAPS_BACKGROUND`` or
+            ``PERHAPS_OBJECT``; some of each side.
+        rounds: Of estimating the mixtures and cutting.
+    """
+    told = labels & 1 > 0
+    if not told.any() or told.all():
+        return told
+    cv2.setRNGSeed(0)
+    top, left = (int(side.nonzero()[0, 0]) for side in _open_sides(labels))
+    bottom, right = (int(side.nonzero()[-1, 0]) + 1 for side in _open_sides(labels))
+    window = slice(max(0, top - 8), bottom + 8), slice(max(0, left - 8), right + 8)
+    drawn = labels[window].contiguous().numpy().copy()
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    pixels = colours[window].contiguous().numpy()
+    cv2.grabCut(pixels, drawn, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+    found = torch.zeros_like(told)
+    found[window] = torch.from_numpy((drawn & 1) > 0)
+    return found
+
+
+def _open_sides(
+    labels: UInt8[Tensor, "height width"],
+) -> tuple[Bool[Tensor, " height"], Bool[Tensor, " width"]]:
+    """Mark rows and columns with anything but certain background."""
+    other = labels != BACKGROUND
+    return other.any(dim=1), other.any(dim=0)
+
+
+def opened(mask: Bool[Tensor, "height width"], radius_px: int) -> Bool[Tensor, "height width"]:
+    """Leave out what no disc of that radius fits into."""
+    return _morphed(mask, cv2.MORPH_OPEN, radius_px)
+
+
+def closed(mask: Bool[Tensor, "height width"], radius_px: int) -> Bool[Tensor, "height width"]:
+    """Fill what no disc of that radius fits into."""
+    return _morphed(mask, cv2.MORPH_CLOSE, radius_px)
+
+
+def convex_hull_of(
+    pixels: Float[Tensor, "point 2"], size_px: tuple[int, int]
+) -> Bool[Tensor, "height width"]:
+    """Fill the convex hull of pixels."""
+    drawn = np.zeros(size_px[::-1], dtype=np.uint8)
+    if len(pixels):
+        hull = cv2.convexHull(pixels.numpy().astype(np.float32))
+        cv2.fillConvexPoly(drawn, np.floor(hull).astype(np.int32), 1)
+    return torch.from_numpy(drawn > 0)
+
+
+def discs_at(
+    pixels: Float[Tensor, "point 2"], radius_px: float, size_px: tuple[int, int]
+) -> Bool[Tensor, "height width"]:
+    """Mark what is within a distance of pixels."""
+    drawn = np.ones(size_px[::-1], dtype=np.uint8)
+    column, row = pixels.floor().long().T.numpy()
+    inside = (column >= 0) & (row >= 0) & (column < size_px[0]) & (row < size_px[1])
+    if not inside.any():
+        return torch.zeros(size_px[::-1], dtype=torch.bool)
+    drawn[row[inside], column[inside]] = 0
+    return torch.from_numpy(cv2.distanceTransform(drawn, cv2.DIST_L2, 3) <= radius_px)
+
+
+def _morphed(
+    mask: Bool[Tensor, "height width"], how: int, radius_px: int
+) -> Bool[Tensor, "height width"]:
+    size = 2 * radius_px + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return torch.from_numpy(cv2.morphologyEx(mask.numpy().astype(np.uint8), how, disc) > 0)
+
+
+def without_specks(
+    mask: Bool[Tensor, "height width"], kept: Bool[Tensor, "height width"], least_px: int
+) -> Bool[Tensor, "height width"]:
+    """Drop components that are small or do not reach ``kept``, and fill small holes."""
+    return ~_large(~_large(mask, kept, least_px), torch.ones_like(mask), least_px)
+
+
+def _large(
+    mask: Bool[Tensor, "height width"], meeting: Bool[Tensor, "height width"], least_px: int
+) -> Bool[Tensor, "height width"]:
+    drawn = mask.numpy().astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(drawn, connectivity=4)
+    met = np.bincount(labels[meeting.numpy()], minlength=count) > 0
+    taken = met & (stats[:, cv2.CC_STAT_AREA] >= least_px) & (np.arange(count) > 0)
+    return torch.from_numpy(taken[labels])
+
+
+def blind_holes(
+    mask: Bool[Tensor, "height width"], seen_through: Bool[Tensor, "height width"], share: float
+) -> Bool[Tensor, "height width"]:
+    """Mark the holes of a mask of which less than a share is seen through."""
+    drawn = (~mask).numpy().astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(drawn, connectivity=4)
+    through = np.bincount(labels[seen_through.numpy()], minlength=count)
+    left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
+    right, bottom = left + stats[:, cv2.CC_STAT_WIDTH], top + stats[:, cv2.CC_STAT_HEIGHT]
+    height, width = drawn.shape
+    enclosed = (left > 0) & (top > 0) & (right < width) & (bottom < height)
+    blind = enclosed & (through < share * stats[:, cv2.CC_STAT_AREA]) & (np.arange(count) > 0)
+    return torch.from_numpy(blind[labels])

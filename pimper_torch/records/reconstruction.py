@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from pimper_torch.records.outlines import Outlines
 from pimper_torch.records.patches import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
@@ -35,6 +36,7 @@ class Reconstruction(Record):
         coarse: The facets.
         patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
         report: One entry a stage, in the order they ran.
+        outlines: Of the object in every view; ``None`` where everything is the object.
     """
 
     mesh: Mesh
@@ -42,6 +44,7 @@ class Reconstruction(Record):
     coarse: CoarseMesh
     patches: DepthPatches | SweptPatches
     report: tuple[StageReport, ...]
+    outlines: Outlines | None = None
 
     @property
     def cameras(self) -> Cameras:

@@ -1,0 +1,213 @@
+"""Which pixels of every view show the object."""
+
+import warnings
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import interpolate
+
+from pimper_torch.config import require
+from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.outlines.agreement import Agreement, agreement_of
+from pimper_torch.outlines.cloud import pixels_seen, split_cloud
+from pimper_torch.outlines.ground import gaze, supporting_plane, well_tracked
+from pimper_torch.outlines.opencv import signed_distance
+from pimper_torch.outlines.parallax import plane_agreement
+from pimper_torch.outlines.pictures import working_pictures
+from pimper_torch.outlines.rounds import Cues, Cuts, cut_in_rounds
+from pimper_torch.records import Outlines, SparseScene, Views
+
+_BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
+# Probabilities where a view's cut and the hull contradict each other by more than two pixels.
+_UNSURE_INSIDE, _UNSURE_OUTSIDE = 0.6, 0.3
+_SOFT = 0.5  # working pixels: the width of a border
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutlineConfig:
+    """Settings of :class:`Outline`.
+
+    Attributes:
+        object: Find outlines and fall back to everything (``auto``), take the masks that come
+            with the photographs (``masks``), or take all that the photographs show for the object
+            (``everything``), as for walls, reliefs and scenes. Masks that are given are believed
+            by ``auto``, too.
+        region: Box that the object is inside: smallest x, y, z, then largest, scene units.
+        size_px: Longer side of the pictures that are cut.
+        rounds: Of cutting and voting after the first cut.
+        num_voxels: Of the visual hull.
+        disagreeing: Share of the views that may see a voxel of the hull outside.
+        plane_tolerance: Distance up to which a point lies on the supporting plane, as a share of
+            the cameras' distance.
+        least_on_plane: Share of the points that lie on it.
+        most_below_plane: Share of the points that may lie below it.
+        least_covered: Share of a view's outline that the hull's silhouette must cover, or the
+            view is not trusted.
+        least_overlap: Intersection over union of outlines and silhouettes, in the median, below
+            which outlines are not trusted.
+        margin: Probability above which a pixel is used as the object's.
+        seed: Of the plane's trials.
+    """
+
+    object: Literal["auto", "masks", "everything"] = "auto"
+    region: tuple[float, float, float, float, float, float] | None = None
+    size_px: int = 640
+    rounds: int = 2
+    num_voxels: int = 500_000
+    disagreeing: float = 0.05
+    plane_tolerance: float = 0.004
+    least_on_plane: float = 0.08
+    most_below_plane: float = 0.05
+    least_covered: float = 0.9
+    least_overlap: float = 0.8
+    margin: float = 0.25
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.size_px >= 64, "size_px", self.size_px, "64 or more")
+        require(self.rounds >= 1, "rounds", self.rounds, "1 or more")
+        require(self.num_voxels >= 1000, "num_voxels", self.num_voxels, "1000 or more")
+        for name in ("disagreeing", "least_on_plane", "most_below_plane", "margin"):
+            require(0 <= getattr(self, name) < 1, name, getattr(self, name), "in [0, 1)")
+        for name in ("least_covered", "least_overlap"):
+            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "in (0, 1]")
+        require(self.plane_tolerance > 0, "plane_tolerance", self.plane_tolerance, "above 0")
+        if self.region is not None:
+            low, high = self.region[:3], self.region[3:]
+            ordered = all(a < b for a, b in zip(low, high, strict=True))
+            require(ordered, "region", self.region, "smallest x, y, z, then largest")
+
+
+class Outline(nn.Module):
+    """Find the object's outline in every view; a constant to autograd."""
+
+    def __init__(self, config: OutlineConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or OutlineConfig()
+
+    @torch.no_grad()
+    def forward(self, scene: SparseScene) -> Outlines | None:
+        """Find outlines, or take the masks for them.
+
+        Args:
+            scene: Photographs, cameras and cloud.
+
+        Returns:
+            ``None`` for everything: where it is asked for, or, with a
+            :class:`~pimper_torch.errors.PimperWarning` that says why, where outlines cannot be
+            trusted.
+
+        Raises:
+            InputError: Masks are asked for, and none are given.
+        """
+        config, masks = self.config, scene.views.masks
+        if config.object == "everything":
+            return None
+        if masks is not None:
+            trusted = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
+            return Outlines(inside=masks.float(), trusted=trusted, source="masks")
+        if config.object == "masks":
+            raise InputError(
+                "`outline.object` is masks, but the photographs come without any. Give a folder "
+                "of masks, or let outlines be found: `outline.object` auto."
+            )
+        cuts = self._cuts(scene)
+        if cuts is None:
+            _warn("the views' outlines have nothing in common")
+            return None
+        agreement = agreement_of(cuts)
+        doubt = self._doubt(agreement)
+        if doubt:
+            _warn(doubt)
+            return None
+        found = _at_full_size(cuts, scene.views)
+        trusted = agreement.trusted(config.least_covered).to(found.device)
+        return Outlines(inside=found, trusted=trusted, source="found")
+
+    def masked(self, scene: SparseScene, outlines: Outlines | None) -> SparseScene:
+        """Give the scene with outlines for masks, a little wider where they are unsure."""
+        if outlines is None or outlines.source == "masks":
+            return scene
+        masks = outlines.inside > self.config.margin
+        return scene.replace(views=scene.views.replace(masks=masks))
+
+    def _cuts(self, scene: SparseScene) -> Cuts | None:
+        config = self.config
+        pictures = working_pictures(scene.views, scene.cameras, config.size_px)
+        cameras, points = pictures.cameras, scene.points_world.cpu().float()
+        looked_at = gaze(cameras)
+        tolerance = config.plane_tolerance * float(looked_at.distance)
+        plane = supporting_plane(
+            points[well_tracked(scene).cpu()],
+            cameras,
+            tolerance=tolerance,
+            least_on=config.least_on_plane,
+            most_below=config.most_below_plane,
+            generator=torch.Generator().manual_seed(config.seed),
+        )
+        region = None
+        if config.region is not None:
+            region = torch.tensor(config.region).reshape(2, 3)
+        cloud = split_cloud(scene.to("cpu", torch.float32), looked_at, plane, tolerance, region)
+        half = _BOX * looked_at.distance
+        middle = looked_at.fixation_world
+        agreement = None if plane is None else plane_agreement(pictures, plane, looked_at)
+        cues = Cues(
+            pictures=pictures,
+            own_px=tuple(pixels_seen(scene, cameras, cloud.own.to(scene.points_world.device))),
+            other_px=tuple(pixels_seen(scene, cameras, cloud.other.to(scene.points_world.device))),
+            plane=plane,
+            agreement=agreement,
+            box_world=torch.stack([middle - half, middle + half]) if region is None else region,
+        )
+        if plane is None and not cues.has_points:
+            return None
+        return cut_in_rounds(
+            cues,
+            rounds=config.rounds,
+            disagreeing=config.disagreeing,
+            num_voxels=config.num_voxels,
+        )
+
+    def _doubt(self, agreement: Agreement) -> str:
+        """Say why outlines cannot be trusted, or nothing."""
+        trusted = agreement.trusted(self.config.least_covered)
+        overlap = float(agreement.overlap.median())
+        if overlap < self.config.least_overlap:
+            return (
+                f"outlines overlap with the hull of all views by {overlap:.0%} in the median; "
+                f"needed: {self.config.least_overlap:.0%} (`outline.least_overlap`)"
+            )
+        if int(trusted.sum()) < max(3, len(trusted) / 2):
+            return f"only {int(trusted.sum())} of {len(trusted)} outlines agree with the others"
+        return ""
+
+
+def _warn(why: str) -> None:
+    warnings.warn(
+        f"Everything that the photographs show is taken for the object: {why}. Give masks, or a "
+        "box round the object (`outline.region`); `outline.object` everything says that this is "
+        "meant.",
+        PimperWarning,
+        stacklevel=3,
+    )
+
+
+def _at_full_size(cuts: Cuts, views: Views) -> Float[Tensor, "view height width"]:
+    """Turn cuts into probabilities at the photographs' size; 0 in the padding."""
+    height, width = views.images.shape[-2:]
+    device = views.images.device
+    found = torch.empty(len(cuts.masks), height, width, device=device)
+    for view, (cut, margin) in enumerate(zip(cuts.masks, cuts.margins_px, strict=True)):
+        layers = torch.stack([signed_distance(cut), margin.clamp(-100, 100)])
+        border, hull = interpolate(
+            layers[None], (height, width), mode="bilinear", align_corners=False
+        )[0]
+        inside = torch.sigmoid(border / _SOFT)
+        inside = torch.where((border > 2) & (hull < -2), _UNSURE_INSIDE, inside)
+        inside = torch.where((border < -2) & (hull > 2), _UNSURE_OUTSIDE, inside)
+        found[view] = inside.to(device)
+    return found * views.inside

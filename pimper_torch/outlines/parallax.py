@@ -1,0 +1,158 @@
+"""Plane parallax: what stands on a plane does not look as the plane does from elsewhere.
+
+All photographs are rectified to the plane. The median of what they show there is the plane's
+texture, without what stands on it and without shadows, which move with the light. Where a view
+agrees with it, it shows the plane; where it does not, something stands before it, textured or not.
+Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.outlines.ground import Gaze, Plane
+from pimper_torch.outlines.opencv import warped, window_means
+from pimper_torch.outlines.pictures import Pictures
+from pimper_torch.records import Cameras, Record
+
+# Shares of the pictures' longer side.
+_WINDOW = 1 / 80  # windows that are compared: 9 px of 640
+_SHADING = 1 / 25  # what is smoother than this is light, not texture
+# Log radiance whose deviation in a window is below this is flat: a sensor's noise of 0.01.
+_FLAT = 0.008
+DISPUTED = 0.5
+_REACH = 0.6  # of the cameras' distance: the plane that is rectified, to each side
+_STEP = 1.5  # working pixels at the fixation point between samples of the plane
+# The same for brightness, where there is no texture.
+_FAR_REACH, _FAR_STEP = 2.0, 8.0
+_NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
+_LEAST_VIEWS = 3  # of which two agree
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Sheet(Record):
+    """A raster on the plane.
+
+    Attributes:
+        world_from_sheet: Homogeneous pixels of the raster to world points, 3 x 3.
+        size_px: Samples each way.
+    """
+
+    world_from_sheet: Float[Tensor, "3 3"]
+    size_px: int
+
+
+def plane_agreement(
+    pictures: Pictures, plane: Plane, gaze: Gaze
+) -> Float[Tensor, "view height width"]:
+    r"""Say how well each view agrees with the plane's texture.
+
+    Agreement in a window is :math:`2\,\mathrm{cov} / (\mathrm{var} + \mathrm{var}')` of log
+    radiance without its smooth part.
+
+    Args:
+        pictures: At the working size.
+        plane: Supporting the object.
+        gaze: Its fixation point is the middle of what is looked at.
+
+    Returns:
+        Between -1 and 1; 0 where views do not agree on what the plane looks like, as where it is
+        always hidden; NaN where it is flat, or few views see it.
+    """
+    cameras, longer = pictures.cameras, max(pictures.grey.shape[1:])
+    texture = torch.stack([_textured(grey, longer) for grey in pictures.grey])
+    common, spread = _common(texture, cameras, _sheet(cameras, plane, gaze, _REACH, _STEP))
+    level, level_spread = _common(
+        pictures.grey, cameras, _sheet(cameras, plane, gaze, _FAR_REACH, _FAR_STEP)
+    )
+    found = []
+    for view, one in enumerate(texture):
+        agreement = _agreement(one, common[view], spread[view], longer)
+        other = (pictures.grey[view] - level[view]).abs() > _NO_SHADOW
+        other &= level_spread[view] < _NO_SHADOW / 2
+        found.append(torch.where(agreement.isnan() & other, -1, agreement))
+    return torch.stack(found)
+
+
+def _common(
+    values: Float[Tensor, "view height width"], cameras: Cameras, sheet: Sheet
+) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
+    """Give the views' median of each place on the plane, and its spread, as each view sees it."""
+    maps = [cameras.intrinsics[v] @ _on_sheet(cameras, sheet, v) for v in range(len(values))]
+    size = (sheet.size_px, sheet.size_px)
+    seen = torch.stack([warped(one, to, size) for one, to in zip(values, maps, strict=True)])
+    common = seen.nanmedian(dim=0).values
+    spread = (seen - common).abs().nanmedian(dim=0).values
+    few = seen.isfinite().sum(dim=0) < _LEAST_VIEWS
+    common, spread = common.masked_fill(few, torch.nan), spread.masked_fill(few, torch.nan)
+    size = (values.shape[2], values.shape[1])
+    back = [torch.linalg.inv(to) for to in maps]
+    return (
+        torch.stack([_before(warped(common, to, size), to) for to in back]),
+        torch.stack([_before(warped(spread, to, size), to) for to in back]),
+    )
+
+
+def _before(
+    layer: Float[Tensor, "height width"], sheet_from_pixels: Float[Tensor, "3 3"]
+) -> Float[Tensor, "height width"]:
+    """Forget what a homography puts before the camera though it lies behind, above the horizon."""
+    height, width = layer.shape
+    pixels = pixel_centers(width, height, like=layer)
+    scale = pixels @ sheet_from_pixels[2, :2] + sheet_from_pixels[2, 2]
+    return torch.where(scale > 0, layer, torch.nan)
+
+
+def _sheet(cameras: Cameras, plane: Plane, gaze: Gaze, reach: float, step_px: float) -> Sheet:
+    """Lay a raster on the plane about the foot of the fixation point."""
+    normal = plane.normal_world
+    axis = torch.eye(3)[normal.abs().argmin()].to(normal)
+    first = normalize(torch.linalg.cross(normal, axis), dim=0)
+    second = torch.linalg.cross(normal, first)
+    foot = gaze.fixation_world - plane.height_of(gaze.fixation_world) * normal
+    step = step_px * gaze.distance / cameras.intrinsics[:, 0, 0].median()
+    size = int(2 * reach * gaze.distance / step)
+    corner = foot - step * size / 2 * (first + second)
+    return Sheet(
+        world_from_sheet=torch.stack([step * first, step * second, corner], dim=1), size_px=size
+    )
+
+
+def _on_sheet(cameras: Cameras, sheet: Sheet, view: int) -> Float[Tensor, "3 3"]:
+    """Give the map from homogeneous pixels of the raster to a camera's frame."""
+    pose = cameras.cam_from_world[view]
+    moved = pose[:3, :3] @ sheet.world_from_sheet
+    moved[:, 2] += pose[:3, 3]
+    return moved
+
+
+def _textured(grey: Float[Tensor, "height width"], longer: int) -> Float[Tensor, "height width"]:
+    """Take the light out: what varies smoothly."""
+    return grey - window_means(grey[None], _odd(_SHADING * longer))[0]
+
+
+def _agreement(
+    one: Float[Tensor, "height width"],
+    common: Float[Tensor, "height width"],
+    spread: Float[Tensor, "height width"],
+    longer: int,
+) -> Float[Tensor, "height width"]:
+    """Compare a view with the plane's texture window by window."""
+    known = common.isfinite() & spread.isfinite()
+    common, spread = torch.where(known, common, 0), torch.where(known, spread, 0)
+    layers = [one, common, one * one, common * common, one * common, spread, known.to(one)]
+    means = window_means(torch.stack(layers), _odd(_WINDOW * longer))
+    variance = (means[2] - means[0] ** 2).clamp_min(0)
+    variance_common = (means[3] - means[1] ** 2).clamp_min(0)
+    agreement = 2 * (means[4] - means[0] * means[1]) / (variance + variance_common)
+    disputed = means[5] > variance_common.sqrt().clamp_min(_FLAT)
+    told = (torch.maximum(variance, variance_common) > _FLAT**2) & (means[6] > 0.999)
+    return torch.where(told, torch.where(disputed, DISPUTED, agreement), torch.nan)
+
+
+def _odd(size: float) -> int:
+    return 2 * round(size / 2) + 1

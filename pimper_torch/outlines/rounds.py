@@ -1,0 +1,183 @@
+"""Rounds of cutting every view and of voting on what the cuts have in common."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from pimper_torch.outlines.ground import Plane
+from pimper_torch.outlines.hull import margins, visual_hull
+from pimper_torch.outlines.opencv import (
+    OBJECT,
+    convex_hull_of,
+    grab_cut,
+    signed_distance,
+    without_specks,
+)
+from pimper_torch.outlines.parallax import DISPUTED
+from pimper_torch.outlines.pictures import Pictures
+from pimper_torch.outlines.seeds import (
+    filled,
+    is_deep,
+    labels_from_hull,
+    labels_from_points,
+    not_seen_through,
+    off_plane,
+)
+from pimper_torch.progress import track
+from pimper_torch.records import Outlines, Record
+
+# Points of the object that a view must observe, in the median, to be seeded by them.
+_LEAST_OBSERVED = 12
+_WELL = 2.0  # times as deep as is_deep asks for
+_CUTS = 2  # rounds of mixtures and cut inside GrabCut
+_SPECK = 2e-4  # share of the picture
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Cues(Record):
+    """What tells the object before anything is cut.
+
+    Attributes:
+        pictures: At the working size.
+        own_px: Pixels of the object's points, one tensor a view.
+        other_px: Of points that are not the object's.
+        plane: That the object stands on.
+        agreement: With neighbours moved by the plane.
+        box_world: The object is inside.
+    """
+
+    pictures: Pictures
+    own_px: tuple[Float[Tensor, "_ 2"], ...]
+    other_px: tuple[Float[Tensor, "_ 2"], ...]
+    plane: Plane | None
+    agreement: Float[Tensor, "view height width"] | None
+    box_world: Float[Tensor, "2 3"]
+
+    @property
+    def num_views(self) -> int:
+        """How many views there are."""
+        return len(self.own_px)
+
+    @property
+    def has_points(self) -> bool:
+        """Whether views observe enough points of the object to be seeded by them."""
+        counts = torch.tensor([len(pixels) for pixels in self.own_px])
+        return int(counts.median()) >= _LEAST_OBSERVED
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Cuts(Record):
+    """The object in every view, as the view itself and as all together have it.
+
+    Attributes:
+        masks: Each view's own cut.
+        margins_px: Inside the silhouette of the hull, pixels of the working size.
+    """
+
+    masks: Bool[Tensor, "view height width"]
+    margins_px: Float[Tensor, "view height width"]
+
+
+def cut_in_rounds(cues: Cues, *, rounds: int, disagreeing: float, num_voxels: int) -> Cuts | None:
+    """Cut every view, vote, and cut again from what the vote says.
+
+    Returns:
+        ``None`` where the cuts have nothing in common.
+    """
+    masks = _first(cues)
+    for _ in range(rounds):
+        seen = _voted(cues, masks | _surrounded(cues), disagreeing, num_voxels)
+        if seen is None:
+            return None
+        masks = _again(cues, masks, seen)
+    seen = _voted(cues, masks, disagreeing, num_voxels)
+    return None if seen is None else Cuts(masks=masks, margins_px=seen)
+
+
+def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Cut from points and parallax; where hardly any points are the object's, parallax alone."""
+    height, width = cues.pictures.grey.shape[1:]
+    found = []
+    for view, own_px in enumerate(cues.own_px):
+        agreement = None if cues.agreement is None else cues.agreement[view]
+        if agreement is not None and not cues.has_points:
+            found.append(off_plane(agreement))
+            continue
+        labels = labels_from_points(own_px, cues.other_px[view], agreement, (width, height))
+        margin = signed_distance(convex_hull_of(own_px, (width, height)))
+        found.append(_cut(cues, view, labels, margin))
+    return torch.stack(found)
+
+
+def _again(
+    cues: Cues,
+    masks: Bool[Tensor, "view height width"],
+    seen: Float[Tensor, "view height width"],
+) -> Bool[Tensor, "view height width"]:
+    """Cut from the last cut and the hull; drop what does not meet the hull."""
+    found = []
+    for view in track(range(cues.num_views)):
+        own_px = cues.own_px[view]
+        agreement = None if cues.agreement is None else cues.agreement[view]
+        labels = labels_from_hull(seen[view], masks[view], own_px, agreement)
+        cut = _cut(cues, view, labels, seen[view])
+        found.append(without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel())))
+    return torch.stack(found)
+
+
+def _cut(
+    cues: Cues,
+    view: int,
+    labels: UInt8[Tensor, "height width"],
+    margin: Float[Tensor, "height width"],
+) -> Bool[Tensor, "height width"]:
+    """Cut a view, by colours that shadows change little where there is a plane for them to fall on.
+
+    Those cannot tell the grey inside of a vessel from a grey table: what is well inside is the
+    object's unless the plane is seen there.
+    """
+    if cues.agreement is None:
+        return grab_cut(cues.pictures.opponent[view], labels, _CUTS)
+    agreement = cues.agreement[view]
+    surrounded = not_seen_through(cues.own_px[view], agreement)
+    surrounded &= ~(agreement >= DISPUTED)
+    labels = torch.where(is_deep(margin / _WELL) & surrounded, OBJECT, labels)
+    cut = grab_cut(cues.pictures.opponent[view], labels, _CUTS)
+    return filled(cut, agreement)
+
+
+def _surrounded(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Mark what the object's points surround in each view and the plane is not seen through.
+
+    It takes part in the vote, as the inside of a vessel may be cut out in many views.
+    """
+    if cues.agreement is None or not cues.has_points:
+        return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
+    pairs = zip(cues.own_px, cues.agreement, strict=True)
+    return torch.stack([not_seen_through(*pair) for pair in pairs])
+
+
+def _voted(
+    cues: Cues, masks: Bool[Tensor, "view height width"], disagreeing: float, num_voxels: int
+) -> Float[Tensor, "view height width"] | None:
+    """Build the hull above the plane, and see it in every view."""
+    cameras = cues.pictures.cameras
+    outlines = Outlines(
+        inside=masks.float(), trusted=torch.ones(len(masks), dtype=torch.bool), source="found"
+    )
+    hull = visual_hull(
+        outlines, cameras, cues.box_world, num_voxels=num_voxels, disagreeing=disagreeing
+    )
+    if hull is None:
+        return None
+    if cues.plane is not None:
+        hull = hull.above(cues.plane.normal_world, cues.plane.offset)
+    height, width = masks.shape[1:]
+    return torch.stack(
+        [
+            margins(hull, cameras.intrinsics[view], cameras.cam_from_world[view], (width, height))
+            for view in range(len(masks))
+        ]
+    )
