@@ -15,7 +15,7 @@ from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.mend import Mend, MendConfig
-from pimper_torch.outlines.outline import Outline, OutlineConfig
+from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
@@ -24,6 +24,7 @@ from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
     Mesh,
+    Outlines,
     Reconstruction,
     SparseScene,
     Surface,
@@ -32,6 +33,8 @@ from pimper_torch.records import (
 )
 from pimper_torch.refinement.refine import Refine, RefineConfig
 from pimper_torch.reporting import Observer, Silent, recorded
+from pimper_torch.rims.constraints import Rim, Rims
+from pimper_torch.rims.contours import RimConfig
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
@@ -66,6 +69,7 @@ class PimperConfig:
     rounds: RoundsConfig = field(default_factory=RoundsConfig)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
     outline: OutlineConfig = field(default_factory=OutlineConfig)
+    rims: RimConfig = field(default_factory=RimConfig)
     triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
     enclose: EncloseConfig = field(default_factory=EncloseConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
@@ -105,7 +109,8 @@ class Pimper(nn.Module):
         self.config = config = config or PimperConfig()
         self.observer = observer or Silent()
         self.reconstruct: nn.Module = Reconstruct(config.reconstruct, cache)
-        self.outline = Outline(config.outline)
+        self.outline: nn.Module = Outline(config.outline)
+        self.rim: nn.Module = Rim(config.rims)
         self.triangulate: nn.Module = Triangulate(config.triangulate)
         self.enclose: nn.Module = Enclose(config.enclose)
         self.decompose: nn.Module = Decompose(config.decompose)
@@ -139,49 +144,63 @@ class Pimper(nn.Module):
         with recorded(self, self.observer) as report:
             scene = self.reconstruct(views, sparse_model)
             outlines = self.outline(scene)
-            scene = self.outline.masked(scene, outlines)
+            scene = masked(scene, outlines, self.config.outline.margin)
             chain = self._in_rounds if self.config.rounds.scales else self._published
-            patches, surface = chain(scene, mesh)
+            patches, surface = chain(scene, outlines, mesh)
             found = self.extract(surface)
         return Reconstruction(
             mesh=found,
             scene=scene,
+            outlines=outlines,
             coarse=patches.patches.coarse,
             patches=patches,
             report=tuple(report),
-            outlines=outlines,
         )
 
-    def _published(self, scene: SparseScene, mesh: Mesh | None) -> tuple[DepthPatches, Surface]:
+    def _published(
+        self, scene: SparseScene, outlines: Outlines | None, mesh: Mesh | None
+    ) -> tuple[DepthPatches, Surface]:
         """Every facet by itself, then all joined."""
-        coarse = self._coarse(scene, mesh)
+        coarse = self._coarse(scene, outlines, None, mesh)
         patches = self.decompose(coarse, scene.cameras)
         seen = self.warp(scene.views, scene.cameras, patches)
         depths = self.integrate(self.factorize(seen))
         aligned = self.align(depths)
         return aligned, self.refine(aligned)
 
-    def _in_rounds(self, scene: SparseScene, mesh: Mesh | None) -> tuple[SweptPatches, Surface]:
+    def _in_rounds(
+        self, scene: SparseScene, outlines: Outlines | None, mesh: Mesh | None
+    ) -> tuple[SweptPatches, Surface]:
         """All facets together, coarse to fine: every round registers on the one before."""
         views, cameras = scene.views, scene.cameras
-        coarse = self._coarse(scene, mesh)
+        rims = self.rim(outlines, cameras)
+        coarse = self._coarse(scene, outlines, rims, mesh)
         swept: SweptPatches | None = None
         surface: Surface | None = None
         for scale in self.config.rounds.scales:
             if surface is not None:
-                coarse = self.adapt(swept, surface)
+                coarse = self.adapt(swept, surface, rims)
             patches = self.decompose(coarse, cameras, surface, scale)
             seen = self.warp(views, cameras, patches)
             photometric = self.factorize(seen)
             swept = self.sweep(views, cameras, seen, photometric)
-            surface = self.mend(self.fuse(swept))
+            surface = self.mend(self.fuse(swept, rims))
         assert swept is not None  # there is a round at least
         assert surface is not None
         return swept, surface
 
-    def _coarse(self, scene: SparseScene, mesh: Mesh | None) -> CoarseMesh:
-        all_round = mesh is not None or self.config.rounds.all_round
-        found: CoarseMesh = self.enclose(scene, mesh) if all_round else self.triangulate(scene)
+    def _coarse(
+        self,
+        scene: SparseScene,
+        outlines: Outlines | None,
+        rims: Rims | None,
+        mesh: Mesh | None,
+    ) -> CoarseMesh:
+        found: CoarseMesh
+        if mesh is not None or self.config.rounds.all_round:
+            found = self.enclose(scene, mesh, outlines, rims)
+        else:
+            found = self.triangulate(scene)
         return found
 
 

@@ -18,6 +18,7 @@ from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
     Mesh,
+    Outlines,
     PatchSet,
     PatchViews,
     PhotometricPatches,
@@ -25,6 +26,7 @@ from pimper_torch.records import (
     StageReport,
     Surface,
 )
+from pimper_torch.rims.constraints import Rims
 
 
 @runtime_checkable
@@ -123,6 +125,19 @@ def _(scene: SparseScene) -> dict[str, int | float]:
         "mean_track_length": length,
         "mean_reprojection_px": _mean(scene.reprojection_errors_px),
     }
+
+
+@figures.register
+def _(outlines: Outlines) -> dict[str, int | float]:
+    return {
+        "trusted_views": int(outlines.trusted.sum()),
+        "object_share": _mean(outlines.masks.flatten().float()),
+    }
+
+
+@figures.register
+def _(rims: Rims) -> dict[str, int | float]:
+    return {"rim_rays": len(rims.rays.view)}
 
 
 @figures.register

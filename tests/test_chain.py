@@ -22,6 +22,7 @@ from pimper_torch.records import (
     SweptPatches,
     Views,
 )
+from pimper_torch.rims.constraints import Rims
 from pimper_torch.scenes import (
     RenderedScene,
     potato_on_table,
@@ -144,8 +145,8 @@ class Dragging(nn.Module):
         self.fuse = fuse
         self.sound: list[Surface] = []
 
-    def forward(self, swept: SweptPatches) -> Surface:
-        surface: Surface = self.fuse(swept)
+    def forward(self, swept: SweptPatches, rims: Rims | None) -> Surface:
+        surface: Surface = self.fuse(swept, rims)
         self.sound.append(surface)
         vertices = surface.vertices_world.clone()
         vertices[self.dragged(surface), 0] += 0.3
@@ -164,9 +165,9 @@ class Spy(nn.Module):
         self.stage = stage
         self.surface: Surface | None = None
 
-    def forward(self, swept: SweptPatches, surface: Surface) -> CoarseMesh:
+    def forward(self, swept: SweptPatches, surface: Surface, rims: Rims | None) -> CoarseMesh:
         self.surface = surface
-        found: CoarseMesh = self.stage(swept, surface)
+        found: CoarseMesh = self.stage(swept, surface, rims)
         return found
 
 
@@ -218,15 +219,14 @@ def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
     surface = compared(result.mesh.replace(normals_world=None), result, truth)
     for name, figures in (("facets", facets), ("surface", surface)):
         log.info("small photographs: %s %s", name, figures)
-    # Measured: 93 to 94 % covered, normals 3.3 to 4.3 degrees off (the facets 7.2 to 8.5), their
-    # median 2.4 to 2.9 (7.0). The 3D error is no measure of so few rays: a handful that pass the
-    # contour beside the mask's border make it 1.3 or 10 %, of the facets as of the surface.
-    assert surface.coverage > 0.92
-    assert surface.mean_angle_deg < 5.0
+    # Measured: 94 % covered, 1.34 % off (the facets 2.43), normals 3.3 degrees off (7.2),
+    # their median 2.8. Bounds are a quarter above.
+    assert surface.coverage > 0.98
+    assert surface.relative_error < 1.7
+    assert surface.mean_angle_deg < 4.1
     assert surface.median_angle_deg < 3.5
+    assert surface.relative_error < 0.7 * facets.relative_error
     assert surface.mean_angle_deg < 0.6 * facets.mean_angle_deg
-    assert surface.median_angle_deg < 0.5 * facets.median_angle_deg
-    assert surface.relative_error < 1.1 * facets.relative_error
 
 
 @pytest.fixture(scope="module")

@@ -49,11 +49,17 @@ class InputOptions:
             from motion.
         mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB), used instead of the
             one that the photographs themselves give.
+        object: Whether outlines of the object are found (auto), taken from masks, or everything is
+            the object, as for walls, reliefs and scenes; as `--outline.object`.
+        region: Box that the object is inside, smallest and largest corner in scene units, such as
+            (-1,-1,0,1,1,2); as `--outline.region`.
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     sparse: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    object: Literal["auto", "masks", "everything"] | None = None
+    region: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,6 +127,12 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         args=list(arguments),
         config=(LEVELS,),
     )
+    outline = job.config.outline
+    if job.inputs.object:
+        outline = dataclasses.replace(outline, object=job.inputs.object)
+    if job.inputs.region:
+        outline = dataclasses.replace(outline, region=job.inputs.region)
+    job = dataclasses.replace(job, config=dataclasses.replace(job.config, outline=outline))
     if job.common.reference:
         named = job.common.reference
         config = dataclasses.replace(

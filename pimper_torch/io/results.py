@@ -15,7 +15,7 @@ from pimper_torch.io.accounts import lights_account, summary_account
 from pimper_torch.io.folders import written_whole
 from pimper_torch.io.meshes import write_glb, write_ply
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Reconstruction
+from pimper_torch.records import Outlines, Reconstruction, SparseScene
 from pimper_torch.sfm.scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.overview import draw_overview
@@ -25,6 +25,7 @@ RESULT_NAMES = (
     "mesh.ply",
     "mesh.glb",
     "sparse",
+    "masks",
     "normals.png",
     "albedo.png",
     "depth.npz",
@@ -52,6 +53,8 @@ def write_result(
                      in the unit of the vertices; binary
     `mesh.glb`       the same for viewers, albedo linear as glTF wants it
     `sparse/`        COLMAP model, in the mesh's frame
+    `masks/`         the object's outline in every photograph as it was undistorted, PNG of its
+                     name; none where everything is the object
     `normals.png`    reference view: red right, green up, blue to the viewer
     `albedo.png`     reference view, sRGB, scaled into [0, 1]
     `depth.npz`      reference view: depth along z (NaN where the mesh is not seen),
@@ -85,11 +88,21 @@ def _write_all(
     write_ply(result.mesh, folder / "mesh.ply")
     write_glb(result.mesh, folder / "mesh.glb")
     write_model(result.scene, folder / "sparse")
+    if result.outlines is not None:
+        _write_masks(result.outlines, result.scene, folder / "masks")
     _write_maps(result, folder)
     _write_json(lights_account(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     _write_json(summary_account(result, about), folder / "summary.json", indent=2)
     draw_overview(result, folder / "overview.png")
+
+
+def _write_masks(outlines: Outlines, scene: SparseScene, folder: Path) -> None:
+    folder.mkdir()
+    names, sizes = scene.views.names, scene.cameras.sizes_px.tolist()
+    for name, mask, (width, height) in zip(names, outlines.masks, sizes, strict=True):
+        drawn = mask[:height, :width].to(torch.uint8) * 255
+        Image.fromarray(drawn.numpy()).save(folder / f"{Path(name).stem}.png")
 
 
 def _write_maps(result: Reconstruction, folder: Path) -> None:

@@ -35,7 +35,8 @@ class OutlineConfig:
             with the photographs (``masks``), or take all that the photographs show for the object
             (``everything``), as for walls, reliefs and scenes. Masks that are given are believed
             by ``auto``, too.
-        region: Box that the object is inside: smallest x, y, z, then largest, scene units.
+        region: Box that the object is inside: smallest x, y, z, then largest, scene units; none
+            unless given.
         size_px: Longer side of the pictures that are cut.
         rounds: Of cutting and voting after the first cut.
         num_voxels: Of the visual hull.
@@ -53,7 +54,7 @@ class OutlineConfig:
     """
 
     object: Literal["auto", "masks", "everything"] = "auto"
-    region: tuple[float, float, float, float, float, float] | None = None
+    region: tuple[float, ...] = ()
     size_px: int = 640
     rounds: int = 2
     num_voxels: int = 500_000
@@ -75,10 +76,9 @@ class OutlineConfig:
         for name in ("least_covered", "least_overlap"):
             require(0 < getattr(self, name) <= 1, name, getattr(self, name), "in (0, 1]")
         require(self.plane_tolerance > 0, "plane_tolerance", self.plane_tolerance, "above 0")
-        if self.region is not None:
-            low, high = self.region[:3], self.region[3:]
-            ordered = all(a < b for a, b in zip(low, high, strict=True))
-            require(ordered, "region", self.region, "smallest x, y, z, then largest")
+        low, high = self.region[:3], self.region[3:]
+        fits = len(self.region) in (0, 6) and all(a < b for a, b in zip(low, high, strict=True))
+        require(fits, "region", self.region, "nothing, or smallest x, y, z, then largest")
 
 
 class Outline(nn.Module):
@@ -127,13 +127,6 @@ class Outline(nn.Module):
         trusted = agreement.trusted(config.least_covered).to(found.device)
         return Outlines(inside=found, trusted=trusted, source="found")
 
-    def masked(self, scene: SparseScene, outlines: Outlines | None) -> SparseScene:
-        """Give the scene with outlines for masks, a little wider where they are unsure."""
-        if outlines is None or outlines.source == "masks":
-            return scene
-        masks = outlines.inside > self.config.margin
-        return scene.replace(views=scene.views.replace(masks=masks))
-
     def _cuts(self, scene: SparseScene) -> Cuts | None:
         config = self.config
         pictures = working_pictures(scene.views, scene.cameras, config.size_px)
@@ -148,9 +141,7 @@ class Outline(nn.Module):
             most_below=config.most_below_plane,
             generator=torch.Generator().manual_seed(config.seed),
         )
-        region = None
-        if config.region is not None:
-            region = torch.tensor(config.region).reshape(2, 3)
+        region = torch.tensor(config.region).reshape(2, 3) if config.region else None
         cloud = split_cloud(scene.to("cpu", torch.float32), looked_at, plane, tolerance, region)
         half = _BOX * looked_at.distance
         middle = looked_at.fixation_world
@@ -184,6 +175,19 @@ class Outline(nn.Module):
         if int(trusted.sum()) < max(3, len(trusted) / 2):
             return f"only {int(trusted.sum())} of {len(trusted)} outlines agree with the others"
         return ""
+
+
+def masked(scene: SparseScene, outlines: Outlines | None, margin: float) -> SparseScene:
+    """Give the scene with outlines that were found for masks, a little wider where unsure.
+
+    Args:
+        scene: With photographs.
+        outlines: Masks that a person gave stay as they are.
+        margin: Probability above which a pixel is used as the object's.
+    """
+    if outlines is None or outlines.source == "masks":
+        return scene
+    return scene.replace(views=scene.views.replace(masks=outlines.inside > margin))
 
 
 def _warn(why: str) -> None:

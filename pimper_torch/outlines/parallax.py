@@ -25,8 +25,8 @@ _SHADING = 1 / 25  # what is smoother than this is light, not texture
 # Log radiance whose deviation in a window is below this is flat: a sensor's noise of 0.01.
 _FLAT = 0.008
 DISPUTED = 0.5
-_REACH = 0.6  # of the cameras' distance: the plane that is rectified, to each side
-_STEP = 1.5  # working pixels at the fixation point between samples of the plane
+_REACH = 1.0  # of the cameras' distance: the plane that is rectified, to each side
+_STEP = 2.0  # working pixels at the fixation point between samples of the plane
 # The same for brightness, where there is no texture.
 _FAR_REACH, _FAR_STEP = 2.0, 8.0
 _NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane

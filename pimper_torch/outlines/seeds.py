@@ -24,10 +24,12 @@ _CLOSING = 1 / 90
 _BEYOND = 1 / 25  # what is further outside the hull's silhouette is background
 _DEEP = 1 / 50  # parallax this far inside the silhouette tells object
 _GRAIN = 1 / 200  # what is smaller in parallax is noise
+_GAPS = 1 / 50  # in what does not show the plane, as beyond its far border
 _FOOT = 1 / 80  # parallax tells nothing of an object's foot that is so high
 
 # Agreement with neighbours moved by the plane: below is not the plane, above is.
 _OFF_PLANE = 0.4
+_NOT_PLANE = 0.6
 _ON_PLANE = 0.75
 _THROUGH = 0.2  # of a hole: its border agrees with nothing
 
@@ -83,8 +85,9 @@ def labels_from_hull(
 
 
 def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Mark what does not lie on the plane; unknown counts as not the object."""
-    return closed(_grainless(agreement < _OFF_PLANE), round(_GRAIN * max(agreement.shape)))
+    """Mark what does not show the plane, or where it is always hidden; unknown counts as plane."""
+    found = _grainless(agreement < _NOT_PLANE)
+    return filled(closed(found, round(_GAPS * max(agreement.shape))), agreement)
 
 
 def is_deep(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

@@ -33,10 +33,10 @@ class Reconstruction(Record):
     Attributes:
         mesh: One connected surface with vertex normals, albedo and confidence.
         scene: Cameras, undistorted photographs and the sparse cloud, in the mesh's frame.
+        outlines: Where every view shows the object; ``None`` where everything is.
         coarse: The facets.
         patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
         report: One entry a stage, in the order they ran.
-        outlines: Of the object in every view; ``None`` where everything is the object.
     """
 
     mesh: Mesh

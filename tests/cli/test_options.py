@@ -21,7 +21,7 @@ RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
         "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
-        "--cache {out}_kept"
+        "--cache {out}_kept --object masks --region (-9,-9,-9,9,9,9)"
     ],
     "demo": [
         "-o {out} --preset fast --reference 38 --device cpu --max-size-px 60 --overwrite "
@@ -175,8 +175,9 @@ def rivals(leaf):
     elif isinstance(value, bool):
         yield not value
     elif isinstance(value, tuple):
-        yield value[:-1]
+        yield from [value[:-1]] if value else []
         yield (*value, 0.5)
+        yield (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
     elif isinstance(value, str):
         yield from ("SIMPLE_PINHOLE", "other")
     elif isinstance(value, int):

@@ -19,6 +19,7 @@ from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.meshes import write_glb, write_ply
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.records import Outlines
 from pimper_torch.viz.maps import albedo_scale
 
 
@@ -40,7 +41,7 @@ def names(folder: Path):
 def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
     write_result(reconstruction, Config(), tmp_path / "deep" / "out", about={"preset": "paper"})
     out = tmp_path / "deep" / "out"
-    assert names(out) == sorted(RESULT_NAMES)
+    assert names(out) == sorted({*RESULT_NAMES} - {"masks"})
     assert names(tmp_path / "deep") == ["out"]
     assert yaml.safe_load((out / "config.yaml").read_text()) == {"zeta": 0.5}
     summary = json.loads((out / "summary.json").read_text())
@@ -271,7 +272,7 @@ def test_an_empty_folder_is_filled(reconstruction, tmp_path):
     (tmp_path / "out").mkdir()
     prepare_output(tmp_path / "out", RESULT_NAMES)
     write_result(reconstruction, Config(), tmp_path / "out")
-    assert names(tmp_path / "out") == sorted(RESULT_NAMES)
+    assert names(tmp_path / "out") == sorted({*RESULT_NAMES} - {"masks"})
 
 
 def test_a_folder_that_cannot_be_renamed_is_filled(reconstruction, tmp_path, monkeypatch):
@@ -285,7 +286,7 @@ def test_a_folder_that_cannot_be_renamed_is_filled(reconstruction, tmp_path, mon
 
     monkeypatch.setattr(Path, "rename", busy)
     write_result(reconstruction, Config(zeta=2.0), out, overwrite=True)
-    assert names(out) == sorted(RESULT_NAMES)
+    assert names(out) == sorted({*RESULT_NAMES} - {"masks"})
     assert "2.0" in (out / "config.yaml").read_text()
     assert names(tmp_path) == ["out"]
 
@@ -330,3 +331,16 @@ def test_the_sparse_model_shares_the_meshs_frame(reconstruction, tmp_path):
     vertex = reconstruction.mesh.vertices_world[112].double()
     wanted = transform(reconstruction.cameras.cam_from_world[1].double(), vertex[None])[0]
     assert np.allclose(image.cam_from_world() * vertex.numpy(), wanted, atol=1e-5)
+
+
+def test_outlines_are_written_as_masks_that_can_be_given(reconstruction, tmp_path):
+    inside = torch.zeros(3, 40, 60)
+    inside[:, 5:30, 10:50] = 0.9
+    inside[:, :, 50:] = 0.4
+    trusted = torch.tensor([True, True, False])
+    outlines = Outlines(inside=inside, trusted=trusted, source="found")
+    write_result(reconstruction.replace(outlines=outlines), Config(zeta=2.0), tmp_path / "out")
+    found = sorted(path.name for path in (tmp_path / "out" / "masks").iterdir())
+    assert found == ["a.png", "b.png", "c.png"]
+    drawn = np.array(Image.open(tmp_path / "out" / "masks" / "b.png"))
+    assert np.array_equal(drawn > 0, inside[1].numpy() > 0.5)

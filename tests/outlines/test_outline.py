@@ -1,0 +1,116 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.outlines.ground import gaze, supporting_plane
+from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
+
+SMALL = OutlineConfig(size_px=240, num_voxels=60_000)
+
+
+def overlap(found, truth):
+    return (found & truth).sum(dim=(1, 2)) / (found | truth).sum(dim=(1, 2))
+
+
+def test_a_ball_on_a_table_is_found_in_every_view(staged):
+    outlines = Outline(SMALL)(staged.scene)
+    assert outlines is not None
+    assert outlines.source == "found"
+    assert outlines.trusted.all()
+    # A pixel more all round the ball of 50 pixels is 0.96; the table or its shadow is far less.
+    assert overlap(outlines.masks, staged.truth).min() > 0.95
+
+
+def test_an_object_without_a_point_is_found_by_parallax(staged):
+    scene = staged.scene
+    on_ball = scene.points_world[:, 2] > 0.01
+    kept = ~on_ball[scene.observation_point]
+    bare = scene.replace(
+        observation_point=scene.observation_point[kept],
+        observation_view=scene.observation_view[kept],
+        observation_pixels=scene.observation_pixels[kept],
+    )
+    outlines = Outline(SMALL)(bare)
+    assert outlines is not None
+    assert overlap(outlines.masks, staged.truth).median() > 0.9
+
+
+def test_used_masks_are_a_little_wider_than_outlines(staged):
+    outlines = Outline(SMALL)(staged.scene)
+    assert outlines is not None
+    used = masked(staged.scene, outlines, SMALL.margin).views.masks
+    assert used is not None
+    assert (used | ~outlines.masks).all()
+    assert used.sum() > outlines.masks.sum()
+    assert masked(staged.scene, None, SMALL.margin) is staged.scene
+
+
+def test_masks_that_are_given_are_believed(staged):
+    drawn = torch.zeros_like(staged.truth)
+    drawn[:, 20:60, 30:90] = True  # nothing like the ball
+    scene = staged.scene.replace(views=staged.scene.views.replace(masks=drawn))
+    outlines = Outline()(scene)
+    assert outlines is not None
+    assert outlines.source == "masks"
+    assert outlines.trusted.all()
+    assert torch.equal(outlines.masks, drawn)
+    assert masked(scene, outlines, 0.25) is scene
+    assert Outline(OutlineConfig(object="everything"))(scene) is None
+
+
+def test_masks_are_asked_for_and_missing(staged):
+    with pytest.raises(InputError, match="come without any"):
+        Outline(OutlineConfig(object="masks"))(staged.scene)
+
+
+def test_outlines_that_contradict_one_another_are_not_trusted(staged):
+    """Photographs under other cameras than theirs have no hull in common."""
+    views = staged.scene.views
+    shifted = [image.roll(90 * (view % 2) - 45, 2) for view, image in enumerate(views.images)]
+    scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))
+    with pytest.warns(PimperWarning, match=r"is taken for the object.*`outline.region`"):
+        assert Outline(SMALL)(scene) is None
+
+
+def test_the_region_keeps_what_is_outside_from_being_the_object(staged):
+    left = OutlineConfig(size_px=240, num_voxels=60_000, region=(-0.6, -0.6, 0.0, 0.0, 0.6, 1.1))
+    outlines = Outline(left)(staged.scene)
+    if outlines is not None:  # half a ball, as the box cuts it
+        assert outlines.masks.sum() < 0.8 * staged.truth.sum()
+
+
+def test_a_region_is_two_corners():
+    for wrong in ((1.0, 2.0), (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)):
+        with pytest.raises(ConfigError, match="region"):
+            OutlineConfig(region=wrong)
+
+
+def test_the_table_is_the_supporting_plane(staged, generator):
+    scene = staged.scene
+    plane = supporting_plane(
+        scene.points_world, scene.cameras, tolerance=0.01, least_on=0.1, most_below=0.05,
+        generator=generator,
+    )  # fmt: skip
+    assert plane is not None
+    assert_close(plane.normal_world, torch.tensor([0.0, 0, 1]), atol=1e-3, rtol=0)
+    assert_close(
+        plane.height_of(torch.tensor([3.0, 1.0, 0.7])), torch.tensor(0.7), atol=0.01, rtol=0
+    )
+
+
+def test_points_without_a_plane_have_none(generator):
+    from pimper_torch.scenes.cameras import arc_cameras
+
+    cameras = arc_cameras(5, width=80, height=60, focal_px=90.0, distance=4.0).to(torch.float32)
+    points = torch.randn(500, 3, generator=generator)
+    found = supporting_plane(
+        points, cameras, tolerance=0.01, least_on=0.1, most_below=0.05, generator=generator
+    )
+    assert found is None
+
+
+def test_cameras_look_where_they_are_aimed(staged):
+    found = gaze(staged.scene.cameras)
+    assert_close(found.fixation_world, torch.tensor([0.0, 0.0, 0.4]), atol=0.01, rtol=0)
+    assert_close(found.distance, torch.tensor(3.0), atol=0.01, rtol=0)
