@@ -86,7 +86,9 @@ def _cloud(views: Views, cameras, generator: torch.Generator) -> SparseScene:
     hidden[:, len(table) :] = False
     framed = (pixels > 2).all(-1) & (pixels < torch.tensor([238.0, 178.0])).all(-1)
     view, point = (faces & ~hidden & framed).nonzero(as_tuple=True)
-    lens = Lens(camera=1, model="PINHOLE", params=(300.0, 300, 120, 90), width=240, height=180)
+    lens = Lens(
+        camera=1, model="PINHOLE", params=(300.0, 300.0, 120.0, 90.0), width=240, height=180
+    )
     return SparseScene(
         views=views,
         cameras=cameras,
