@@ -86,7 +86,8 @@ def expected_error(
 
 def regions(lattice: Lattice) -> Int[Tensor, " facet"]:
     """Group the facets whose middles lie in one cell of a grid, a few facets wide."""
-    num_facets = int(lattice.facet.max()) + 1
+    # A facet whose vertices all lie on its edges may be named by its faces alone.
+    num_facets = int(lattice.face_facet.max()) + 1
     count = torch.bincount(lattice.facet, minlength=num_facets).clamp_min(1)[:, None]
     points = lattice.points.double()
     middle = points.new_zeros(num_facets, 3).index_add(0, lattice.facet, points) / count

@@ -170,6 +170,14 @@ def test_regions_are_a_few_facets_wide(square):
     assert torch.equal(regions(moved), label)  # whatever the scale
 
 
+def test_facets_whose_vertices_name_others_have_regions():
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]).double()
+    facets = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    lattice = subdivide(corners, facets, torch.full((4,), 9.0).double())
+    assert int(lattice.facet.max()) < 3  # four vertices, each named after one of its facets
+    assert len(regions(lattice)) == 4
+
+
 def test_no_kind_is_taken_to_be_surer_than_it_claims(square, generator):
     lattice, facets = square
     exact = [differences(lattice, 0.1), heights(lattice, 0.1)]  # without noise at all
