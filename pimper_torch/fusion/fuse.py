@@ -77,7 +77,7 @@ class FuseConfig:
         outlier_samples: How far, in samples, a patch may lie from the others before they
             outvote it, where three or more meet.
         error_draws: Of noise, for the expected error of every vertex; the more, the less it is
-            off by chance: 12 by a fifth. 0 gives none.
+            off by chance: 8 by a quarter. 0 gives none.
     """
 
     samples_per_vertex: float = 1.0
@@ -88,7 +88,7 @@ class FuseConfig:
     drift_rounds: int = 2
     noise_rounds: int = 3
     outlier_samples: float = 4.0
-    error_draws: int = 12
+    error_draws: int = 8
 
     def __post_init__(self) -> None:
         for name in ("samples_per_vertex", "outlier_samples"):
