@@ -139,7 +139,7 @@ class Enclose(nn.Module):
             reference = named_view(scene.views, config.reference)
         else:
             reference = frontal_view(scene)
-        trusted = self._trusted(scene)
+        trusted = self.trusted(scene)
         if rims is None and mesh is None:
             rims = Rim()(outlines, scene.cameras)
         fine: FineSurface | None = None
@@ -198,7 +198,8 @@ class Enclose(nn.Module):
             )
         return *_used(vertices, faces[kept]), pixel
 
-    def _trusted(self, scene: SparseScene) -> Int[Tensor, " trusted"]:
+    def trusted(self, scene: SparseScene) -> Int[Tensor, " trusted"]:
+        """List the points of the cloud that enough views saw well enough."""
         config, observed = self.config, scene.observed
         angle = triangulation_angles(scene.points_world, observed, scene.cameras.centers_world)
         trusted = (

@@ -201,7 +201,7 @@ def closed_surface(
                 f"and {len(touched.ray)} rays touch the surface there; some hundreds are needed. "
                 "Look at the masks, or bring a mesh of your own."
             )
-        vertices, faces = _poisson(joined_points(cloud, rim), pixel, config, threads)
+        vertices, faces = poisson(joined_points(cloud, rim), pixel, config, threads)
         normals = vertex_normals(vertices, faces)
         front = shown(vertices, faces, normals, rims.cameras, config.cell_px * pixel)
         places, normals = vertices[front], normals[front]
@@ -232,9 +232,10 @@ def shown(
     return found
 
 
-def _poisson(
+def poisson(
     cloud: OrientedPoints, pixel: float, config: OutlinedConfig, threads: int
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """Put a closed surface through points; the arguments are those of :func:`closed_surface`."""
     points = cloud.points_world
     # COLMAP works in single precision: a cloud far from the origin is brought there.
     middle = points.median(dim=0).values

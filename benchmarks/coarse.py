@@ -1,0 +1,186 @@
+"""Compare ways to the coarse surface of a rendered scene, true masks given.
+
+    python benchmarks/coarse.py SCENE [SCENE ...] [--cache DIR]
+
+SCENE is a folder that ``pimper render`` wrote. Cameras are found without masks. Each way is
+simplified to the facets of ``default`` and compared with the truth before any round: in the
+reference view the share of the object's pixels that it meets, the 3D error and the normals of its
+shape there; accuracy, and completeness of what three views see, in per cent of the diagonal.
+"""
+
+import argparse
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from coarse_cut import cut_surface
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.coarse.cropping import cropped
+from pimper_torch.coarse.enclose import Enclose
+from pimper_torch.coarse.matched import matched_cloud
+from pimper_torch.coarse.oriented import OrientedPoints, joined_points
+from pimper_torch.coarse.outlined import closed_surface, poisson, seen_surface, supports
+from pimper_torch.coarse.select import frontal_view
+from pimper_torch.coarse.trim import evidence, point_distances
+from pimper_torch.datasets.rendered import read_rendered
+from pimper_torch.errors import PimperWarning
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.io.photographs import load_views
+from pimper_torch.metrics import pair_views, similarity_between_cameras
+from pimper_torch.metrics.distances import TrueSurface
+from pimper_torch.metrics.in_view import compare_along_rays
+from pimper_torch.records import Mesh, Outlines, RimPoints, SparseScene
+from pimper_torch.rims.constraints import Rim
+from pimper_torch.sfm.reconstruct import Reconstruct
+from pimper_torch.sfm.surfaces import simplified
+from pimper_torch.sfm.undistort import undistorted
+
+Surface = tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
+
+# Facets of the cut count where they are so many pixels from all points and rims.
+_UNKNOWN_PX = 8.0
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--cache", type=Path, help="folder where structure from motion is kept")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore", PimperWarning)
+    sys.stdout.write(
+        "| scene | way | met % | 3D error % | normals °, mean (median) | accuracy % "
+        "| completeness % | CPU s |\n|---|---|--:|--:|--:|--:|--:|--:|\n"
+    )
+    for folder in options.scenes:
+        scene = Reconstruct(cache=options.cache)(load_views(folder / "photos"))
+        judge = Judge(folder, scene)
+        for name, way in ways(scene, masks_of(folder, scene)).items():
+            began = time.process_time()
+            vertices, faces = way()
+            seconds = time.process_time() - began
+            row = f"| {folder.name} | {name} | {judge(vertices, faces)} | {seconds:.0f} |\n"
+            sys.stdout.write(row)
+            sys.stdout.flush()
+
+
+def masks_of(folder: Path, scene: SparseScene) -> Outlines:
+    """Read the true masks, undistorted as the photographs are."""
+    views = load_views(folder / "photos", masks=folder / "masks")
+    views = views.take([views.names.index(name) for name in scene.views.names])
+    inside = torch.zeros_like(views.images[:, 0])
+    for view, (_, mask) in enumerate(undistorted(views, scene.lenses)):
+        inside[view, : mask.shape[0], : mask.shape[1]] = mask.to(inside)
+    trusted = torch.ones(len(inside), dtype=torch.bool)
+    return Outlines(inside=inside, trusted=trusted, source="masks")
+
+
+def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surface]]:
+    """List the surfaces to compare; the later ones share what the photographs told."""
+    enclose = Enclose()
+    config = enclose.config
+    rims = Rim()(outlines, scene.cameras)
+    assert rims is not None  # rendered outlines agree
+    hull = rims.hull
+    trusted = enclose.trusted(scene)
+    inside = trusted[hull.depth_of(scene.points_world[trusted]) > 0]
+    part = cropped(scene, outlines)
+    cloud, maps, pixel = matched_cloud(part, inside, config.densify, config.outlined.point_px)
+    away = config.outlined.tolerance_px * pixel
+    cloud = cloud.take(hull.depth_of(cloud.points_world) > -away)
+    vertices, faces, rim = closed_surface(cloud, rims, pixel, config.outlined, config.threads)
+    joined = joined_points(cloud, _oriented(rim))
+
+    def given(masked: bool) -> Surface:
+        some = scene.replace(views=scene.views.replace(masks=outlines.masks if masked else None))
+        found = enclose(some).mesh
+        return found.vertices_world, found.faces
+
+    def facets(some: Surface) -> Surface:
+        vertices, faces = some
+        said = evidence(vertices, faces, maps.level, maps)
+        middle = vertices[faces].mean(dim=1)
+        support = supports(middle, cloud, rim, said, config.outlined.reach_px * pixel)
+        within = hull.depth_of(middle) > -max(away, float(hull.spacing))
+        hole = (config.outlined.hole_px * pixel) ** 2
+        kept = seen_surface(vertices, faces, support, said, within, hole, config.outlined.min_share)
+        used, faces = torch.unique(faces[kept], return_inverse=True)
+        if len(faces) <= config.num_facets:
+            return vertices[used], faces
+        return simplified(
+            vertices[used],
+            faces,
+            num_faces=config.num_facets,
+            boundary_weight=config.boundary_weight,
+            threads=config.threads,
+        )
+
+    def both() -> Surface:
+        corners, cells = cut_surface(cloud, maps, hull, rim)
+        middle, normals = corners[cells].mean(dim=1), face_normals(corners, cells)
+        unknown = point_distances(middle, joined.points_world) > _UNKNOWN_PX * pixel
+        unknown &= hull.depth_of(middle) > hull.spacing
+        filled = OrientedPoints(
+            points_world=middle[unknown],
+            normals_world=normalize(normals[unknown], dim=1),
+            noise=torch.zeros(int(unknown.sum())),
+        )
+        return poisson(joined_points(joined, filled), pixel, config.outlined, config.threads)
+
+    return {
+        "no outlines": lambda: given(False),
+        "no outlines, photographs masked": lambda: given(True),
+        "Poisson of points": lambda: facets(poisson(cloud, pixel, config.outlined, config.threads)),
+        "min-cut of points": lambda: facets(cut_surface(cloud, maps, hull)),
+        "min-cut of points and rims": lambda: facets(cut_surface(cloud, maps, hull, rim)),
+        "Poisson of points, rims, and the cut between": lambda: facets(both()),
+        "Poisson of points and rims": lambda: facets((vertices, faces)),
+    }
+
+
+def _oriented(rim: RimPoints) -> OrientedPoints:
+    return OrientedPoints(
+        points_world=rim.points_world,
+        normals_world=rim.normals_world,
+        noise=rim.variance.sqrt(),
+    )
+
+
+class Judge:
+    """The truth of a scene, to compare with."""
+
+    def __init__(self, folder: Path, scene: SparseScene) -> None:
+        capture = read_rendered(folder, maps=False, photographs=False)
+        assert capture.cameras is not None  # a rendered scene has them
+        ours, theirs = pair_views(scene.views.names, capture.views.names)
+        self._truth_from_world = similarity_between_cameras(
+            scene.cameras.take(ours.tolist()), capture.cameras.take(theirs.tolist())
+        ).double()
+        view = capture.views.names.index(scene.views.names[frontal_view(scene)])
+        self._maps = read_rendered(folder, views=[view], photographs=False)
+        self._surface = TrueSurface(capture, samples=50_000)
+
+    def __call__(self, vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> str:
+        """Give a row's figures."""
+        mesh = Mesh(vertices_world=vertices.double(), faces=faces)
+        seen = compare_along_rays(mesh, self._truth_from_world, self._maps, 0)
+        moved = transform(self._truth_from_world, mesh.vertices_world)
+        found = self._surface.compare(mesh.replace(vertices_world=moved))
+        assert seen is not None
+        assert seen.shape_normals is not None
+        normals = f"{seen.shape_normals.mean_deg:.1f} ({seen.shape_normals.median_deg:.1f})"
+        near = "-" if found.accuracy is None else f"{found.accuracy.mean_percent:.2f}"
+        full = "-" if found.seen is None else f"{found.seen.completeness.mean_percent:.2f}"
+        met = f"{100 * seen.coverage:.1f} | {seen.relative_error:.1f}"
+        return f"{met} | {normals} | {near} | {full}"
+
+
+if __name__ == "__main__":
+    main()
