@@ -45,6 +45,7 @@ class InputOptions:
 
     Attributes:
         masks: Folder with a mask for each photograph, of the same name; zero off the object.
+        mask_object: How masks show the object; auto looks at all of them together.
         sparse: Folder of a COLMAP model of these photographs, used instead of structure
             from motion.
         mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB), used instead of the
@@ -56,6 +57,7 @@ class InputOptions:
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    mask_object: Literal["auto", "bright", "dark"] = "auto"
     sparse: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     object: Literal["auto", "masks", "everything"] | None = None

@@ -49,6 +49,7 @@ def _read(job: Job) -> Views:
     return load_views(
         job.photos,
         masks=job.inputs.masks,
+        mask_object=job.inputs.mask_object,
         encoding=job.config.photographs,
         max_size_px=job.common.max_size_px,
     )

@@ -4,6 +4,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,12 +22,15 @@ _BLACK = 1e-3
 _LIT_SHARE = 1e-3  # more than hot pixels
 # Less of the object than this is left of a photograph that is mostly saturated.
 _LEAST_USABLE = 0.1
+# Masks are turned round where more than the rest of it is bright at the border, and less inside.
+_TELLING = 0.25
 
 
 def load_views(
     folder: Path | str,
     *,
     masks: Path | str | None = None,
+    mask_object: Literal["auto", "bright", "dark"] = "auto",
     encoding: Encoding = SRGB,
     max_size_px: int = 0,
 ) -> Views:
@@ -38,14 +42,17 @@ def load_views(
     colour profiles are not looked at. Radiance 1 is saturation, in every colour: the level that
     is told, or at which values pile up, or full scale. Photographs of unlike sizes are padded.
 
-    Masks are images of the photographs' sizes, zero off the object (JPEG: below half).
+    Masks are images of the photographs' sizes, zero off the object (JPEG: below half). Where all
+    of them together are bright along the border and dark in the middle, they are turned round,
+    and a warning says so.
     Without a folder of masks, alpha channels that are somewhere transparent are the masks,
     and a photograph without one shows the object everywhere.
 
     Args:
         folder: With the photographs.
         masks: Folder with one mask for each photograph, of the same name whatever the
-            suffix (``17.jpg``: ``17.png``, or COLMAP's ``17.jpg.png``).
+            suffix (``17.jpg``: ``17.png``, COLMAP's ``17.jpg.png``, or ``17_mask.png``).
+        mask_object: How masks show the object; ``auto`` looks at them.
         encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer, in linear light and
             without aliasing; 0 leaves them as they are. A pixel made of some saturated ones
@@ -71,9 +78,16 @@ def load_views(
     images = pictures.images
     has_masks = mask_paths is not None or any(one is not None for one in pictures.opaque)
     drawn = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
+    opacities = (
+        [_read_mask(*one) for one in zip(mask_paths, paths, headers, strict=True)]
+        if mask_paths is not None
+        else []
+    )
+    if opacities and _is_dark(opacities, mask_object, Path(str(masks))):
+        opacities = [1 - opacity for opacity in opacities]
     for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
-        if mask_paths is not None:
-            opacity = _read_mask(mask_paths[index], paths[index], headers[index])
+        if opacities:
+            opacity = opacities[index]
             drawn[index, :high, :wide] = resized_mask(opacity, wide, high)
         else:
             drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
@@ -169,9 +183,12 @@ def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
 
 
 def _match_masks(paths: list[Path], folder: Path) -> list[Path]:
-    """Find the mask of each photograph by its stem, or by its whole name as COLMAP has it."""
+    """Find the mask of each photograph by its stem, its whole name (COLMAP), or with ``_mask``."""
     by_stem = {path.stem: path for path in list_images(folder)}
-    found = [by_stem.get(path.stem) or by_stem.get(path.name) for path in paths]
+    found = [
+        by_stem.get(path.stem) or by_stem.get(path.name) or by_stem.get(f"{path.stem}_mask")
+        for path in paths
+    ]
     missing = [path.name for path, mask in zip(paths, found, strict=True) if mask is None]
     if missing:
         raise InputError(
@@ -180,6 +197,35 @@ def _match_masks(paths: list[Path], folder: Path) -> list[Path]:
             f"{some([path.name for path in by_stem.values()])}."
         )
     return [mask for mask in found if mask is not None]
+
+
+def _is_dark(
+    opacities: Sequence[Float[Tensor, "_ _"]],
+    mask_object: Literal["auto", "bright", "dark"],
+    folder: Path,
+) -> bool:
+    """Tell whether masks show the object dark, by all of them together."""
+    if mask_object != "auto":
+        return mask_object == "dark"
+    border, middle = [], []
+    for opacity in opacities:
+        high, wide = opacity.shape
+        border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
+        border.append(opacity[:, -1].mean())
+        inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
+        middle.append(inner.mean())
+    shares = float(torch.stack(border).mean()), float(torch.stack(middle).mean())
+    # An object that fills its photographs is bright in the middle, too.
+    dark = shares[0] > 1 - _TELLING and shares[1] < 1 - _TELLING
+    if dark:
+        warnings.warn(
+            f"{folder}: the masks are bright along {shares[0]:.0%} of the border and "
+            f"{shares[1]:.0%} of the middle, so the object is taken to be dark in them. "
+            "`--mask-object bright` says that it is not.",
+            PimperWarning,
+            stacklevel=3,
+        )
+    return dark
 
 
 def _read_mask(path: Path, photograph: Path, header: Header) -> Float[Tensor, "height width"]:

@@ -1,3 +1,5 @@
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import torch
@@ -5,7 +7,7 @@ from PIL import Image
 from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.photographs import load_views
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import LINEAR, linear_from_srgb, srgb_from_linear
@@ -230,3 +232,26 @@ def test_masks_that_do_not_match_are_refused_by_name(photos, tmp_path):
         load_views(photos, masks=masks)
     with pytest.raises(InputError, match="nowhere: found nothing"):
         load_views(photos, masks=tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("polarity", ["auto", "dark", "bright"])
+def test_masks_of_other_programs_are_understood(photos, tmp_path, polarity):
+    """Named ``1_mask.png``, and the object dark on a bright border."""
+    dark = np.full((8, 12), 255, dtype=np.uint8)
+    dark[2:6, 3:9] = 0
+    for number in (1, 2, 10):
+        save(tmp_path / "masks" / f"{number}_mask.png", dark)
+    told = pytest.warns(PimperWarning, match="taken to be dark")
+    with told if polarity == "auto" else nullcontext():
+        masks = load_views(photos, masks=tmp_path / "masks", mask_object=polarity).masks
+    shown = torch.from_numpy((dark > 0) == (polarity == "bright"))
+    assert torch.equal(masks, shown.expand(3, 8, 12))
+
+
+def test_an_object_that_fills_its_photographs_stays_bright(photos, tmp_path):
+    drawn = np.full((8, 12), 255, dtype=np.uint8)
+    drawn[:2, :3] = 0
+    for number in (1, 2, 10):
+        save(tmp_path / "masks" / f"{number}.png", drawn)
+    masks = load_views(photos, masks=tmp_path / "masks").masks
+    assert torch.equal(masks, torch.from_numpy(drawn > 0).expand(3, 8, 12))
