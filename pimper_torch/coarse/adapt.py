@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from pimper_torch.coarse.contradicted import contradicted, misfit_of
 from pimper_torch.coarse.inherit import UNSURE, fitted_normals, with_points
 from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.config import require
@@ -91,16 +92,19 @@ class Adapt(nn.Module):
         Lengths count in samples of these patches; the residual is their photometry's. A facet
         that shows in two views has data, whether or not it is lit there. Inside the outlines'
         visual hull one view is enough, as at the ends of an arc, or none beside a facet that
-        shows: contours run through both. Facets outside the hull are dropped.
+        shows: contours run through both. Facets outside the hull are dropped, and so are those
+        that the photographs contradict (:mod:`~pimper_torch.coarse.contradicted`).
         """
         patches = swept.patches
         residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
+        misfit = residual
         seen = torch.zeros_like(residual, dtype=torch.bool)
         for templates, found, heights in zip(
             patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
         ):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
+            misfit = misfit.index_copy(0, templates.facet, misfit_of(found).to(misfit))
             enough = heights.num_views >= (_SEEING if rims is None else 1)
             seen = seen.index_copy(0, templates.facet, enough)
         spacing = float(patches.buckets[0].spacing[0].detach())
@@ -109,6 +113,8 @@ class Adapt(nn.Module):
             mesh = patches.coarse.mesh
             seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
             inside = within(rims.hull, surface, patches.num_patches)
+            if patches.coarse.support is not None:
+                inside &= ~contradicted(mesh.faces, patches.coarse.support, misfit)
         return adapt(
             patches.coarse,
             surface,
