@@ -36,7 +36,7 @@ class ExtractConfig:
     """
 
     min_confidence: float = 0.0
-    max_expected_error: float = 0.01
+    max_expected_error: float = 0.02
     max_hole: float = 1.0
     max_stretch: float = 10.0
     overturned: Literal["folded", "all", "none"] = "folded"
