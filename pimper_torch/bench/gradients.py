@@ -92,11 +92,11 @@ def small_scene(
 class Given(nn.Module):
     """A stage that hands out what it was made with, whatever it is handed."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: Record | None) -> None:
         super().__init__()
         self.record = record
 
-    def forward(self, *_: object) -> Record:
+    def forward(self, *_: object) -> Record | None:
         """Hand it out."""
         return self.record
 
@@ -105,7 +105,8 @@ def probes(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> dict[str, 
     """Run the chain once, and make a probe of every stage that took part, and of the whole.
 
     Args:
-        pimper: Its stages may be swapped; its first two are replaced by ``scene`` and ``coarse``.
+        pimper: Its stages may be swapped; structure from motion and the coarse mesh are replaced
+            by ``scene`` and ``coarse``, and no outlines are looked for.
         scene: Float64.
         coarse: In the same frame.
     """
@@ -160,6 +161,7 @@ def _calls(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> dict[str, 
 
 def _place(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> None:
     pimper.reconstruct = Given(scene)
+    pimper.outline = Given(None)  # outlines jump as photographs change: everything is the object
     pimper.triangulate = pimper.enclose = Given(coarse)
 
 
@@ -317,7 +319,7 @@ def _sweep(
     return Probe(function=function, inputs=inputs, scales=scales)
 
 
-def _fuse(stage: nn.Module, swept: Any) -> Probe:  # noqa: ANN401
+def _fuse(stage: nn.Module, swept: Any, rims: Any) -> Probe:  # noqa: ANN401
     photometric = swept.photometric
     patches = photometric.patches
     spacing, cloud = _spacing(patches), patches.coarse.points
@@ -342,7 +344,8 @@ def _fuse(stage: nn.Module, swept: Any) -> Probe:  # noqa: ANN401
             swept.replace(
                 photometric=photometric.replace(buckets=buckets, patches=carrying),
                 buckets=heights,
-            )
+            ),
+            rims,
         )
         return _of_surface(surface)
 
@@ -370,7 +373,7 @@ def _mend(stage: nn.Module, surface: Any) -> Probe:  # noqa: ANN401
     return Probe(function=function, inputs=inputs, scales={"vertices": scale})
 
 
-def _adapt(stage: nn.Module, swept: Any, surface: Any) -> Probe:  # noqa: ANN401
+def _adapt(stage: nn.Module, swept: Any, surface: Any, rims: Any) -> Probe:  # noqa: ANN401
     def function(x: Tensors) -> Tensors:
         found = stage(
             swept,
@@ -379,6 +382,7 @@ def _adapt(stage: nn.Module, swept: Any, surface: Any) -> Probe:  # noqa: ANN401
                 normals_world=x["normals"],
                 confidence=x["confidence"],
             ),
+            rims,
         )
         return {"vertices": found.mesh.vertices_world, "normals": found.mesh.normals_world}
 

@@ -204,8 +204,8 @@ def _require_lattice(coarse: CoarseMesh, surface: Surface) -> None:
 
 
 def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]:
-    """Mark facets with a vertex of the surface in the hull, or less than a voxel outside."""
-    inside = hull.depth_of(surface.vertices_world.detach()) > -hull.spacing
+    """Mark facets with a vertex of the surface that the hull holds."""
+    inside = hull.holds(surface.vertices_world.detach())
     return torch.bincount(surface.facet[inside], minlength=count) > 0
 
 

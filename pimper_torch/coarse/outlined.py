@@ -149,8 +149,8 @@ def outlined_surface(
     said = evidence(vertices, faces, level, maps)
     middles = vertices[faces].mean(dim=1)
     support = supports(middles, cloud, rim, said, config.reach_px * pixel)
-    reach = max(config.tolerance_px * pixel, float(rims.hull.spacing))
-    inside = rims.hull.depth_of(middles) > -reach
+    deep = rims.hull.depth_of(middles)
+    inside = rims.hull.holds(middles) | (deep > -config.tolerance_px * pixel)
     kept = seen_surface(
         vertices, faces, support, said, inside, (config.hole_px * pixel) ** 2, config.min_share
     )

@@ -128,13 +128,13 @@ class Outline(nn.Module):
         return Outlines(inside=found, trusted=trusted, source="found")
 
     def _cuts(self, scene: SparseScene) -> Cuts | None:
-        config = self.config
+        config, scene = self.config, scene.to("cpu", torch.float32)
         pictures = working_pictures(scene.views, scene.cameras, config.size_px)
-        cameras, points = pictures.cameras, scene.points_world.cpu().float()
+        cameras, points = pictures.cameras, scene.points_world
         looked_at = gaze(cameras)
         tolerance = config.plane_tolerance * float(looked_at.distance)
         plane = supporting_plane(
-            points[well_tracked(scene).cpu()],
+            points[well_tracked(scene)],
             cameras,
             tolerance=tolerance,
             least_on=config.least_on_plane,
@@ -142,14 +142,14 @@ class Outline(nn.Module):
             generator=torch.Generator().manual_seed(config.seed),
         )
         region = torch.tensor(config.region).reshape(2, 3) if config.region else None
-        cloud = split_cloud(scene.to("cpu", torch.float32), looked_at, plane, tolerance, region)
+        cloud = split_cloud(scene, looked_at, plane, tolerance, region)
         half = _BOX * looked_at.distance
         middle = looked_at.fixation_world
         agreement = None if plane is None else plane_agreement(pictures, plane, looked_at)
         cues = Cues(
             pictures=pictures,
-            own_px=tuple(pixels_seen(scene, cameras, cloud.own.to(scene.points_world.device))),
-            other_px=tuple(pixels_seen(scene, cameras, cloud.other.to(scene.points_world.device))),
+            own_px=tuple(pixels_seen(scene, cameras, cloud.own)),
+            other_px=tuple(pixels_seen(scene, cameras, cloud.other)),
             plane=plane,
             agreement=agreement,
             box_world=torch.stack([middle - half, middle + half]) if region is None else region,

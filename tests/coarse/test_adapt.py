@@ -161,7 +161,7 @@ def test_a_closed_mesh_stays_closed_and_nears_the_ball(generator):
 def test_facets_outside_the_hull_are_dropped(generator):
     vertices, faces = icosphere(2)
     coarse = coarse_of(vertices, faces)
-    grid = torch.linspace(-1.5, 1.5, 31).double()
+    grid = torch.linspace(-1.5, 1.5, 91).double()
     x, y, z = torch.meshgrid(grid, grid, grid, indexing="ij")
     # Half a ball: the plane z = -0.2 cuts it.
     distance = torch.minimum(1.05 - (x**2 + y**2 + z**2).sqrt(), z + 0.2)
