@@ -133,7 +133,7 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
     if job.inputs.object:
         outline = dataclasses.replace(outline, object=job.inputs.object)
     if job.inputs.region:
-        outline = dataclasses.replace(outline, region=job.inputs.region)
+        outline = dataclasses.replace(outline, region=tuple(map(float, job.inputs.region)))
     job = dataclasses.replace(job, config=dataclasses.replace(job.config, outline=outline))
     if job.common.reference:
         named = job.common.reference

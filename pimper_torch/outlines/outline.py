@@ -141,7 +141,11 @@ class Outline(nn.Module):
             most_below=config.most_below_plane,
             generator=torch.Generator().manual_seed(config.seed),
         )
-        region = torch.tensor(config.region).reshape(2, 3) if config.region else None
+        region = (
+            torch.tensor(config.region, dtype=torch.float32).reshape(2, 3)
+            if config.region
+            else None
+        )
         cloud = split_cloud(scene, looked_at, plane, tolerance, region)
         half = _BOX * looked_at.distance
         middle = looked_at.fixation_world

@@ -65,6 +65,18 @@ class Cauchy:
 Loss = Squares | Cauchy
 
 
+def median_spread(
+    residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
+) -> Float[Tensor, "*batch"]:
+    """Estimate the standard deviation of residuals from their median size; 0 if none is seen.
+
+    1.4826 makes the median absolute value of Gaussian noise its standard deviation. Where most
+    residuals are next to nothing it lets the others go more firmly than :func:`spread`.
+    """
+    size = torch.where(seen, residual.abs(), torch.nan)
+    return 1.4826 * size.nanmedian(dim=-1).values.nan_to_num(nan=0.0)
+
+
 def spread(
     residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
 ) -> Float[Tensor, "*batch"]:

@@ -22,7 +22,7 @@ RUNS = {
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
         "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --object masks --mask-object bright "
-        "--region (-9,-9,-9,9,9,9)"
+        "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0)"
     ],
     "demo": [
         "-o {out} --preset fast --reference 38 --device cpu --max-size-px 60 --overwrite "
