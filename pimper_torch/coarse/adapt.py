@@ -97,14 +97,12 @@ class Adapt(nn.Module):
         """
         patches = swept.patches
         residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
-        misfit = residual
         seen = torch.zeros_like(residual, dtype=torch.bool)
         for templates, found, heights in zip(
             patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
         ):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
-            misfit = misfit.index_copy(0, templates.facet, misfit_of(found).to(misfit))
             enough = heights.num_views >= (_SEEING if rims is None else 1)
             seen = seen.index_copy(0, templates.facet, enough)
         spacing = float(patches.buckets[0].spacing[0].detach())
@@ -114,6 +112,11 @@ class Adapt(nn.Module):
             seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
             inside = within(rims.hull, surface, patches.num_patches)
             if patches.coarse.support is not None:
+                misfit = torch.full_like(residual, torch.nan)
+                for templates, found in zip(
+                    patches.buckets, swept.photometric.buckets, strict=True
+                ):
+                    misfit[templates.facet] = misfit_of(found).to(misfit)
                 inside &= ~contradicted(mesh.faces, patches.coarse.support, misfit)
         return adapt(
             patches.coarse,

@@ -149,8 +149,7 @@ def outlined_surface(
     said = evidence(vertices, faces, level, maps)
     middles = vertices[faces].mean(dim=1)
     support = supports(middles, cloud, rim, said, config.reach_px * pixel)
-    deep = rims.hull.depth_of(middles)
-    inside = rims.hull.holds(middles) | (deep > -config.tolerance_px * pixel)
+    inside = rims.hull.holds(middles, config.tolerance_px * pixel)
     kept = seen_surface(
         vertices, faces, support, said, inside, (config.hole_px * pixel) ** 2, config.min_share
     )

@@ -66,9 +66,16 @@ class Hull(Record):
         )
         return self.replace(distance=torch.minimum(self.distance, height))
 
-    def holds(self, points_world: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Mark points inside, or so little outside that outlines do not tell."""
-        return self.depth_of(points_world) > -_SLACK * self.spacing
+    def holds(
+        self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
+    ) -> Bool[Tensor, "*batch"]:
+        """Mark points inside, or so little outside that outlines do not tell.
+
+        Args:
+            points_world: Anywhere.
+            tolerance: Scene units outside that do not count, if they are more than that.
+        """
+        return self.depth_of(points_world) > -max(tolerance, _SLACK * float(self.spacing))
 
     def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Say how deep points lie inside the hull; negative outside.

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.projection import triangulate_rays
 from pimper_torch.outlines.hull import Hull, visual_hull
 from pimper_torch.records import Cameras, Outlines, Record, RimPoints, RimRays
 from pimper_torch.rims.contours import RimConfig, rim_rays
@@ -92,20 +92,15 @@ def box_round(outlines: Outlines, cameras: Cameras) -> Float[Tensor, "2 3"] | No
     views = (outlines.trusted & outlines.masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
     if len(views) < 2:
         return None
-    like = cameras.intrinsics
-    rays, halves = [], []
+    chosen, boxes = cameras.take(views), []
     for view in views:
         rows, columns = (outlines.masks[view].any(dim=1 - axis).nonzero() for axis in (0, 1))
-        low = torch.stack([columns.amin(), rows.amin()]).to(like)
-        high = torch.stack([columns.amax(), rows.amax()]).to(like) + 1
-        camera = cameras.cam_from_world[view], cameras.intrinsics[view]
-        rays.append(rays_through((low + high)[None] / 2, *camera)[0])
-        halves.append((high - low).norm() / 2 / cameras.intrinsics[view, 0, 0])
-    rays_world, eyes = torch.stack(rays), cameras.centers_world[views]
-    along = rays_world / rays_world.norm(dim=1, keepdim=True)
-    across = torch.eye(3).to(like) - along[:, :, None] * along[:, None, :]
-    right = (across @ eyes[..., None])[..., 0].sum(dim=0)
-    middle = torch.linalg.lstsq(across.sum(dim=0), right[:, None]).solution[:, 0]
-    distance = (middle - eyes).norm(dim=1)
-    reach = 1.5 * (distance * torch.stack(halves)).amax()
+        low = torch.stack([columns.amin(), rows.amin()])
+        boxes.append(torch.stack([low, torch.stack([columns.amax(), rows.amax()]) + 1]))
+    low, high = torch.stack(boxes).to(chosen.intrinsics).unbind(dim=1)
+    seen = torch.ones(1, len(views), dtype=torch.bool, device=low.device)
+    middle = triangulate_rays(chosen, (low + high)[None] / 2, seen)[0]
+    distance = (middle - chosen.centers_world).norm(dim=1)
+    half = (high - low).norm(dim=1) / 2 / chosen.intrinsics[:, 0, 0]
+    reach = 1.5 * (distance * half).amax()
     return torch.stack([middle - reach, middle + reach])

@@ -287,3 +287,43 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(lattice
     # Raising all of the surface alike takes the point as much nearer: its target stays.
     assert checks["all", "target"].analytic.abs().max() < 1e-9
     assert checks["all", "target"].numeric.abs().max() < 1e-6
+
+
+def test_a_rim_stays_where_it_is_as_the_surface_is_raised(lattice, generator):
+    height = 0.1 * torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
+    places = lattice.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
+    leaning = UP + 0.2 * torch.randn(places.shape, generator=generator, dtype=torch.float64)
+    rims = RimPoints(
+        points_world=places,
+        normals_world=normalize(leaning, dim=1),
+        variance=torch.full_like(places[:, 0], 1e-4),
+        view=torch.zeros(len(places), dtype=torch.long),
+        ray=torch.arange(len(places)),
+    )
+
+    def term(x):
+        along = normalize(x["directions"], dim=1)
+        raised = x["heights"] + x["all"]
+        ground = Ground(
+            places=lattice.points + raised[:, None] * UP,
+            faces=lattice.faces,
+            heights=raised,
+            directions=along,
+            reach=9.0,
+            finest=1e-3,
+        )
+        found = rim_tangents(rims, ground)
+        return {"target": found.targets, "information": found.information}
+
+    inputs = {
+        "heights": height,
+        "all": torch.zeros(()).double(),
+        "directions": UP.expand(len(height), 3).clone(),
+    }
+    checks = check_derivatives(term, inputs, generator)
+    assert checks["heights", "target"].spread < 1e-5
+    assert checks["directions", "target"].spread < 1e-5
+    assert checks["directions", "information"].spread < 1e-5
+    # Along their directions, which are upright, all of the surface comes nearer by as much.
+    assert checks["all", "target"].analytic.abs().max() < 1e-9
+    assert checks["all", "target"].numeric.abs().max() < 1e-6
