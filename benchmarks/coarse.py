@@ -109,8 +109,7 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
         middle = vertices[faces].mean(dim=1)
         support = supports(middle, cloud, rim, said, config.outlined.reach_px * pixel)
         within = hull.depth_of(middle) > -max(away, float(hull.spacing))
-        hole = (config.outlined.hole_px * pixel) ** 2
-        kept = seen_surface(vertices, faces, support, said, within, hole, config.outlined.min_share)
+        kept = seen_surface(vertices, faces, support, said, within, pixel, config.outlined)
         used, faces = torch.unique(faces[kept], return_inverse=True)
         if len(faces) <= config.num_facets:
             return vertices[used], faces

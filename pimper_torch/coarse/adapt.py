@@ -10,16 +10,17 @@ from torch.nn.functional import normalize
 from pimper_torch.coarse.contradicted import contradicted, misfit_of
 from pimper_torch.coarse.inherit import UNSURE, fitted_normals, with_points
 from pimper_torch.coarse.splitting import mark_edges, split_edges
+from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.components import face_components, vertex_fans
+from pimper_torch.geometry.components import vertex_fans
 from pimper_torch.geometry.surfaces import (
     corners_of,
     face_edges,
     face_normals,
-    face_pairs,
     side_lengths,
 )
+from pimper_torch.geometry.visibility import ambient_occlusion
 from pimper_torch.outlines.hull import Hull
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
 from pimper_torch.rims.constraints import Rims
@@ -117,7 +118,8 @@ class Adapt(nn.Module):
                     patches.buckets, swept.photometric.buckets, strict=True
                 ):
                     misfit[templates.facet] = misfit_of(found).to(misfit)
-                inside &= ~contradicted(mesh.faces, patches.coarse.support, misfit)
+                occlusion = ambient_occlusion(mesh.vertices_world, mesh.faces).to(misfit)
+                inside &= ~contradicted(mesh.faces, patches.coarse.support, misfit, occlusion)
         return adapt(
             patches.coarse,
             surface,
@@ -207,9 +209,10 @@ def _require_lattice(coarse: CoarseMesh, surface: Surface) -> None:
 
 
 def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]:
-    """Mark facets with a vertex of the surface that the hull holds."""
+    """Mark facets with a vertex of the surface that the hull holds, or with none of their own."""
     inside = hull.holds(surface.vertices_world.detach())
-    return torch.bincount(surface.facet[inside], minlength=count) > 0
+    outside = torch.bincount(surface.facet[~inside], minlength=count)
+    return torch.bincount(surface.facet[inside], minlength=count) >= outside.clamp_max(1)
 
 
 def _on_surface(
@@ -270,16 +273,8 @@ def _with_data(
         known = known | seen
     if not bool(known.any()):
         return everything
-    (without,) = torch.nonzero(~known, as_tuple=True)
-    if not len(without):
-        return known
-    label = face_components(faces[without])
-    area = face_normals(vertices, faces).norm(dim=1)
-    share = area.new_zeros(int(label.max()) + 1).index_add(0, label, area[without]) / area.sum()
-    paired = torch.bincount(face_pairs(faces)[0].flatten(), minlength=len(faces))
-    open_ = torch.zeros_like(share).index_add(0, label, (paired[without] < 3).to(share)) > 0
-    filled = ((share <= max_hole) & ~open_)[label]
-    return known.index_copy(0, without, filled)
+    area = face_normals(vertices, faces).norm(dim=1) / 2
+    return known | enclosed_holes(vertices, faces, known, max_hole * float(area.sum()))
 
 
 def _severity(

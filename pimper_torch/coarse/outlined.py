@@ -16,14 +16,16 @@ from pimper_torch.coarse.matching import level_of
 from pimper_torch.coarse.oriented import OrientedPoints, joined_points, no_points
 from pimper_torch.coarse.trim import (
     Evidence,
+    enclosed_holes,
     evidence,
+    hanging_together,
     point_distances,
     supported_pieces,
     without_small_holes,
 )
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Outlines, Record, RimPoints, SparseScene, Support
 from pimper_torch.rims.constraints import Rims
@@ -56,7 +58,9 @@ class OutlinedConfig:
             surface before; the first time on the points.
         tolerance_px: By which points and surface may lie outside the visual hull.
         reach_px: A face nearer to a point, or a rim point, than this is supported by it.
-        hole_px: Side of a square as large as the largest hole that is closed.
+        hole_px: Side of a square as large as the largest hole that is closed whatever made it.
+        max_unseen: Share of the area seen that a hole may have which only lack of views made,
+            such as the bottom of a deep concavity, to be closed.
         min_share: Of the area that points or rims support, which a piece apart has to have.
     """
 
@@ -67,6 +71,7 @@ class OutlinedConfig:
     tolerance_px: float = 4.0
     reach_px: float = 4.0
     hole_px: float = 24.0
+    max_unseen: float = 0.02
     min_share: float = 0.01
 
     def __post_init__(self) -> None:
@@ -79,6 +84,7 @@ class OutlinedConfig:
         require(self.reach_px > 0, f"{name}.reach_px", self.reach_px, "above 0")
         require(0 <= self.min_share < 1, f"{name}.min_share", self.min_share, "in [0, 1)")
         require(self.hole_px >= 0, f"{name}.hole_px", self.hole_px, "0 or more")
+        require(0 <= self.max_unseen < 1, f"{name}.max_unseen", self.max_unseen, "in [0, 1)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -150,9 +156,7 @@ def outlined_surface(
     middles = vertices[faces].mean(dim=1)
     support = supports(middles, cloud, rim, said, config.reach_px * pixel)
     inside = rims.hull.holds(middles, config.tolerance_px * pixel)
-    kept = seen_surface(
-        vertices, faces, support, said, inside, (config.hole_px * pixel) ** 2, config.min_share
-    )
+    kept = seen_surface(vertices, faces, support, said, inside, pixel, config)
     if not bool(kept.any()):
         raise ReconstructionError(
             f"coarse mesh: none of {len(faces)} faces inside the outlines is seen. Look at the "
@@ -277,12 +281,13 @@ def seen_surface(
     support: Int[Tensor, " face"],
     said: Evidence,
     inside: Bool[Tensor, " face"],
-    largest_hole: float,
-    min_share: float,
+    pixel: float,
+    config: OutlinedConfig,
 ) -> Bool[Tensor, " face"]:
     """Mark the faces that stay: what a view sees, points and rims, in the visual hull.
 
-    A lid goes: a face without points behind which views see something.
+    A lid goes: a face without points behind which views see something. What no view sees stays
+    where it is a small hole in the rest; the back of an object seen from one side is a large one.
 
     Args:
         vertices: Of the closed surface.
@@ -290,14 +295,19 @@ def seen_surface(
         support: Of each face.
         said: What the photographs say about each.
         inside: True for faces in the visual hull.
-        largest_hole: Area of what is kept nevertheless where the rest surrounds it.
-        min_share: Of the area that points or rims support, which a piece apart has to have.
+        pixel: Size of one, scene units.
+        config: Settings.
     """
     known = support >= Support.RIM
+    small = (config.hole_px * pixel) ** 2
     possible = inside & ((said.denied < _DENYING) | (support == Support.POINTS))
+    possible = without_small_holes(vertices, faces, possible, small)
     kept = possible & ((said.seen > 0) | known)
-    kept = without_small_holes(vertices, faces, kept, largest_hole)
+    area = float(face_normals(vertices, faces[kept]).norm(dim=1).sum()) / 2
+    holes = enclosed_holes(vertices, faces, kept, config.max_unseen * area)
+    kept = kept | (holes & ~hanging_together(faces, ~kept, ~possible))
+    kept = without_small_holes(vertices, faces, kept, small)
     (chosen,) = torch.nonzero(kept, as_tuple=True)
-    pieces = supported_pieces(vertices, faces[chosen], known[chosen], min_share)
+    pieces = supported_pieces(vertices, faces[chosen], known[chosen], config.min_share)
     kept[chosen[~pieces]] = False
     return kept

@@ -137,6 +137,28 @@ def without_small_holes(
     return kept | (~kept & (areas < largest))
 
 
+def enclosed_holes(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    kept: Bool[Tensor, " face"],
+    largest: float,
+) -> Bool[Tensor, " face"]:
+    """Mark connected dropped faces that kept ones enclose, of no more than an area together.
+
+    What reaches the border of the surface is not enclosed.
+    """
+    found = torch.zeros_like(kept)
+    (dropped,) = torch.nonzero(~kept, as_tuple=True)
+    if not len(dropped):
+        return found
+    label = face_components(faces[dropped])
+    paired = torch.bincount(face_pairs(faces)[0].flatten(), minlength=len(faces))
+    on_border = torch.zeros_like(label).index_add(0, label, (paired[dropped] < 3).long())
+    areas = component_areas(vertices, faces[dropped], label)
+    found[dropped] = (on_border[label] == 0) & (areas <= largest)
+    return found
+
+
 def supported_pieces(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],

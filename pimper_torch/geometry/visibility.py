@@ -13,10 +13,16 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
+from pimper_torch.geometry.directions import cosine_fan
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.surfaces import face_normals, side_lengths
 from pimper_torch.records import Cameras, Mesh, Record
+
+# How far above its face a ray starts, in shares of the face's longest side.
+_CLEARANCE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -165,6 +171,28 @@ def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
     ).reshape(height, width, 3)
     caster = RayCaster(mesh.vertices_world, mesh.faces)
     return caster.cast(cameras.centers_world[view], rays)
+
+
+def ambient_occlusion(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], num_rays: int = 128
+) -> Float[Tensor, " face"]:
+    """Give the share of the light from everywhere that the mesh itself keeps from each face.
+
+    Directions weigh as much as a matte surface weighs their light: 0 on a convex mesh, 1 - a / b
+    on the inside of an open sphere of area b of which a is missing. Constant to autograd.
+
+    Args:
+        vertices: Of the mesh.
+        faces: Of it, counter-clockwise from outside.
+        num_rays: From each face's middle; the share is a multiple of one over them.
+    """
+    corners = vertices.detach()[faces]
+    normals = normalize(face_normals(vertices.detach(), faces), dim=1)
+    fan = cosine_fan(normals, torch.zeros_like(normals[:, 0]), num_rays)
+    clearance = _CLEARANCE * side_lengths(corners).amax(dim=1, keepdim=True)
+    start = (corners.mean(dim=1) + clearance * normals)[:, None]
+    infinite = torch.full_like(fan[..., 0], torch.inf)
+    return RayCaster(vertices, faces).blocked(start, fan, infinite).to(vertices).mean(dim=1)
 
 
 def _as_rows(

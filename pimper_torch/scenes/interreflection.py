@@ -4,8 +4,6 @@ The share of its light that each vertex gets from each face depends on geometry 
 found once by casting rays, and each bounce of each photograph is then one sparse product.
 """
 
-import math
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -13,10 +11,10 @@ from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.geometry.directions import cosine_fan
 from pimper_torch.scenes.lights import Lamp
 from pimper_torch.scenes.stage import Stage
 
-_GOLDEN = (math.sqrt(5) - 1) / 2
 _BATCH = 1 << 14  # vertices at once
 
 
@@ -63,7 +61,7 @@ def transfer(stage: Stage, num_rays: int, seed: int) -> csr_array:
     turns = 2 * torch.pi * torch.rand(len(vertices), generator=generator)
     rows, columns = [], []
     for own in torch.split(torch.arange(len(vertices)), _BATCH):
-        fan = _cosine_fan(normals[own], turns[own], num_rays)
+        fan = cosine_fan(normals[own], turns[own], num_rays)
         start = (vertices[own] + stage.clearance * normals[own])[:, None].expand_as(fan)
         face = stage.cast(start.reshape(-1, 3), fan.reshape(-1, 3)).face
         (met,) = torch.nonzero(face >= 0, as_tuple=True)
@@ -72,28 +70,6 @@ def transfer(stage: Stage, num_rays: int, seed: int) -> csr_array:
     ends = (torch.cat(rows).numpy(), torch.cat(columns).numpy())
     shares = np.full(len(ends[0]), 1 / num_rays, dtype=np.float32)
     return csr_array((shares, ends), shape=(len(vertices), len(stage.mesh.faces)))
-
-
-def _cosine_fan(
-    normals: Float[Tensor, "vertex 3"], turns: Float[Tensor, " vertex"], num_rays: int
-) -> Float[Tensor, "vertex ray 3"]:
-    """Spread rays round normals as densely as a matte surface weighs light."""
-    step = torch.arange(num_rays)
-    across = ((step + 0.5) / num_rays).sqrt()  # even over the disc below the hemisphere
-    angle = 2 * torch.pi * torch.remainder(step * _GOLDEN, 1) + turns[:, None]
-    # Duff et al., JCGT 6(1), 2017: a frame round each normal, without a branch.
-    x, y, z = normals.unbind(dim=-1)
-    sign = torch.where(z < 0, -1.0, 1.0)
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], dim=-1)
-    second = torch.stack([b, sign + y * y * a, -y], dim=-1)
-    fan = (
-        (across * angle.cos())[..., None] * first[:, None]
-        + (across * angle.sin())[..., None] * second[:, None]
-        + ((1 - across**2).sqrt()[:, None]) * normals[:, None]
-    )
-    return normalize(fan, dim=-1)
 
 
 def _direct(stage: Stage, lamp: Lamp) -> Float[Tensor, " face"]:

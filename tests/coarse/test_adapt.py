@@ -177,6 +177,20 @@ def test_facets_outside_the_hull_are_dropped(generator):
     assert len(adapt(coarse, surface, 0.1, inside=nowhere).mesh.faces) == len(faces)
 
 
+def test_a_facet_without_vertices_of_its_own_is_not_outside(generator):
+    vertices, faces = icosphere(1)
+    surface = surface_on(coarse_of(vertices, faces), lambda points: points, spacing=5.0)
+    owners = torch.unique(surface.facet)
+    assert len(owners) < len(faces)  # facets share their corners, and have nothing else here
+    nowhere = Hull(
+        origin_world=vertices.new_full((3,), 5.0),
+        spacing=vertices.new_tensor(0.1),
+        distance=vertices.new_full((3, 3, 3), 1.0),
+    )
+    left = within(nowhere, surface, len(faces)).nonzero()[:, 0]
+    assert set(left.tolist()) == set(range(len(faces))) - set(owners.tolist())
+
+
 def test_only_where_the_residual_is_high_if_nothing_else_is(generator):
     coarse = sheet(generator)
     residual = torch.full((len(coarse.mesh.faces),), 0.01).double()

@@ -24,17 +24,28 @@ def test_a_lid_goes_and_plain_surface_stays():
     misfit[(strip == 3).nonzero()[::5, 0]] = 0.03  # some of it fits by chance
     misfit[(strip == 2).nonzero()[::3, 0]] = 0.5  # points bear it out, whatever light says
     misfit[strip == 4] = torch.nan
-    assert (contradicted(faces, support, misfit) == (strip == 3)).all()
+    assert (contradicted(faces, support, misfit, 0 * misfit) == (strip == 3)).all()
 
 
 def test_with_little_to_compare_with_nothing_goes():
     faces, strip = strips()
     misfit = torch.full(strip.shape, 0.5, dtype=torch.float64)
     light = torch.full_like(strip, Support.LIGHT)
-    assert not contradicted(faces, light, misfit).any()
+    assert not contradicted(faces, light, misfit, 0 * misfit).any()
     some = light.clone()
     some[:10] = Support.POINTS
-    assert not contradicted(faces, some, misfit).any()
+    assert not contradicted(faces, some, misfit, 0 * misfit).any()
+
+
+def test_a_few_facets_are_no_lid():
+    faces, strip = strips()
+    support = torch.full_like(strip, Support.POINTS)
+    misfit = torch.full(strip.shape, 0.03, dtype=torch.float64)
+    (lid,) = (strip == 3).nonzero(as_tuple=True)
+    support[lid], misfit[lid] = Support.LIGHT, 0.2
+    assert contradicted(faces, support, misfit, 0 * misfit).any()
+    misfit[lid[6:]] = torch.nan  # light determines six
+    assert not contradicted(faces, support, misfit, 0 * misfit).any()
 
 
 def test_what_is_dark_in_all_alike_is_not_called_a_lid():
@@ -43,4 +54,17 @@ def test_what_is_dark_in_all_alike_is_not_called_a_lid():
     support[strip == 3] = Support.LIGHT
     misfit = torch.full(strip.shape, 0.002, dtype=torch.float64)
     misfit[strip == 3] = 0.05  # 25 times as much, and still next to nothing
-    assert not contradicted(faces, support, misfit).any()
+    assert not contradicted(faces, support, misfit, 0 * misfit).any()
+
+
+def test_a_concavity_is_compared_with_textured_ones_and_a_lid_with_open_surface():
+    faces, strip = strips(21)
+    support = torch.full_like(strip, Support.POINTS)
+    support[(strip == 1) | (strip == 3)] = Support.LIGHT
+    # Half of what points support is a concavity too. So is strip 1; strip 3 is a lid.
+    occlusion = torch.where((strip == 0) | (strip == 1), 0.4, 0.02).double()
+    misfit = 0.03 + 0.3 * occlusion
+    misfit[strip == 1] = 0.2  # 5.6 times the open surface's, 1.3 times a concavity's
+    assert not contradicted(faces, support, misfit, occlusion).any()
+    misfit[strip == 3] = 0.2
+    assert (contradicted(faces, support, misfit, occlusion) == (strip == 3)).all()

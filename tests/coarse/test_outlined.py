@@ -18,6 +18,8 @@ from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.meshes import icosphere
 from tests.coarse.ball import SETTINGS, outlines_of, photographed
 
+SMALL_HOLES = OutlinedConfig(hole_px=0.3**0.5)  # closed up to an area of 0.3 with pixels of 1
+
 
 def white(points):
     return torch.full_like(points, 0.7)
@@ -94,11 +96,33 @@ def test_a_lid_goes_and_small_dents_stay():
     support = torch.full_like(count, Support.LIGHT)
     support[middle[:, 0] > 0.9] = Support.RIM
     everywhere = torch.ones_like(lid)
-    kept = seen_surface(vertices, faces, support, said, everywhere, 0.3, 0.01)
+    kept = seen_surface(vertices, faces, support, said, everywhere, 1.0, SMALL_HOLES)
     assert bool((kept == ~lid).all())  # the lid's area is 1.2, the speck's 0.2
     # Nothing goes where points are.
     support[lid] = Support.POINTS
-    assert bool(seen_surface(vertices, faces, support, said, everywhere, 0.3, 0.01).all())
+    assert bool(seen_surface(vertices, faces, support, said, everywhere, 1.0, SMALL_HOLES).all())
+
+
+def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes():
+    vertices, faces = icosphere(3)
+    middle = vertices[faces].mean(dim=1)
+    bottom, back, lid = middle[:, 2] > 0.97, middle[:, 2] < -0.5, middle[:, 0] > 0.97
+    assert 0.005 < bottom.double().mean() < 0.02 < back.double().mean()
+    count = torch.full((len(faces),), 3)
+    seen = torch.where(bottom | back | lid, 0, count)
+    said = Evidence(seen=seen, lit=seen, denied=torch.where(lid, 2, 0))
+    support = torch.where(seen > 0, Support.POINTS, Support.NOTHING)
+    everywhere = torch.ones_like(lid)
+    config = OutlinedConfig(hole_px=0.0)
+
+    def kept(inside=everywhere, config=config):
+        return seen_surface(vertices, faces, support, said, inside, 1.0, config)
+
+    assert bool((kept() == ~(back | lid)).all())
+    # One face of it behind which something is seen, or outside the hull, opens all of it.
+    assert bool((kept(inside=everywhere & (middle[:, 2] < middle[:, 2].max())) == (seen > 0)).all())
+    none = OutlinedConfig(hole_px=0.0, max_unseen=0.0)
+    assert bool((kept(config=none) == (seen > 0)).all())
 
 
 def test_pieces_that_neither_points_nor_rims_support_go():
@@ -108,7 +132,7 @@ def test_pieces_that_neither_points_nor_rims_support_go():
     count = torch.full((len(two[1]),), 3)
     said = Evidence(seen=count, lit=count, denied=0 * count)
     support = torch.where(first, Support.POINTS, Support.LIGHT)
-    kept = seen_surface(*two, support, said, torch.ones_like(first), 0.0, 0.01)
+    kept = seen_surface(*two, support, said, torch.ones_like(first), 1.0, OutlinedConfig())
     assert bool((kept == first).all())
 
 
