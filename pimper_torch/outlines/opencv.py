@@ -153,6 +153,13 @@ def without_specks(
     return ~_large(~_large(mask, kept, least_px), torch.ones_like(mask), least_px)
 
 
+def components_of(
+    mask: Bool[Tensor, "height width"], meeting: Bool[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Keep the components of a mask that reach ``meeting``."""
+    return _large(mask, meeting, 1)
+
+
 def _large(
     mask: Bool[Tensor, "height width"], meeting: Bool[Tensor, "height width"], least_px: int
 ) -> Bool[Tensor, "height width"]:

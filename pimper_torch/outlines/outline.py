@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate
 
 from pimper_torch.config import require
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.outlines.agreement import Agreement, agreement_of
+from pimper_torch.outlines.agreement import Agreement, agreement_of, settled
 from pimper_torch.outlines.cloud import pixels_seen, split_cloud
 from pimper_torch.outlines.ground import gaze, supporting_plane, well_tracked
 from pimper_torch.outlines.opencv import signed_distance
@@ -118,13 +118,13 @@ class Outline(nn.Module):
         if cuts is None:
             _warn("the views' outlines have nothing in common")
             return None
-        agreement = agreement_of(cuts)
-        doubt = self._doubt(agreement)
+        doubt = self._doubt(agreement_of(cuts))
         if doubt:
             _warn(doubt)
             return None
+        cuts = settled(cuts)
         found = _at_full_size(cuts, scene.views)
-        trusted = agreement.trusted(config.least_covered).to(found.device)
+        trusted = agreement_of(cuts).trusted(config.least_covered).to(found.device)
         return Outlines(inside=found, trusted=trusted, source="found")
 
     def _cuts(self, scene: SparseScene) -> Cuts | None:
@@ -156,6 +156,7 @@ class Outline(nn.Module):
             other_px=tuple(pixels_seen(scene, cameras, cloud.other)),
             plane=plane,
             agreement=agreement,
+            gaze=looked_at,
             box_world=torch.stack([middle - half, middle + half]) if region is None else region,
         )
         if plane is None and not cues.has_points:

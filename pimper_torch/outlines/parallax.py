@@ -9,7 +9,7 @@ Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -47,7 +47,10 @@ class Sheet(Record):
 
 
 def plane_agreement(
-    pictures: Pictures, plane: Plane, gaze: Gaze
+    pictures: Pictures,
+    plane: Plane,
+    gaze: Gaze,
+    hidden: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view height width"]:
     r"""Say how well each view agrees with the plane's texture.
 
@@ -58,23 +61,29 @@ def plane_agreement(
         pictures: At the working size.
         plane: Supporting the object.
         gaze: Its fixation point is the middle of what is looked at.
+        hidden: Where views do not show the plane, as far as is known. What they show there is
+            compared with the plane's texture, but is no part of it.
 
     Returns:
-        Between -1 and 1; 0 where views do not agree on what the plane looks like, as where it is
-        always hidden; NaN where it is flat, or few views see it.
+        Between -1 and 1; ``DISPUTED`` where views do not agree on what the plane looks like, as
+        where it is always hidden; NaN where it is flat, or few views see it; -1 where a view that
+        does not agree is brighter or darker than the others by more than light does it.
     """
     cameras, longer = pictures.cameras, max(pictures.grey.shape[1:])
-    texture = torch.stack([_textured(grey, longer) for grey in pictures.grey])
-    common, spread = _common(texture, cameras, _sheet(cameras, plane, gaze, _REACH, _STEP))
-    level, level_spread = _common(
-        pictures.grey, cameras, _sheet(cameras, plane, gaze, _FAR_REACH, _FAR_STEP)
+    hidden = torch.zeros_like(pictures.grey, dtype=torch.bool) if hidden is None else hidden
+    texture = torch.stack(
+        [_textured(grey, off, longer) for grey, off in zip(pictures.grey, hidden, strict=True)]
     )
+    seen, radiance = (layer.masked_fill(hidden, torch.nan) for layer in (texture, pictures.grey))
+    common, spread = _common(seen, cameras, _sheet(cameras, plane, gaze, _REACH, _STEP))
+    far = _sheet(cameras, plane, gaze, _FAR_REACH, _FAR_STEP)
+    level, level_spread = _common(radiance, cameras, far)
     found = []
     for view, one in enumerate(texture):
         agreement = _agreement(one, common[view], spread[view], longer)
         other = (pictures.grey[view] - level[view]).abs() > _NO_SHADOW
         other &= level_spread[view] < _NO_SHADOW / 2
-        found.append(torch.where(agreement.isnan() & other, -1, agreement))
+        found.append(torch.where(~(agreement > DISPUTED) & other, -1, agreement))
     return torch.stack(found)
 
 
@@ -130,9 +139,15 @@ def _on_sheet(cameras: Cameras, sheet: Sheet, view: int) -> Float[Tensor, "3 3"]
     return moved
 
 
-def _textured(grey: Float[Tensor, "height width"], longer: int) -> Float[Tensor, "height width"]:
-    """Take the light out: what varies smoothly."""
-    return grey - window_means(grey[None], _odd(_SHADING * longer))[0]
+def _textured(
+    grey: Float[Tensor, "height width"], hidden: Bool[Tensor, "height width"], longer: int
+) -> Float[Tensor, "height width"]:
+    """Take the light out: what varies smoothly, on the plane and on what hides it apart."""
+    window = _odd(_SHADING * longer)
+    off = hidden.to(grey)
+    sums = window_means(torch.stack([grey * off, off, grey * (1 - off), 1 - off]), window)
+    smooth = torch.where(hidden, sums[0] / sums[1], sums[2] / sums[3])
+    return grey - smooth
 
 
 def _agreement(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from pimper_torch.outlines.ground import Plane
+from pimper_torch.outlines.ground import Gaze, Plane
 from pimper_torch.outlines.hull import margins, visual_hull
 from pimper_torch.outlines.opencv import (
     OBJECT,
@@ -15,7 +15,7 @@ from pimper_torch.outlines.opencv import (
     signed_distance,
     without_specks,
 )
-from pimper_torch.outlines.parallax import DISPUTED
+from pimper_torch.outlines.parallax import DISPUTED, plane_agreement
 from pimper_torch.outlines.pictures import Pictures
 from pimper_torch.outlines.seeds import (
     filled,
@@ -23,6 +23,7 @@ from pimper_torch.outlines.seeds import (
     labels_from_hull,
     labels_from_points,
     not_seen_through,
+    off_level,
     off_plane,
 )
 from pimper_torch.progress import track
@@ -44,7 +45,8 @@ class Cues(Record):
         own_px: Pixels of the object's points, one tensor a view.
         other_px: Of points that are not the object's.
         plane: That the object stands on.
-        agreement: With neighbours moved by the plane.
+        agreement: With the plane's texture.
+        gaze: Where the cameras look.
         box_world: The object is inside.
     """
 
@@ -53,6 +55,7 @@ class Cues(Record):
     other_px: tuple[Float[Tensor, "_ 2"], ...]
     plane: Plane | None
     agreement: Float[Tensor, "view height width"] | None
+    gaze: Gaze
     box_world: Float[Tensor, "2 3"]
 
     @property
@@ -74,26 +77,53 @@ class Cuts(Record):
     Attributes:
         masks: Each view's own cut.
         margins_px: Inside the silhouette of the hull, pixels of the working size.
+        on_plane: Whether the object stands on a plane.
     """
 
     masks: Bool[Tensor, "view height width"]
     margins_px: Float[Tensor, "view height width"]
+    on_plane: bool = False
 
 
 def cut_in_rounds(cues: Cues, *, rounds: int, disagreeing: float, num_voxels: int) -> Cuts | None:
     """Cut every view, vote, and cut again from what the vote says.
+
+    Before every vote the plane's texture is learned anew where the cuts do not hide it: holes
+    that it is seen through stay open, and what stands before it stands out.
 
     Returns:
         ``None`` where the cuts have nothing in common.
     """
     masks = _first(cues)
     for _ in range(rounds):
-        seen = _voted(cues, masks | _surrounded(cues), disagreeing, num_voxels)
+        cues = _looked_behind(cues, masks)
+        masks = _filled(cues, masks)
+        seen = _voted(cues, masks | _likely(cues), disagreeing, num_voxels)
         if seen is None:
             return None
         masks = _again(cues, masks, seen)
+    masks = _filled(_looked_behind(cues, masks), masks)
     seen = _voted(cues, masks, disagreeing, num_voxels)
-    return None if seen is None else Cuts(masks=masks, margins_px=seen)
+    if seen is None:
+        return None
+    return Cuts(masks=masks, margins_px=seen, on_plane=cues.plane is not None)
+
+
+def _looked_behind(cues: Cues, masks: Bool[Tensor, "view height width"]) -> Cues:
+    """Learn the plane's texture where the cuts do not hide it; elsewhere keep what was known."""
+    if cues.plane is None or cues.agreement is None:
+        return cues
+    found = plane_agreement(cues.pictures, cues.plane, cues.gaze, masks)
+    return cues.replace(agreement=torch.where(found.isnan(), cues.agreement, found))
+
+
+def _filled(
+    cues: Cues, masks: Bool[Tensor, "view height width"]
+) -> Bool[Tensor, "view height width"]:
+    """Fill holes that the plane is not seen through."""
+    if cues.agreement is None:
+        return masks
+    return torch.stack([filled(*pair) for pair in zip(masks, cues.agreement, strict=True)])
 
 
 def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
@@ -144,19 +174,19 @@ def _cut(
     surrounded = not_seen_through(cues.own_px[view], agreement)
     surrounded &= ~(agreement >= DISPUTED)
     labels = torch.where(is_deep(margin / _WELL) & surrounded, OBJECT, labels)
-    cut = grab_cut(cues.pictures.opponent[view], labels, _CUTS)
-    return filled(cut, agreement)
+    return grab_cut(cues.pictures.opponent[view], labels, _CUTS)
 
 
-def _surrounded(cues: Cues) -> Bool[Tensor, "view height width"]:
-    """Mark what the object's points surround in each view and the plane is not seen through.
+def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Mark what takes part in the vote though cuts may lack it, as the inside of a vessel.
 
-    It takes part in the vote, as the inside of a vessel may be cut out in many views.
+    That is what the object's points surround and the plane is not seen through, and what is
+    brighter or darker than the plane can be.
     """
     if cues.agreement is None or not cues.has_points:
         return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
     pairs = zip(cues.own_px, cues.agreement, strict=True)
-    return torch.stack([not_seen_through(*pair) for pair in pairs])
+    return torch.stack([not_seen_through(*pair) | off_level(pair[1]) for pair in pairs])
 
 
 def _voted(

@@ -103,6 +103,11 @@ def not_seen_through(
     return convex_hull_of(own_px, (width, height)) & ~_grainless(agreement > _ON_PLANE)
 
 
+def off_level(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Mark what is so bright or dark that light cannot make it so on the plane."""
+    return _grainless(agreement == -1)
+
+
 def filled(
     cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:

@@ -3,8 +3,14 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
-from pimper_torch.outlines.ground import gaze, supporting_plane
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project
+from pimper_torch.outlines import outline
+from pimper_torch.outlines.ground import Plane, gaze, supporting_plane
 from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
+from pimper_torch.outlines.parallax import plane_agreement
+from pimper_torch.outlines.pictures import working_pictures
+from pimper_torch.outlines.rounds import Cuts
 
 SMALL = OutlineConfig(size_px=240, num_voxels=60_000)
 
@@ -71,6 +77,56 @@ def test_outlines_that_contradict_one_another_are_not_trusted(staged):
     scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))
     with pytest.warns(PimperWarning, match=r"is taken for the object.*`outline.region`"):
         assert Outline(SMALL)(scene) is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(staged, monkeypatch, share):
+    """Cuts that meet the hull's silhouettes by chance, or not at all, are no outlines."""
+    silhouettes = torch.full(staged.truth.shape, -5.0)
+    silhouettes[:, 60:120, 60:180] = 5.0
+    masks = torch.zeros_like(staged.truth)
+    masks[:, 60:120, 180 - int(share * 120) : 240] = True
+    nonsense = Cuts(masks=masks, margins_px=silhouettes, on_plane=True)
+    monkeypatch.setattr(outline, "cut_in_rounds", lambda *_, **__: nonsense)
+    overlap_percent = 100 * (share * 120 * 60) / ((240 - 60) * 60)
+    with pytest.warns(PimperWarning, match=f"by {overlap_percent:.0f}% in the median"):
+        assert Outline(SMALL)(staged.scene) is None
+
+
+def test_few_outlines_that_agree_are_not_enough(staged, monkeypatch):
+    """Half of the views and more have to."""
+    silhouettes = torch.full(staged.truth.shape, -5.0)
+    silhouettes[:, 60:120, 60:180] = 5.0
+    masks = silhouettes > 0
+    masks[:7, 60:120, 60:205] = True  # overlap 0.83, of which 0.83 is inside
+    cuts = Cuts(masks=masks, margins_px=silhouettes, on_plane=False)
+    monkeypatch.setattr(outline, "cut_in_rounds", lambda *_, **__: cuts)
+    with pytest.warns(PimperWarning, match="only 5 of 12 outlines agree"):
+        assert Outline(SMALL)(staged.scene) is None
+
+
+def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
+    """A place of the table that is hidden in eight of twelve views is known from the other four."""
+    views, cameras = staged.scene.views, staged.scene.cameras
+    place, _ = project(
+        torch.tensor([[0.0, -0.75, 0.0]]), cameras.cam_from_world, cameras.intrinsics
+    )
+    away = (pixel_centers(240, 180, like=views.images) - place[:, None]).norm(dim=-1)
+    hidden = away < 16
+    hidden[8:] = False
+    other = torch.rand(views.images.shape, generator=generator)
+    images = torch.where(hidden[:, None], other, views.images)
+    pictures = working_pictures(views.replace(images=images), cameras, 240)
+    plane = Plane(normal_world=torch.tensor([0.0, 0, 1]), offset=torch.tensor(0.0))
+    looked_at = gaze(pictures.cameras)
+    before = plane_agreement(pictures, plane, looked_at)
+    after = plane_agreement(pictures, plane, looked_at, hidden)
+    middle = (away < 8) & after.isfinite()  # not where the table is flat
+    seen, covered = middle & (torch.arange(12) >= 8)[:, None, None], middle & hidden
+    assert seen.sum() > 400
+    assert (before[seen] > 0.75).float().mean() < 0.4  # what hides it counts for it
+    assert (after[seen] > 0.75).float().mean() > 0.9
+    assert (after[covered] < 0.5).float().mean() > 0.8  # what hides it stands out
 
 
 def test_the_region_keeps_what_is_outside_from_being_the_object(staged):
