@@ -62,7 +62,7 @@ def write_result(
     `lights.json`    light of every view, averaged and for each patch, world frame
     `config.yaml`    every setting of the run
     `summary.json`   counts, times, memory, convergence
-    `overview.png`   contact sheet
+    `overview.png`   contact sheet, every photograph with its outline below
     ===============  ==============================================================
 
     It is there whole or not at all; see :func:`pimper_torch.io.folders.written_whole`.

@@ -1,4 +1,4 @@
-"""The contact sheet of a run: photograph, facets, normals, albedo, relief."""
+"""The contact sheet of a run: photographs with outlines, facets, normals, albedo, relief."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +11,11 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
+from pimper_torch.viz.outlines import TRUSTED, outlined_thumbnails
 from pimper_torch.viz.render import bounding_box, frame, shade, turn
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+Box = tuple[float, float, float, float]  # left, bottom, width, height, shares of the sheet
 
 _MARGIN = 0.05
 _TURN_DEG = 40.0
@@ -21,6 +23,8 @@ _DIMMED = 0.45
 _ACROSS = 4
 # Inches of the sheet: width of a panel, room round it, heights of its title and of the sheet's.
 _PANEL_IN, _GAP_IN, _TITLE_IN, _HEADLINE_IN = 3.9, 0.1, 0.35, 0.4
+_DPI = 100
+_THUMBNAILS_ACROSS = 8
 _TALLEST = 1.6  # a panel that is higher for its width is shown narrower
 
 
@@ -32,11 +36,13 @@ class Panel:
         title: Above it.
         picture: sRGB in [0, 1], rows first.
         lines: Triangles to draw over it, pixels of ``picture``.
+        inside: Probability of the object, of which the outline is drawn over it.
     """
 
     title: str
     picture: Picture
     lines: Picture | None = None
+    inside: Picture | None = None
 
 
 def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> None:
@@ -44,7 +50,9 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
 
     Shown in the reference view, cropped to the object: the photograph, the facets over it
     and shaded, the normals and albedo that the mesh carries, the mesh's own shape shaded,
-    and that again from 40 degrees to the left and to the right.
+    and that again from 40 degrees to the left and to the right. Where outlines are known they
+    are drawn over the photograph, and below over small photographs of all views, red where a
+    view is not trusted.
 
     Args:
         result: Of a run.
@@ -59,6 +67,10 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
 
     shown = panels(result, panel_px)
     boxes, size = _boxes(shown)
+    below = _all_views(result)
+    if below is not None:
+        shown = [*shown, below]
+        boxes, size = _with_band(boxes, size, below)
     figure = Figure(figsize=size)
     FigureCanvasAgg(figure)
     figure.suptitle(headline(result), fontsize=13, y=1 - 0.25 * _HEADLINE_IN / size[1])
@@ -66,6 +78,9 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
         axes = figure.add_axes(box)
         height, width = panel.picture.shape[:2]
         axes.imshow(panel.picture, extent=(0, width, height, 0), interpolation="antialiased")
+        if panel.inside is not None and _has_border(panel.inside):
+            at = np.arange(width) + 0.5, np.arange(height) + 0.5
+            axes.contour(*at, panel.inside, levels=[0.5], colors=[TRUSTED], linewidths=0.8)
         if panel.lines is not None:
             axes.add_collection(
                 PolyCollection(
@@ -75,12 +90,10 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
         axes.set_title(panel.title, fontsize=11)
         axes.set_axis_off()
         axes.set_anchor("N")
-    figure.savefig(path, dpi=100, facecolor="white")
+    figure.savefig(path, dpi=_DPI, facecolor="white")
 
 
-def _boxes(
-    shown: list[Panel],
-) -> tuple[list[tuple[float, float, float, float]], tuple[float, float]]:
+def _boxes(shown: list[Panel]) -> tuple[list[Box], tuple[float, float]]:
     """Lay panels out in rows as high as their highest.
 
     Returns:
@@ -102,6 +115,40 @@ def _boxes(
     return boxes, (width, height)
 
 
+def _with_band(
+    boxes: list[Box], size: tuple[float, float], band: Panel
+) -> tuple[list[Box], tuple[float, float]]:
+    """Make room for a panel as wide as the sheet below the others."""
+    width, height = size
+    inner = width - _GAP_IN
+    tall = inner * band.picture.shape[0] / band.picture.shape[1]
+    total = height + _TITLE_IN + tall + _GAP_IN
+    raised = [
+        (left, (bottom * height + total - height) / total, wide, high * height / total)
+        for left, bottom, wide, high in boxes
+    ]
+    lowest = (_GAP_IN / 2 / width, _GAP_IN / total, inner / width, tall / total)
+    return [*raised, lowest], (width, total)
+
+
+def _all_views(result: Reconstruction) -> Panel | None:
+    """Show all photographs with their outlines; nothing where there are none."""
+    outlines = result.outlines
+    if outlines is None:
+        return None
+    width_px = round(_DPI * _ACROSS * _PANEL_IN)
+    tiles = outlined_thumbnails(
+        result.scene.views, outlines, width_px=width_px, across=_THUMBNAILS_ACROSS
+    )
+    origin = "masks given" if outlines.source == "masks" else "outlines found"
+    trusted = f"{int(outlines.trusted.sum())} of {len(outlines.trusted)} views trusted"
+    return Panel(title=f"{origin}, {trusted}", picture=_array(tiles))
+
+
+def _has_border(inside: Picture) -> bool:
+    return bool(inside.min() < 0.5 < inside.max())
+
+
 def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     """Make the pictures of the contact sheet."""
     reference = result.coarse.reference
@@ -109,7 +156,7 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     vertices = result.mesh.vertices_world
     camera = frame(own, vertices, panel_px, _MARGIN)
     name = result.scene.views.names[reference]
-    photograph, facets = _photograph(result, own)
+    photograph, facets, inside = _photograph(result, own)
     maps = view_maps(result.mesh, camera, 0)
     albedo = (albedo_scale(result.mesh) * maps.albedo).clamp(0, 1)
     center = vertices.mean(dim=0)
@@ -119,7 +166,7 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     ]
     mesh, coarse = result.mesh, result.coarse.mesh
     return [
-        Panel(title=f"photograph {name}", picture=photograph),
+        Panel(title=f"photograph {name}", picture=photograph, inside=inside),
         Panel(
             title=f"{len(coarse.faces)} facets on {len(coarse.vertices_world)} points",
             picture=_DIMMED * photograph,
@@ -145,19 +192,20 @@ def headline(result: Reconstruction) -> str:
     )
 
 
-def _photograph(result: Reconstruction, own: Cameras) -> tuple[Picture, Picture]:
-    """Crop the reference photograph to the object, and project the facets to the crop."""
+def _photograph(result: Reconstruction, own: Cameras) -> tuple[Picture, Picture, Picture | None]:
+    """Crop the reference photograph and its outline to the object, and project the facets."""
     reference = result.coarse.reference
     width, height = (int(side) for side in own.sizes_px[0])
     low, high = bounding_box(own, result.mesh.vertices_world, _MARGIN)
     left, top = (max(0, int(corner)) for corner in low.floor())
     right, bottom = (int(corner) for corner in high.ceil())
-    image = result.scene.views.images[reference, :, top : min(bottom, height), :]
-    image = image[..., left : min(right, width)].movedim(0, -1)
+    crop = slice(top, min(bottom, height)), slice(left, min(right, width))
+    image = result.scene.views.images[reference][:, *crop].movedim(0, -1)
+    inside = None if result.outlines is None else _array(result.outlines.inside[reference][crop])
     coarse = result.coarse.mesh
     pixels, _ = project(coarse.vertices_world, own.cam_from_world[0], own.intrinsics[0])
     corners = (pixels - pixels.new_tensor([left, top]))[coarse.faces]
-    return _array(_rgb(srgb_from_linear(image.clamp(0, 1)))), _array(corners)
+    return _array(_rgb(srgb_from_linear(image.clamp(0, 1)))), _array(corners), inside
 
 
 def _rgb(colors: Float[Tensor, "height width channel"]) -> Float[Tensor, "height width 3"]:

@@ -6,15 +6,17 @@ import warnings
 import pytest
 import torch
 import yaml
+from PIL import Image
 
 from pimper_torch.cli.main import main
 from pimper_torch.errors import PimperWarning, ReconstructionError
 from pimper_torch.io.meshes import write_ply
-from pimper_torch.io.results import RESULT_NAMES
+from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.io.version import installed_version
+from pimper_torch.outlines.outline import Outline
 from pimper_torch.pipeline import PimperConfig, load_config
 from pimper_torch.radiometry import Encoding
-from pimper_torch.records import Mesh
+from pimper_torch.records import Mesh, Outlines
 
 
 def run(*arguments):
@@ -73,6 +75,28 @@ def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):
 def test_masks_are_read(photos, chain, tmp_path):
     assert run("reconstruct", photos, "-o", tmp_path / "out", "--masks", photos) == 0
     assert chain.given[1].masks is not None
+
+
+def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, tmp_path):
+    """The outlines that a run found come back to the bit, whatever they look like."""
+    scene = reconstruction.scene
+    inside = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(4))
+    trusted = torch.tensor([True, True, False])
+    found = Outlines(inside=inside, trusted=trusted, source="found")
+    write_result(reconstruction.replace(outlines=found), PimperConfig(), tmp_path / "first")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name, image in zip(scene.views.names, scene.views.images, strict=True):
+        pixels = (255 * image).byte().movedim(0, -1).expand(-1, -1, 3)
+        Image.fromarray(pixels.numpy()).save(photos / name)
+    masks = tmp_path / "first" / "masks"
+    assert run("reconstruct", photos, "-o", tmp_path / "second", "--masks", masks) == 0
+    views = chain.given[1]
+    assert views.names == scene.views.names
+    outlines = Outline()(scene.replace(views=views))
+    assert outlines.source == "masks"
+    assert torch.equal(outlines.masks, found.masks)
+    assert outlines.trusted.all()  # also of views whose outline was not trusted
 
 
 def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkeypatch):
