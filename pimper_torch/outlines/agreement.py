@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.outlines.opencv import components_of
+from pimper_torch.outlines.opencv import blind_holes, components_of
 from pimper_torch.outlines.rounds import Cuts
+from pimper_torch.outlines.seeds import is_deep
 from pimper_torch.records import Record
 
 # On rendered scenes, 99 in 100 pixels of a median view's cut lie less than 0.4 pixels of 640
@@ -15,6 +17,8 @@ _FAR = 1 / 200  # of the pictures' longer side, outside the silhouette
 _LEAST, _MOST = 0.005, 0.2  # of a cut, so far outside
 _MANY = 0.25  # of the views
 _SHIFTED = 0.5  # of what is outside is missing elsewhere
+_WELL = 2.0  # times as deep as is_deep asks for: beside a skull's cheek bone views see through
+_SHALLOW = 0.2  # of a hole: more lies near the silhouette's border where it is seen through
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -53,16 +57,32 @@ def agreement_of(cuts: Cuts) -> Agreement:
 
 
 def settled(cuts: Cuts) -> Cuts:
+    """Mend single cuts that the hull denies: shadows taken in, highlights left out.
+
+    A supporting plane shows shadows, and what is seen through a hole is known there
+    (:func:`~pimper_torch.outlines.seeds.filled`); without a plane the hull tells of holes.
+    """
+    return _without_shadows(cuts) if cuts.on_plane else _without_holes(cuts)
+
+
+def _without_holes(cuts: Cuts) -> Cuts:
+    """Fill holes deep inside the silhouette, as a highlight makes them in a single view."""
+    pairs = zip(cuts.masks, cuts.margins_px, strict=True)
+    filled = [
+        mask | blind_holes(mask, ~is_deep(margin / _WELL), _SHALLOW) for mask, margin in pairs
+    ]
+    return cuts.replace(masks=torch.stack(filled))
+
+
+def _without_shadows(cuts: Cuts) -> Cuts:
     """Take from single cuts what the hull denies, as the shadow beside an object's foot.
 
-    Shadows fall on a supporting plane and move with the light, so that one view's cut holds a
-    shadow that the others cut away. Nothing is taken where another cause is likelier: where there
-    is no plane; where many cuts exceed the silhouettes, as the hull has lost a part then; where a
-    cut exceeds the silhouette on one side and lacks something on the other, as a misplaced camera
-    makes it; where a cut has little to do with the silhouette.
+    Shadows move with the light, so that one view's cut holds a shadow that the others cut away.
+    Nothing is taken where another cause is likelier: where many cuts exceed the silhouettes, as
+    the hull has lost a part then; where a cut exceeds the silhouette on one side and lacks
+    something on the other, as a misplaced camera makes it; where a cut has little to do with the
+    silhouette.
     """
-    if not cuts.on_plane:
-        return cuts
     far = _FAR * max(cuts.masks.shape[1:])
     excess = cuts.masks & (cuts.margins_px < -far)
     missing = ~cuts.masks & (cuts.margins_px > far)

@@ -61,6 +61,15 @@ def test_nothing_is_taken_where_another_cause_is_likelier(changed, on_plane):
     assert torch.equal(settled(cuts).masks, cuts.masks)
 
 
+def test_a_highlight_is_filled_where_the_hull_is_deep_and_no_plane_tells_of_it():
+    """A hole beside the border, which the silhouette is not deep around, may be one."""
+    holes = disc() > 0
+    holes &= (disc((50.0, 40.0), 4.0) < 0) & (disc((50.0, 60.5), 2.0) < 0)
+    open_side = holes | (disc((50.0, 40.0), 4.0) >= 0)
+    assert torch.equal(settled(cuts_of([holes], on_plane=False)).masks[0], open_side)
+    assert torch.equal(settled(cuts_of([holes], on_plane=True)).masks[0], holes)
+
+
 def test_the_agreement_counts_pixels():
     square = torch.full((80, 100), -1.0)
     square[10:50, 10:50] = 1.0
