@@ -29,6 +29,18 @@ def test_rims_of_a_ball_touch_it(cameras):
     assert depth[1] < -0.1
 
 
+def test_one_wrong_outline_in_twenty_cuts_nothing_off_where_they_were_found(cameras):
+    outlines = outlines_of(ball, cameras)
+    wrong = outlines.inside.clone()
+    wrong[3, :, 60:] = 0  # half of the ball lies in shadow there
+    eye = -(cameras.cam_from_world[3, :3, :3].mT @ cameras.cam_from_world[3, :3, 3])
+    lost = 0.9 * normalize(cameras.cam_from_world[3, 0, :3], dim=0)  # to that picture's right
+    assert (lost @ eye).abs() < 1e-6
+    for source, kept in (("found", True), ("masks", False)):
+        rims = Rim()(outlines.replace(inside=wrong, source=source), cameras)
+        assert bool(rims.hull.holds(lost)) == kept
+
+
 def test_without_outlines_there_are_no_rims(cameras):
     assert Rim()(None, cameras) is None
 
