@@ -18,6 +18,7 @@ from pimper_torch.coarse.trim import (
     Evidence,
     enclosed_holes,
     evidence,
+    fringes,
     hanging_together,
     point_distances,
     supported_pieces,
@@ -59,6 +60,7 @@ class OutlinedConfig:
         tolerance_px: By which points and surface may lie outside the visual hull.
         reach_px: A face nearer to a point, or a rim point, than this is supported by it.
         hole_px: Side of a square as large as the largest hole that is closed whatever made it.
+            Strips along a border that are narrower go, where they are small or unsupported.
         max_unseen: Share of the area seen that a hole may have which only lack of views made,
             such as the bottom of a deep concavity, to be closed.
         min_share: Of the area that points or rims support, which a piece apart has to have.
@@ -288,6 +290,7 @@ def seen_surface(
 
     A lid goes: a face without points behind which views see something. What no view sees stays
     where it is a small hole in the rest; the back of an object seen from one side is a large one.
+    The border has no fringes.
 
     Args:
         vertices: Of the closed surface.
@@ -307,6 +310,8 @@ def seen_surface(
     holes = enclosed_holes(vertices, faces, kept, config.max_unseen * area)
     kept = kept | (holes & ~hanging_together(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
+    rings = int(config.hole_px / (2 * config.cell_px))
+    kept &= ~fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)
     (chosen,) = torch.nonzero(kept, as_tuple=True)
     pieces = supported_pieces(vertices, faces[chosen], known[chosen], config.min_share)
     kept[chosen[~pieces]] = False

@@ -12,7 +12,12 @@ from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.matching import Level
 from pimper_torch.geometry.components import component_areas, face_components, graph_components
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import face_normals, face_pairs, side_lengths
+from pimper_torch.geometry.surfaces import (
+    corners_of,
+    face_normals,
+    face_pairs,
+    side_lengths,
+)
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Record
 
@@ -157,6 +162,46 @@ def enclosed_holes(
     areas = component_areas(vertices, faces[dropped], label)
     found[dropped] = (on_border[label] == 0) & (areas <= largest)
     return found
+
+
+def fringes(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    kept: Bool[Tensor, " face"],
+    supported: Bool[Tensor, " face"],
+    smallest: float,
+    rings: int,
+) -> Bool[Tensor, " face"]:
+    """Mark narrow strips and spurs beside dropped faces that little supports.
+
+    Narrow is what a morphological opening takes away: erosion by so many rings of faces, then
+    dilation. Of that, components go that are smaller than an area, or less than half supported:
+    what is thin and supported, such as a handle seen from one side, stays.
+
+    Args:
+        vertices: Of the surface.
+        faces: Of it.
+        kept: Which are not dropped.
+        supported: Faces that something supports.
+        smallest: Area of a component that stays if it is supported.
+        rings: Half the width of the widest strip that is narrow, in faces.
+    """
+    core = ~_dilated(faces, ~kept, rings, len(vertices))
+    narrow = kept & ~_dilated(faces, core, rings, len(vertices))
+    pairs, _ = face_pairs(faces)
+    label = graph_components(pairs[narrow[pairs].all(dim=1)], len(faces))
+    area = component_areas(vertices, faces, label)
+    known = component_areas(vertices, faces, label, supported)
+    return narrow & ((area < smallest) | (known < area / 2))
+
+
+def _dilated(
+    faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], rings: int, num_vertices: int
+) -> Bool[Tensor, " face"]:
+    """Mark some faces and so many rings of faces round them."""
+    for _ in range(rings):
+        some = corners_of(faces, some, num_vertices)[faces].any(dim=1)
+    return some
 
 
 def supported_pieces(

@@ -5,6 +5,7 @@ from pimper_torch.coarse.densify import push_pull, sweep
 from pimper_torch.coarse.matching import Matcher, Windows, level_of, mean_of_largest, pair
 from pimper_torch.coarse.oriented import OrientedPoints, fitted_planes, thinned
 from pimper_torch.coarse.trim import (
+    fringes,
     hanging_together,
     supported_pieces,
     too_far,
@@ -143,6 +144,25 @@ def test_small_holes_are_closed_and_large_ones_and_crumbs_are_not():
     crumbs = (middle[:, 2] < 0) | (middle[:, 2] > 0.97)
     pieces = supported_pieces(vertices, faces[crumbs], whole[crumbs], 0.05)
     assert (pieces == (middle[crumbs][:, 2] < 0)).all()
+
+
+def test_narrow_strips_along_a_border_go_unless_they_are_long_and_supported():
+    sheet = table(half_side=20.0, cells=40)
+    vertices, faces = sheet.vertices_world, sheet.faces
+    x, y, _ = vertices[faces].mean(dim=1).unbind(dim=1)
+    land = x < 0
+    known, unknown = (x > 0) & (x < 12) & (y.abs() < 2), (x > 0) & (x < 12) & ((y - 10).abs() < 2)
+    spur = (x > 0) & (x < 2) & ((y + 7).abs() < 1)
+    cape = (x > 0) & (x < 12) & (y < -10)  # as wide as it is long: no strip, supported or not
+    supported = ~unknown & ~cape
+    kept = land | known | unknown | spur | cape
+    found = fringes(vertices, faces, kept, supported, 5.0, 3)
+    assert bool(found[spur].all())
+    assert float(found[unknown].double().mean()) > 0.8  # a little stays in its corners
+    assert not bool(found[known].any())
+    assert float(found[cape].double().mean()) < 0.05
+    assert not bool(found[land & (x < -4)].any())
+    assert not bool(fringes(vertices, faces, kept, supported, 5.0, 0).any())
 
 
 def test_faces_go_with_what_they_hang_together_with():
