@@ -15,7 +15,7 @@ from pimper_torch.records import Record
 # outside; one of 16 to 30 views holds a shadow of 2 to 9 % of its cut.
 _FAR = 1 / 200  # of the pictures' longer side, outside the silhouette
 _LEAST, _MOST = 0.005, 0.2  # of a cut, so far outside
-_MANY = 0.25  # of the views
+_MANY = 0.5  # of the views
 _SHIFTED = 0.5  # of what is outside is missing elsewhere
 _WELL = 2.0  # times as deep as is_deep asks for: beside a skull's cheek bone views see through
 _SHALLOW = 0.2  # of a hole: more lies near the silhouette's border where it is seen through
@@ -78,7 +78,7 @@ def _without_shadows(cuts: Cuts) -> Cuts:
     """Take from single cuts what the hull denies, as the shadow beside an object's foot.
 
     Shadows move with the light, so that one view's cut holds a shadow that the others cut away.
-    Nothing is taken where another cause is likelier: where many cuts exceed the silhouettes, as
+    Nothing is taken where another cause is likelier: where most cuts exceed the silhouettes, as
     the hull has lost a part then; where a cut exceeds the silhouette on one side and lacks
     something on the other, as a misplaced camera makes it; where a cut has little to do with the
     silhouette.

@@ -51,7 +51,7 @@ def test_what_lies_apart_from_the_excess_keeps_its_border():
     ("changed", "on_plane"),
     [
         ([shadowed()], False),  # no plane for a shadow to fall on
-        ([shadowed()] * 3, True),  # many views see it: the hull has lost it
+        ([shadowed()] * 5, True),  # most views see it: the hull has lost it
         ([disc((53.0, 40.0)) > 0], True),  # a misplaced camera
         ([disc((50.0, 40.0), 32.0) > 0], True),  # has little to do with the silhouette
     ],
