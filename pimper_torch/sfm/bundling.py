@@ -11,12 +11,14 @@ from pimper_torch.sfm.model import SparseModel
 
 _ITERATIONS = 100
 
-# Relative fall of the cost that ends the iterations.
-_TOLERANCE = 1e-6
-
 
 def bundle(
-    model: SparseModel, scale_px: float, threads: int, *, cameras: bool = True
+    model: SparseModel,
+    scale_px: float,
+    threads: int,
+    *,
+    cameras: bool = True,
+    tolerance: float = 1e-6,
 ) -> SparseModel:
     """Adjust poses, lenses and points to the observations, robustly.
 
@@ -27,6 +29,7 @@ def bundle(
         scale_px: Residual at which Cauchy's weight is a half.
         threads: -1 for all cores.
         cameras: Whether poses and lenses are adjusted, or points alone.
+        tolerance: Relative fall of the cost that ends the iterations.
 
     Returns:
         Views, points and observations in their old order.
@@ -39,7 +42,7 @@ def bundle(
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = scale_px
     options.ceres.solver_options.max_num_iterations = _ITERATIONS
-    options.ceres.solver_options.function_tolerance = _TOLERANCE
+    options.ceres.solver_options.function_tolerance = tolerance
     options.ceres.solver_options.num_threads = threads
     with quiet():
         reconstruction = reconstruction_of(model, _no_colors(model))

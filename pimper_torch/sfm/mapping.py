@@ -10,6 +10,10 @@ from pimper_torch.sfm.colmap import model_of
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.workspace import Workspace
 
+# Growth of a model between two adjustments of all of it. COLMAP's own 1.1 suits models that are
+# final; here tracks are found again, and everything is adjusted to them.
+_GROWTH = 1.2
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapSettings:
@@ -43,6 +47,7 @@ def map_views(space: Workspace, settings: MapSettings) -> list[SparseModel]:
     options.num_threads = settings.threads
     options.random_seed = settings.seed
     options.mapper.abs_pose_min_num_inliers = settings.min_inliers
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
     options.triangulation.ignore_two_view_tracks = not settings.pairs_count
     registered = count(3)  # the first call follows a model of two views
 

@@ -121,7 +121,6 @@ class ReconstructConfig:
         return RegistrationSettings(
             matching=MatchSettings(
                 max_ratio=self.max_ratio,
-                guided=False,
                 max_error_px=self.max_error_px,
                 min_inliers=self.min_matches,
                 seed=self.seed,

@@ -23,6 +23,9 @@ _FEWEST_SIGHTINGS = 3
 # tails, from light that is no slope: one spread puts points a quarter nearer to the truth.
 _FIRST_SCALE_PX, _SCALES_PX = 0.5, (0.05, 1.0)
 
+# Relative fall of the cost that ends the adjustment which tells the spread.
+_FIRST_TOLERANCE = 1e-4
+
 # Median length of a two-dimensional Gaussian's draws, in standard deviations.
 _MEDIAN_LENGTH = 1.1774
 
@@ -124,12 +127,14 @@ def _adjusted(
 ) -> SparseModel:
     """Adjust cameras to what was aligned, then the points that only features know."""
     tied, leading = _leading(model, aligned, settings.fewest_points)
-    tied = bundle(tied, _FIRST_SCALE_PX, settings.threads)
+    tied = bundle(tied, _FIRST_SCALE_PX, settings.threads, tolerance=_FIRST_TOLERANCE)
     spread = float(observation_errors(tied)[leading].median()) / _MEDIAN_LENGTH
     scale = min(max(spread, _SCALES_PX[0]), _SCALES_PX[1])
     tied = bundle(tied, scale, settings.threads)
     model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
-    model = bundle(model, _FIRST_SCALE_PX, settings.threads, cameras=False)
+    model = bundle(
+        model, _FIRST_SCALE_PX, settings.threads, cameras=False, tolerance=_FIRST_TOLERANCE
+    )
     model = bundle(model, scale, settings.threads, cameras=False)
     limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
     return model.without(observation_errors(model) > limit)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pimper_torch.errors import PimperWarning
 from pimper_torch.sfm.agreement import misplaced_views
 from pimper_torch.sfm.components import FEWEST_VIEWS, count_spread_views, require_motion
+from pimper_torch.sfm.guided import match_guided
 from pimper_torch.sfm.leave_out import leave_out_room
 from pimper_torch.sfm.mapping import MapSettings, map_views
 from pimper_torch.sfm.matching import (
@@ -30,7 +31,7 @@ class RegistrationSettings:
     """How photographs are registered.
 
     Attributes:
-        matching: What counts as a match; ``guided`` is set by the pass.
+        matching: What counts as a match.
         mapping: How views are added to a model; ``pairs_count`` and further seeds are set by the
             pass.
         guided_pairs: Strongest pairs of each photograph that are matched along epipolar lines,
@@ -97,7 +98,7 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
         ReconstructionError: Nothing moves from photograph to photograph.
     """
     pairs = all_pairs(len(space.files))
-    match_pairs(space, pairs, replace(settings.matching, guided=False))
+    match_pairs(space, pairs, settings.matching)
     _leave_out_room(space, settings)
     verified = verified_pairs(space)
     if settings.guided_pairs:
@@ -146,8 +147,8 @@ def _starts(settings: RegistrationSettings) -> list[MapSettings]:
 def _guided(
     space: Workspace, pairs: Sequence[PhotographPair], settings: RegistrationSettings
 ) -> list[VerifiedPair]:
-    """Match some pairs anew, along epipolar lines too; give all that are verified then."""
-    match_pairs(space, pairs, replace(settings.matching, guided=True))
+    """Match some pairs along their epipolar lines; give all that are verified then."""
+    match_guided(space, pairs, settings.matching)
     return verified_pairs(space)
 
 

@@ -6,9 +6,7 @@ from pimper_torch.sfm.leave_out import leave_out_room
 from pimper_torch.sfm.matching import MatchSettings
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
 
-SETTINGS = MatchSettings(
-    max_ratio=0.8, guided=False, max_error_px=2.0, min_inliers=15, seed=0, threads=1
-)
+SETTINGS = MatchSettings(max_ratio=0.8, max_error_px=2.0, min_inliers=15, seed=0, threads=1)
 
 
 def stored(scene, path):

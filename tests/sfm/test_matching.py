@@ -2,11 +2,11 @@ from pimper_torch.sfm.matching import all_pairs, strongest, tiles
 
 
 def test_tiles_hold_every_pair_once_and_few_photographs_each():
-    pairs = all_pairs(30)
+    pairs = all_pairs(60)
     groups = list(tiles(pairs))
     assert sorted(pair for some in groups for pair in some) == sorted(pairs)
-    assert len(pairs) == 30 * 29 // 2
-    assert max(len({view for pair in some for view in pair}) for some in groups) <= 16
+    assert len(pairs) == 60 * 59 // 2
+    assert max(len({view for pair in some for view in pair}) for some in groups) <= 32
 
 
 def test_the_strongest_pairs_of_every_photograph_are_listed_once():

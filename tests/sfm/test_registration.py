@@ -13,9 +13,7 @@ from pimper_torch.sfm.model import select_views
 from pimper_torch.sfm.registration import RegistrationSettings, register
 from pimper_torch.sfm.workspace import Workspace
 
-MATCHING = MatchSettings(
-    max_ratio=0.8, guided=False, max_error_px=2.0, min_inliers=15, seed=0, threads=1
-)
+MATCHING = MatchSettings(max_ratio=0.8, max_error_px=2.0, min_inliers=15, seed=0, threads=1)
 MAPPING = MapSettings(min_inliers=6, pairs_count=False, seed=5, threads=1)
 SETTINGS = RegistrationSettings(matching=MATCHING, mapping=MAPPING, guided_pairs=1, starts=2)
 
@@ -28,7 +26,10 @@ class Told:
         self.matched, self.mapped = [], []
 
     def match(self, space, pairs, settings):
-        self.matched.append((settings.guided, list(pairs)))
+        self.matched.append((False, list(pairs)))
+
+    def guide(self, space, pairs, settings):
+        self.matched.append((True, list(pairs)))
 
     def map(self, space, settings):
         self.mapped.append((settings.seed, settings.pairs_count))
@@ -54,6 +55,7 @@ def told(model, monkeypatch):
             for pair in all_pairs(5)
         ]
         monkeypatch.setattr(registration, "match_pairs", answers.match)
+        monkeypatch.setattr(registration, "match_guided", answers.guide)
         monkeypatch.setattr(registration, "map_views", answers.map)
         monkeypatch.setattr(registration, "misplaced_views", answers.judge)
         monkeypatch.setattr(registration, "verified_pairs", lambda space: pairs)

@@ -1,0 +1,130 @@
+"""Guided matching against COLMAP's own, and against closed-form features."""
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import pad
+
+from pimper_torch.io.photographs import load_views
+from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm.features import find_features
+from pimper_torch.sfm.guided import (
+    Features,
+    guided_matches,
+    match_guided,
+    near_epipolar_lines,
+    near_mapped_points,
+)
+from pimper_torch.sfm.matching import match_pairs
+from pimper_torch.sfm.reconstruct import ReconstructConfig
+from pimper_torch.sfm.workspace import workspace
+
+CONFIG = ReconstructConfig(threads=1)
+
+# Cameras side by side: epipolar lines are rows.
+ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+
+
+def features(pixels, descriptors):
+    """Make features whose descriptors are angles about one axis, in degrees."""
+    turned = torch.deg2rad(torch.tensor(descriptors, dtype=torch.float64))
+    return Features(
+        pixels=torch.tensor(pixels, dtype=torch.float64),
+        descriptors=torch.stack([turned.cos(), turned.sin()], dim=1).float(),
+    )
+
+
+def test_a_twin_off_the_line_is_no_rival_and_one_on_it_is():
+    first = features([[5.0, 10.0], [5.0, 60.0]], [0.0, 90.0])
+    second = features(
+        [[30.0, 11.0], [40.0, 30.0], [30.0, 60.0], [40.0, 61.5]], [10.0, 0.0, 90.0, 92.0]
+    )
+    found = guided_matches(first, second, near_epipolar_lines(ROWS, 2.0), 0.8)
+    assert found.tolist() == [[0, 0], [1, 2]]  # 0 against 2 degrees: clear
+    ratio = features([[30.0, 11.0], [40.0, 9.0]], [10.0, 12.0])
+    assert guided_matches(first, ratio, near_epipolar_lines(ROWS, 2.0), 0.8).tolist() == []
+    assert guided_matches(first, ratio, near_epipolar_lines(ROWS, 2.0), 0.9).tolist() == [[0, 0]]
+
+
+def test_matches_are_each_others_best():
+    first = features([[5.0, 10.0], [9.0, 10.5]], [0.0, 10.0])
+    second = features([[30.0, 10.0]], [2.0])
+    assert guided_matches(first, second, near_epipolar_lines(ROWS, 2.0), 0.8).tolist() == [[0, 0]]
+
+
+def test_descriptors_that_are_unlike_do_not_match_though_nothing_rivals():
+    first, second = features([[5.0, 10.0]], [0.0]), features([[30.0, 10.0]], [45.0])
+    assert guided_matches(first, second, near_epipolar_lines(ROWS, 2.0), 0.8).tolist() == []
+
+
+def test_the_distance_from_epipolar_lines_is_sampsons():
+    generator = torch.Generator().manual_seed(3)
+    fundamental = torch.rand(3, 3, generator=generator, dtype=torch.float64) - 0.5
+    fundamental[2] *= 500
+    first, second = 1000 * torch.rand(2, 300, 2, generator=generator, dtype=torch.float64)
+    ends = pad(first, (0, 1), value=1), pad(second, (0, 1), value=1)
+    residual = ends[0] @ fundamental.mT @ ends[1].mT
+    lines, back = ends[0] @ fundamental.mT, ends[1] @ fundamental
+    slope = lines[:, None, :2].square().sum(dim=2) + back[None, :, :2].square().sum(dim=2)
+    error = residual.abs() / slope.sqrt()
+    near = near_epipolar_lines(fundamental, 2.0)(first, second)
+    assert near.any()
+    assert not near[error > 2.01].any()
+    assert near[error < 1.99].all()
+
+
+def test_a_homography_maps_to_a_circle():
+    shift = torch.tensor([[1.0, 0, 20], [0, 1, -5], [0, 0, 1]], dtype=torch.float64)
+    first = torch.tensor([[10.0, 10.0]], dtype=torch.float64)
+    second = torch.tensor([[30.0, 5.0], [31.9, 5.0], [31.5, 6.5]], dtype=torch.float64)
+    assert near_mapped_points(shift, 2.0)(first, second).tolist() == [[True, True, False]]
+
+
+@pytest.fixture(scope="module")
+def matched():
+    """Two bundled photographs: inliers before guiding, as COLMAP guides, and as we do."""
+    pycolmap = loaded()
+    views = load_views(str(files("pimper_torch").joinpath("data/skull")))
+    views = views.take([views.names.index(name) for name in ("35.jpg", "36.jpg")])
+    matching = CONFIG.registration.matching
+
+    def inliers(stored):
+        geometry = stored.read_two_view_geometry(1, 2)
+        return {tuple(row) for row in np.array(geometry.inlier_matches).tolist()}
+
+    with workspace(views, 1) as space:
+        find_features(space, CONFIG.features, [None, None])
+        match_pairs(space, [(0, 1)], matching)
+        options = pycolmap.FeatureMatchingOptions()
+        options.use_gpu, options.num_threads, options.guided_matching = False, 1, True
+        options.sift.max_ratio = matching.max_ratio
+        with quiet(), pycolmap.Database.open(space.database) as stored:
+            plain, geometry = inliers(stored), stored.read_two_view_geometry(1, 2)
+        match_guided(space, [(0, 1)], matching)
+        with quiet(), pycolmap.Database.open(space.database) as stored:
+            ours = inliers(stored)
+            stored.delete_two_view_geometry(1, 2)
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.min_num_inliers = matching.min_inliers
+        verification.ransac.max_error = matching.max_error_px
+        verification.ransac.random_seed = matching.seed
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = space.folder / "pairs.txt"
+        pairing.match_list_path.write_text(" ".join(space.files) + "\n", encoding="ascii")
+        with quiet():
+            pycolmap.match_image_pairs(
+                space.database, options, pairing, verification, pycolmap.Device.cpu
+            )
+        with quiet(), pycolmap.Database.open(space.database) as stored:
+            theirs, again = inliers(stored), stored.read_two_view_geometry(1, 2)
+    assert np.allclose(geometry.F, again.F, atol=0)
+    return plain, theirs, ours
+
+
+def test_guided_matches_are_those_of_colmap(matched):
+    plain, theirs, ours = matched
+    assert len(theirs) > 1.2 * len(plain)
+    # Nearly all of the others have a ratio within 2 % of the limit, where rounding tells.
+    assert len(theirs & ours) > 0.97 * len(theirs | ours)
