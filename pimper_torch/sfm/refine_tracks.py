@@ -66,20 +66,27 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
         The same views. Points that nothing agrees about are left out.
     """
     for _ in range(settings.rounds):
-        raster = (views.num_views, *views.images.shape[-2:])
-        pictures = log_pictures(undistorted(views, model.lenses), raster)
-        cameras = Cameras(
-            intrinsics=pinholes_for(model.lenses),
-            cam_from_world=model.cam_from_world,
-            sizes_px=views.sizes_px.cpu(),
-        )
-        planes = tangents(model.points_world, model.observed, cameras)
-        found = sight(pictures, cameras, planes, settings.sightings)
+        found, cameras = _sighted(views, model, settings.sightings)
         renewed, aligned = _renewed(model, found, cameras, settings.fewest_points)
         if not bool(aligned.any()):
             return model
         model = _adjusted(renewed, aligned, settings)
     return model
+
+
+def _sighted(
+    views: Views, model: SparseModel, settings: SightingSettings
+) -> tuple[Sightings, Cameras]:
+    """Find the points in undistorted photographs, which are held no longer than that."""
+    raster = (views.num_views, *views.images.shape[-2:])
+    pictures = log_pictures(undistorted(views, model.lenses), raster)
+    cameras = Cameras(
+        intrinsics=pinholes_for(model.lenses),
+        cam_from_world=model.cam_from_world,
+        sizes_px=views.sizes_px.cpu(),
+    )
+    planes = tangents(model.points_world, model.observed, cameras)
+    return sight(pictures, cameras, planes, settings), cameras
 
 
 def _renewed(
