@@ -38,6 +38,11 @@ def pixels_from_indices(indices: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*b
     return indices + 0.5
 
 
+def homogeneous(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    """Append 1 to pixels, as homographies and epipolar geometries take them; differentiable."""
+    return torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
+
+
 def pixel_centers(
     width: int, height: int, like: Float[Tensor, "..."]
 ) -> Float[Tensor, "{height} {width} 2"]:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Record
 
 # Features at rest that were found less exactly are no evidence of motion: in rendered rooms 1 in
@@ -183,7 +184,7 @@ def fundamental_matrix(
     Source: Hartley, In Defense of the Eight-Point Algorithm, PAMI 19(6), 1997.
     """
     one, two = _normalizing(first), _normalizing(second)
-    x, y = _homogeneous(first) @ one.mT, _homogeneous(second) @ two.mT
+    x, y = homogeneous(first.double()) @ one.mT, homogeneous(second.double()) @ two.mT
     rows = (y[:, :, None] * x[:, None, :]).reshape(-1, 9)
     least = torch.linalg.eigh(rows.mT @ (weight[:, None] * rows)).eigenvectors[:, 0]
     u, s, v = torch.linalg.svd(least.reshape(3, 3))
@@ -197,7 +198,8 @@ def sampson_errors(
     second: Float[Tensor, "match 2"],
 ) -> Float[Tensor, " match"]:
     """Give the first-order distance of matches from an epipolar geometry, in pixels."""
-    residual = (_homogeneous(second) * (_homogeneous(first) @ geometry.mT)).sum(dim=1)
+    ends, starts = homogeneous(second.double()), homogeneous(first.double())
+    residual = (ends * (starts @ geometry.mT)).sum(dim=1)
     return residual.abs() / _slope(geometry, first, second).sqrt()
 
 
@@ -207,7 +209,7 @@ def _slope(
     second: Float[Tensor, "match 2"],
 ) -> Float[Tensor, " match"]:
     """Give the squared gradient of the residual in the four coordinates of a match."""
-    line, back = _homogeneous(first) @ geometry.mT, _homogeneous(second) @ geometry
+    line, back = homogeneous(first.double()) @ geometry.mT, homogeneous(second.double()) @ geometry
     slope = line[:, :2].square().sum(dim=1) + back[:, :2].square().sum(dim=1)
     return slope.clamp_min(torch.finfo(slope.dtype).tiny)
 
@@ -220,10 +222,6 @@ def _pixels(keypoints: Keypoints, pair: Pair) -> Ends:
 def _count(votes: list[Int[Tensor, " _"]], pair: Pair, weight: int) -> None:
     for view, features in zip((pair.first, pair.second), pair.matches.unbind(dim=1), strict=True):
         votes[view] = votes[view].index_add(0, features, torch.full_like(features, weight))
-
-
-def _homogeneous(pixels: Float[Tensor, "match 2"]) -> Float[Tensor, "match 3"]:
-    return torch.nn.functional.pad(pixels.double(), (0, 1), value=1.0)
 
 
 def _normalizing(pixels: Float[Tensor, "match 2"]) -> Float[Tensor, "3 3"]:

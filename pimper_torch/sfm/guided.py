@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.progress import track
 from pimper_torch.records import Record
 from pimper_torch.sfm.binding import loaded, quiet
@@ -112,8 +113,8 @@ def near_epipolar_lines(fundamental: Float[Tensor, "3 3"], max_error_px: float) 
     def near(
         first: Float[Tensor, "first 2"], second: Float[Tensor, "second 2"]
     ) -> Bool[Tensor, "first second"]:
-        lines = _homogeneous(first) @ fundamental.mT
-        back = _homogeneous(second) @ fundamental
+        lines = homogeneous(first) @ fundamental.mT
+        back = homogeneous(second) @ fundamental
         # From the middle of all on, single precision tells a hundredth of a pixel.
         middle = second.mean(dim=0)
         offsets = (lines[:, :2] @ middle + lines[:, 2]).float()
@@ -130,7 +131,7 @@ def near_mapped_points(homography: Float[Tensor, "3 3"], max_error_px: float) ->
     def near(
         first: Float[Tensor, "first 2"], second: Float[Tensor, "second 2"]
     ) -> Bool[Tensor, "first second"]:
-        mapped = _homogeneous(first) @ homography.mT
+        mapped = homogeneous(first) @ homography.mT
         mapped = mapped[:, :2] / mapped[:, 2:]
         gap = mapped[:, None] - second
         return gap.square().sum(dim=2) <= max_error_px**2
@@ -180,7 +181,3 @@ def _read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycol
         pixels=torch.from_numpy(pixels),
         descriptors=torch.from_numpy(descriptors / _DESCRIPTOR_LENGTH),
     )
-
-
-def _homogeneous(pixels: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 3"]:
-    return torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)

@@ -11,7 +11,8 @@ from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.workspace import Workspace
 
 # Growth of a model between two adjustments of all of it. COLMAP's own 1.1 suits models that are
-# final; here tracks are found again, and everything is adjusted to them.
+# final, and takes 29 in place of 25 CPU s on 66 photographs; here tracks are found again, and
+# everything is adjusted to them.
 _GROWTH = 1.2
 
 

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
@@ -23,7 +24,8 @@ _FEWEST_SIGHTINGS = 3
 # tails, from light that is no slope: one spread puts points a quarter nearer to the truth.
 _FIRST_SCALE_PX, _SCALES_PX = 0.5, (0.05, 1.0)
 
-# Relative fall of the cost that ends the adjustment which tells the spread.
+# Relative fall of the cost that ends the adjustment which tells the spread. With the 1e-6 of the
+# adjustment after it, all of them take 71 in place of 56 CPU s on 66 photographs of 1600x1067.
 _FIRST_TOLERANCE = 1e-4
 
 # Median length of a two-dimensional Gaussian's draws, in standard deviations.
@@ -120,11 +122,11 @@ def _photographed(
     model: SparseModel,
 ) -> Float[Tensor, "sighting 2"]:
     """Carry pixels of the undistorted photographs to the photographs."""
-    homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
+    ends = homogeneous(pixels)
     found = torch.empty_like(pixels)
     for index, lens in enumerate(model.lenses):
         here = view == index
-        rays = torch.linalg.solve(cameras.intrinsics[index], homogeneous[here].mT).mT
+        rays = torch.linalg.solve(cameras.intrinsics[index], ends[here].mT).mT
         found[here] = colmap.distort(lens, rays)
     return found
 
