@@ -242,6 +242,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
         )
     if config.shared_camera:
         _require_one_size(views)
+    release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
     with workspace(views, thread_count(config.threads or -1)) as space:
         counts = find_features(space, config.features, _known_focals(views))
         _require_features(counts, views.names)
