@@ -30,8 +30,8 @@ def track(items: Sequence[Item]) -> Iterator[Item]:
 
 
 @contextmanager
-def listening(listener: Listener) -> Iterator[None]:
-    """Send reports to ``listener(done, total)`` inside the ``with`` block."""
+def listening(listener: Listener | None) -> Iterator[None]:
+    """Send reports to ``listener(done, total)`` inside the ``with`` block, or to nobody."""
     token = _listener.set(listener)
     try:
         yield

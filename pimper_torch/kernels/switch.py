@@ -1,0 +1,56 @@
+"""Whether a compiled kernel stands in for torch, and how kernels are compiled."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from importlib import import_module
+from pkgutil import iter_modules
+from typing import Literal, TypeVar
+
+import torch
+from torch import Tensor
+
+import pimper_torch.kernels
+from pimper_torch.progress import track
+
+Kernels = Literal["numba", "torch"]
+Function = TypeVar("Function", bound=Callable[..., object])
+
+_chosen: ContextVar[Kernels] = ContextVar("kernels", default="numba")
+
+
+@contextmanager
+def using(kernels: Kernels) -> Iterator[None]:
+    """Choose inside the ``with`` block: ``"numba"``, compiled kernels; ``"torch"``, none."""
+    token = _chosen.set(kernels)
+    try:
+        yield
+    finally:
+        _chosen.reset(token)
+
+
+def compiled_for(*tensors: Tensor) -> bool:
+    """Tell whether a kernel may stand in: chosen, on the CPU, and without gradients."""
+    asked = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    on_cpu = all(each.device.type == "cpu" for each in tensors)
+    return _chosen.get() == "numba" and on_cpu and not asked
+
+
+def compiled(*signatures: str) -> Callable[[Function], Function]:
+    """Compile a function for the given types when its module is imported.
+
+    Once an installation: the machine code is kept on disk. It holds no lock of the interpreter.
+    """
+    import numba
+
+    decorate: Callable[[Function], Function] = numba.njit(
+        list(signatures), cache=True, nogil=True, error_model="numpy"
+    )
+    return decorate
+
+
+def compile_all() -> None:
+    """Compile every kernel that is not kept on disk yet; half a minute, once an installation."""
+    names = [found.name for found in iter_modules(pimper_torch.kernels.__path__)]
+    for name in track(names):
+        import_module(f"{pimper_torch.kernels.__name__}.{name}")

@@ -1,0 +1,89 @@
+import threading
+import time
+from contextvars import ContextVar
+
+import pytest
+import torch
+
+from pimper_torch.parallel import num_workers, side_by_side
+from pimper_torch.progress import listening, track
+
+COLOUR: ContextVar[str] = ContextVar("colour", default="none")
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_results_come_in_the_order_of_the_items(two_threads):
+    def work(item):
+        time.sleep(0.02 if item % 2 == 0 else 0)
+        return item * item
+
+    assert list(side_by_side(work, range(9))) == [item * item for item in range(9)]
+
+
+def test_two_items_are_worked_on_at_the_same_time(two_threads):
+    both = threading.Barrier(2, timeout=10)
+    assert list(side_by_side(lambda _: both.wait() >= 0, range(2))) == [True, True]
+
+
+def test_workers_have_one_thread_each_and_torch_gets_its_own_back(two_threads):
+    inside = list(side_by_side(lambda _: (torch.get_num_threads(), num_workers()), range(4)))
+    assert inside == [(1, 1)] * 4
+    assert torch.get_num_threads() == 2
+    assert list(side_by_side(lambda _: torch.get_num_threads(), range(1))) == [1]
+    assert torch.get_num_threads() == 2
+
+
+def test_workers_see_the_callers_context_and_whether_gradients_are_recorded(two_threads):
+    token = COLOUR.set("red")
+    with torch.no_grad():
+        seen = list(side_by_side(lambda _: (COLOUR.get(), torch.is_grad_enabled()), range(3)))
+    COLOUR.reset(token)
+    assert seen == [("red", False)] * 3
+    assert all(side_by_side(lambda _: torch.is_grad_enabled(), range(3)))
+
+
+def test_work_within_work_stays_in_its_worker(two_threads):
+    def outer(item):
+        here = threading.get_ident()
+        return all(side_by_side(lambda _: threading.get_ident() == here, range(3)))
+
+    assert all(side_by_side(outer, range(3)))
+
+
+def test_the_first_failure_in_order_is_raised_and_no_more_is_begun(two_threads):
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        if item >= 1:
+            raise ValueError(f"item {item}")
+        return item
+
+    with pytest.raises(ValueError, match="item 1"):
+        list(side_by_side(work, range(100)))
+    assert len(begun) < 10
+    assert torch.get_num_threads() == 2
+
+
+def test_no_more_results_than_workers_wait_to_be_taken(two_threads):
+    begun = []
+    results = side_by_side(lambda item: begun.append(item), range(100))
+    next(results)
+    time.sleep(0.1)
+    results.close()
+    assert len(begun) <= 4
+
+
+def test_progress_counts_items_and_not_what_they_walk_through(two_threads):
+    told = []
+    with listening(lambda done, total: told.append((done, total))):
+        list(side_by_side(lambda _: list(track(range(7))), range(3)))
+        list(side_by_side(lambda _: None, range(3), tracked=False))
+    assert told == [(1, 3), (2, 3), (3, 3)]
