@@ -2,7 +2,7 @@
 
 >>> import pimper_torch as pt
 >>> views = pt.load_views("photos/")  # doctest: +SKIP
->>> surface = pt.Pimper(pt.load_config("paper"))(views)  # doctest: +SKIP
+>>> surface = pt.Pimper(pt.load_config("default"))(views)  # doctest: +SKIP
 """
 
 from importlib import import_module

@@ -24,7 +24,7 @@ class CommonOptions:
         preset: Settings to start from: paper, default, fast, or a YAML file of your own.
         reference: Name of the photograph that the facets and pictures are seen from; chosen
             automatically unless given.
-        device: Where everything after structure from motion runs.
+        device: Where everything after structure from motion runs; cuda has never been run on a GPU.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         overwrite: Replace a former result in OUT.
         cache: Folder where structure from motion is kept from run to run, so that a change of a
