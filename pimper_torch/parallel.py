@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
+from functools import cache
+from itertools import pairwise
 from typing import TypeVar
 
 import torch
@@ -50,6 +52,35 @@ def side_by_side(
         yield result
         if tracked:
             report(done, len(items))
+
+
+# Fewer rows than these are not worth a second thread: they take it some 50 microseconds.
+_WORTHWHILE_ROWS = 20_000
+
+
+def over_rows(kernel: Callable[..., object], rows: int, *arguments: object) -> None:
+    """Call ``kernel(*arguments, first, last)`` on ranges that make up all rows, side by side.
+
+    Args:
+        kernel: Compiled, so that it holds no lock; what it writes for a row depends on no other.
+        rows: How many there are.
+        arguments: Of the kernel.
+    """
+    workers = num_workers() if rows >= _WORTHWHILE_ROWS else 1
+    bounds = [rows * part // workers for part in range(workers + 1)]
+    others = [
+        _idle(workers - 1).submit(kernel, *arguments, first, last)
+        for first, last in pairwise(bounds[1:])
+    ]
+    kernel(*arguments, bounds[0], bounds[1])
+    for other in others:
+        other.result()
+
+
+@cache
+def _idle(workers: int) -> ThreadPoolExecutor:
+    """Give threads that wait for work as long as the process lives."""
+    return ThreadPoolExecutor(workers, thread_name_prefix="rows")
 
 
 def _one_by_one(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:

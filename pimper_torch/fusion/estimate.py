@@ -17,8 +17,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.fusion.evidence import Evidence
-from pimper_torch.linalg.equations import normal_equations
-from pimper_torch.linalg.systems import solutions
+from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.linalg.equations import compressed_equations, normal_equations
+from pimper_torch.linalg.systems import solutions, solve_compressed
 from pimper_torch.photometry.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.records import Record
 
@@ -65,6 +66,7 @@ def fuse_evidence(
     start: Float[Tensor, " vertex"],
     hold: Float[Tensor, " vertex"],
     rounds: int,
+    factors: Sequence[float] | None = None,
 ) -> Fused:
     """Solve, judge the noise, and solve again.
 
@@ -73,6 +75,7 @@ def fuse_evidence(
         start: Heights that vertices keep where nothing is known.
         hold: Information that they keep them by.
         rounds: Of solves.
+        factors: What the claimed variances are multiplied by at first; 1 unless given.
 
     Differentiable in targets, coefficients, information, hold and start, through the weights and
     the factors too: every solve answers by the implicit function. That takes as many more solves
@@ -81,34 +84,61 @@ def fuse_evidence(
     Raises:
         SingularSystemError: See :func:`~pimper_torch.linalg.systems.solutions`.
     """
-    factors = [torch.ones((), dtype=torch.float64).to(start.device) for _ in kinds]
+    like = torch.ones((), dtype=torch.float64, device=start.device)
+    found = [like * factor for factor in factors or [1.0] * len(kinds)]
     weights = [torch.ones_like(kind.information).double() for kind in kinds]
     generator = torch.Generator().manual_seed(0)  # of signs: any will do
     probe = 2.0 * torch.randint(0, 2, (len(start),), generator=generator) - 1
-    probe = probe.double().to(start.device)
+    probe = probe.to(like)
+    heights = None
     for _ in range(rounds - 1):
-        entries, rhs = _system(kinds, weights, factors, start, hold)
-        heights, answer = solutions(*entries, rhs, probe, what="the fusion", tolerance=_ACCURACY)
+        heights, answer = _solved(kinds, weights, found, start, hold, probe, guess=heights)
         for place, kind in enumerate(kinds):
             if not kind.judged or len(kind.targets) == 0:
                 continue
             square = kind.information.double() * kind.residual(heights).square()
             square = square * kind.correlated
-            weight = weights[place] * kind.information / factors[place]
+            weight = weights[place] * kind.information / found[place]
             used = (weight * _sum(kind, probe) * _sum(kind, answer)).sum()
             left = 1 - used / weights[place].sum()
             square = square / left.clamp_min(_LEAST_LEFT)
-            factors[place] = noise_factor(square)
-            weights[place] = 1 / (1 + square / (CAUCHY_TUNING**2 * factors[place]))
-    entries, rhs = _system(kinds, weights, factors, start, hold)
-    (heights,) = solutions(*entries, rhs, what="the fusion", tolerance=_ACCURACY)
+            found[place] = noise_factor(square)
+            weights[place] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[place]))
+    (heights,) = _solved(kinds, weights, found, start, hold, guess=heights)
     return Fused(
         heights=heights,
-        factors=tuple(float(factor.detach()) for factor in factors),
+        factors=tuple(float(factor.detach()) for factor in found),
         kinds=tuple(kinds),
         weights=tuple(weight.detach() for weight in weights),
         hold=hold.detach(),
     )
+
+
+def _solved(
+    kinds: Sequence[Evidence],
+    weights: Sequence[Float[Tensor, " _"]],
+    factors: Sequence[Float[Tensor, ""]],
+    start: Float[Tensor, " vertex"],
+    hold: Float[Tensor, " vertex"],
+    *more: Float[Tensor, " vertex"],
+    guess: Float[Tensor, " vertex"] | None,
+) -> tuple[Float[Tensor, " vertex"], ...]:
+    """Solve for the heights, and for more right-hand sides of the same matrix."""
+    parts = [part for kind in kinds for part in (kind.coefficients, kind.targets, kind.information)]
+    if not compiled_for(start, hold, *parts, *weights, *factors):
+        entries, rhs = _system(kinds, weights, factors, start, hold)
+        return solutions(*entries, rhs, *more, what="the fusion", tolerance=_ACCURACY)
+    terms = [
+        (kind.unknowns, kind.coefficients, kind.targets, weight * kind.information / factor)
+        for kind, weight, factor in zip(kinds, weights, factors, strict=True)
+    ]
+    matrix, rhs = compressed_equations(terms, hold, start)
+    near = None
+    if guess is not None:
+        near = torch.stack([guess, *(torch.zeros_like(guess) for _ in more)], dim=1)
+    sides = torch.stack([rhs, *more], dim=1)
+    found = solve_compressed(matrix, sides, what="the fusion", tolerance=_ACCURACY, start=near)
+    return found.unbind(dim=1)
 
 
 def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:

@@ -27,6 +27,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array, diags_array
 
+from pimper_torch.kernels.switch import compiled_for
+
 # An entry is strong if it is at least this share of the largest of a row; compared by
 # iterations on weights that vary over 0 to 10 orders, where 0.1 takes up to 1.6 times as many.
 _STRONG = 0.25
@@ -58,6 +60,8 @@ def prolongation(matrix: csr_array) -> csr_array:
         are empty, the others add up to their unit where no anchor (excess of the diagonal)
         holds them.
     """
+    if compiled_for():
+        return _compiled(matrix)
     units = diags_array(_units(matrix))
     found: csr_array = (units @ _averaged((units @ matrix @ units).tocsr())).tocsr()
     return found
@@ -68,8 +72,40 @@ def dominant_diagonal(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
 
     It is the matrix's own wherever that is diagonally dominant.
     """
+    if compiled_for():
+        from pimper_torch.kernels import aggregation as kernels
+
+        own, dominant = np.empty((2, matrix.shape[0]))
+        kernels.diagonals(matrix.indptr, matrix.indices, matrix.data, own, dominant)
+        return dominant
     diagonal: np.ndarray = matrix.diagonal()
     return np.maximum(diagonal, abs(matrix).sum(axis=1) / 2)
+
+
+def _compiled(matrix: csr_array) -> csr_array:
+    """Give the same map by compiled kernels."""
+    from pimper_torch.kernels import aggregation as kernels
+
+    parts, size = (matrix.indptr, matrix.indices, matrix.data), matrix.shape[0]
+    dominant, units = dominant_diagonal(matrix), np.ones(size)
+    for _ in range(_UNIT_STEPS):
+        smoother = np.empty(size)
+        kernels.smooth_ones(*parts, dominant, units, smoother, _DAMPING)
+        units = smoother
+    units = np.maximum(np.abs(units), _LEAST_UNIT)
+    largest, tied, excess = np.empty((3, size))
+    kernels.ties(*parts, units, largest, tied, excess)
+    label = np.empty(size, np.int32)
+    count = kernels.aggregate(*parts, units, largest, tied, _order(size), _STRONG, _TIED, label)
+    starts, columns, entries = kernels.spread(
+        *parts, units, largest, excess, label, _STRONG, _DAMPING
+    )
+    return csr_array((entries, columns, starts), shape=(size, count))
+
+
+def _order(size: int) -> Int[np.ndarray, " unknown"]:
+    """Give the order in which unknowns are asked to be roots."""
+    return np.random.default_rng(0).permutation(size)
 
 
 def _units(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
@@ -133,7 +169,8 @@ def _aggregates(
 def _founded(graph: csr_array) -> Int[np.ndarray, " unknown"]:
     """Label what lies within two steps of roots that are more than two steps apart."""
     size = graph.shape[0]
-    rank = np.random.default_rng(0).permutation(size)
+    rank = np.empty(size, dtype=int)
+    rank[_order(size)] = np.arange(size)[::-1]
     root = np.zeros(size, dtype=bool)
     open_ = np.diff(graph.indptr) > 0
     while open_.any():

@@ -48,7 +48,7 @@ def conjugate_gradients(
     decrease = inner(residual, better)
     size = decrease if start is None else inner(rhs, precondition(rhs))
     goal = tolerance**2 * size
-    direction, steps = better, 0
+    direction, steps = better.clone(), 0
     # Written so that what is not a number stops the loop and has not converged.
     while bool((decrease > goal).any()) and steps < max_iterations:
         image = product(direction)
@@ -62,6 +62,6 @@ def conjugate_gradients(
         better = precondition(residual)
         previous, decrease = decrease, inner(residual, better)
         growth = torch.where(previous > 0, decrease / previous, 0)
-        direction = better.addcmul(growth, direction)
+        direction.mul_(growth).add_(better)
         steps += 1
     return found, steps, bool((decrease.abs() <= goal).all())

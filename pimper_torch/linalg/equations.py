@@ -1,6 +1,11 @@
 """Least squares of any sparse equations, such as those that join overlapping rasters."""
 
+from collections.abc import Sequence
+
+import numpy as np
+import torch
 from jaxtyping import Float, Int
+from scipy.sparse import csr_array
 from torch import Tensor
 
 
@@ -38,3 +43,59 @@ def normal_equations(
         0, unknowns.flatten(), (scaled * targets[:, None]).flatten()
     )
     return rows.flatten(), cols.flatten(), blocks.flatten(), rhs
+
+
+Terms = tuple[
+    Int[Tensor, "equation term"],
+    Float[Tensor, "equation term"],
+    Float[Tensor, " equation"],
+    Float[Tensor, " equation"],
+]
+
+
+def compressed_equations(
+    kinds: Sequence[Terms], hold: Float[Tensor, " unknown"], start: Float[Tensor, " unknown"]
+) -> tuple[csr_array, Float[Tensor, " unknown"]]:
+    """Give the same for several sets of equations by compiled kernels, in float64 on the CPU.
+
+    Nothing but the matrix itself takes memory.
+
+    Args:
+        kinds: Unknowns, coefficients, targets and weights of each set, as in
+            :func:`normal_equations`.
+        hold: Weight with which every unknown is held to its start; above 0.
+        start: That.
+
+    Returns:
+        The matrix, columns in order, and the right-hand side. A constant to autograd.
+    """
+    from pimper_torch.kernels import equations as kernels
+
+    size = len(hold)
+    each = torch.arange(size)[:, None]
+    held = (each, torch.ones(size, 1, dtype=start.dtype), start, hold)
+    sets = [_arrays(*kind) for kind in (held, *kinds) if len(kind[0])]
+    counts, side = np.zeros(size, np.int32), np.zeros(size)
+    for unknowns, coefficients, targets, weights in sets:
+        kernels.count(unknowns, counts)
+        kernels.add_sides(unknowns, coefficients, targets, weights, side)
+    starts = np.zeros(size, np.int32)
+    np.cumsum(counts[:-1], out=starts[1:])
+    total = int(counts.sum(dtype=np.int64))
+    ends, columns, entries = starts.copy(), np.empty(total, np.int32), np.empty(total)
+    for unknowns, coefficients, _, weights in sets:
+        kernels.fill(unknowns, coefficients, weights, ends, columns, entries)
+    first, columns, entries = kernels.merged(starts, ends, columns, entries)
+    matrix = csr_array((entries, columns, first), shape=(size, size))
+    return matrix, torch.from_numpy(side)
+
+
+def _arrays(
+    unknowns: Int[Tensor, "equation term"],
+    coefficients: Float[Tensor, "equation term"],
+    targets: Float[Tensor, " equation"],
+    weights: Float[Tensor, " equation"],
+) -> tuple[np.ndarray, ...]:
+    real = torch.promote_types(coefficients.dtype, targets.dtype)
+    kept = unknowns, coefficients.to(real), targets.to(real), weights.double()
+    return tuple(each.detach().contiguous().numpy() for each in kept)

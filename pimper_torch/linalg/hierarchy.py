@@ -1,21 +1,27 @@
 """One cycle of multigrid: an approximate inverse in time proportional to the unknowns.
 
-Coarse unknowns and matrices are found by scipy on the CPU, once; cycles run in torch on the
-device of the system. On the CPU products go through scipy all the same: torch's own compressed
-rows take up to 4 times as long there for less than a million unknowns.
+Coarse unknowns and matrices are found on the CPU, once; cycles run in torch on the device of the
+system, or in compiled kernels on the CPU. Without these, products on the CPU go through scipy all
+the same: torch's own compressed rows take up to 4 times as long there for less than a million
+unknowns.
+
+Vectors have one row an unknown, and may have one column a right-hand side.
 """
 
-import dataclasses
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.aggregation import dominant_diagonal, prolongation
+from pimper_torch.parallel import over_rows
 
 Product = Callable[[Tensor], Tensor]
 
@@ -35,7 +41,7 @@ _SPAN = 4
 _KEPT_FACTOR = 2.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Level:
     """A matrix, how to smooth it and how to reach the next one."""
 
@@ -43,6 +49,64 @@ class Level:
     inverse_diagonal: Float[Tensor, " unknown"]
     prolong: Product | None
     restrict: Product | None
+
+    def corrected(
+        self,
+        start: Float[Tensor, "unknown ..."],
+        residual: Float[Tensor, "unknown ..."],
+        step: Float[Tensor, "unknown ..."],
+        of_step: float,
+        of_rest: float,
+    ) -> Float[Tensor, "unknown ..."]:
+        """Give ``start + of_step * step + of_rest * D^-1 (residual - A step)``."""
+        rest = self.scaled(self.rest(residual, step))
+        return torch.add(start, step, alpha=of_step).add_(rest, alpha=of_rest)
+
+    def scaled(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+        """Give ``D^-1 residual``."""
+        return self.inverse_diagonal.reshape(-1, *[1] * (residual.ndim - 1)) * residual
+
+    def rest(
+        self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
+    ) -> Float[Tensor, "unknown ..."]:
+        """Give ``residual - A found``."""
+        return residual - self.product(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompiledLevel(Level):
+    """A level whose matrix the kernels read: once for all right-hand sides, and on all threads."""
+
+    matrix: csr_array
+
+    def corrected(
+        self,
+        start: Float[Tensor, "unknown ..."],
+        residual: Float[Tensor, "unknown ..."],
+        step: Float[Tensor, "unknown ..."],
+        of_step: float,
+        of_rest: float,
+    ) -> Float[Tensor, "unknown ..."]:
+        """Do the same in one pass."""
+        from pimper_torch.kernels import sparse
+
+        found = torch.empty_like(step)
+        over_rows(
+            sparse.corrected,
+            len(step),
+            *_parts(self.matrix),
+            self.inverse_diagonal.numpy(),
+            *(_columns(vectors) for vectors in (residual, step, start, found)),
+            of_step,
+            of_rest,
+        )
+        return found
+
+    def rest(
+        self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
+    ) -> Float[Tensor, "unknown ..."]:
+        """Do the same in one pass."""
+        return add_product(self.matrix, found, residual.clone(), keep=1.0, gain=-1.0)
 
 
 class Hierarchy:
@@ -66,14 +130,7 @@ class Hierarchy:
             if spread is not None and not 0 < spread.shape[1] < _WORTHWHILE * matrix.shape[0]:
                 spread = None
             gather = None if spread is None else spread.T.tocsr()
-            self._levels.append(
-                Level(
-                    product=product or sparse_product(matrix, device),
-                    inverse_diagonal=torch.from_numpy(1 / dominant_diagonal(matrix)).to(device),
-                    prolong=None if spread is None else sparse_product(spread, device),
-                    restrict=None if gather is None else sparse_product(gather, device),
-                )
-            )
+            self._levels.append(_level(matrix, spread, gather, device, product))
             product = None
             if spread is None:
                 break
@@ -86,7 +143,7 @@ class Hierarchy:
         """The given matrix counted."""
         return len(self._levels)
 
-    def precondition(self, residual: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+    def precondition(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         """Apply the approximate inverse."""
         return self._cycle(0, residual)
 
@@ -99,27 +156,73 @@ class Hierarchy:
         """
         other = object.__new__(Hierarchy)
         finest, *coarse = self._levels
-        finest = dataclasses.replace(finest, product=product, inverse_diagonal=1 / dominant)
+        finest = Level(
+            product=product,
+            inverse_diagonal=1 / dominant,
+            prolong=finest.prolong,
+            restrict=finest.restrict,
+        )
         other._levels, other._coarsest = [finest, *coarse], self._coarsest
         return other
 
-    def _cycle(self, depth: int, residual: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+    def _cycle(
+        self, depth: int, residual: Float[Tensor, "unknown ..."]
+    ) -> Float[Tensor, "unknown ..."]:
         level = self._levels[depth]
         if level.prolong is None or level.restrict is None:
             if self._coarsest is not None:
                 return self._coarsest @ residual
             return _smooth(level, residual, None)
         found = _smooth(level, residual, None)
-        coarse = self._cycle(depth + 1, level.restrict(residual - level.product(found)))
+        coarse = self._cycle(depth + 1, level.restrict(level.rest(residual, found)))
         found += level.prolong(coarse)
         return _smooth(level, residual, found)
 
 
+def _level(
+    matrix: csr_array,
+    spread: csr_array | None,
+    gather: csr_array | None,
+    device: torch.device,
+    product: Product | None,
+) -> Level:
+    diagonal = torch.from_numpy(1 / dominant_diagonal(matrix)).to(device)
+    parts: dict[str, Any] = {
+        "product": product or sparse_product(matrix, device),
+        "inverse_diagonal": diagonal,
+        "prolong": None if spread is None else sparse_product(spread, device),
+        "restrict": None if gather is None else sparse_product(gather, device),
+    }
+    if product is None and compiled_for(diagonal):
+        return CompiledLevel(matrix=matrix, **parts)
+    return Level(**parts)
+
+
 def sparse_product(matrix: csr_array, device: torch.device) -> Product:
     """Give the product of a sparse matrix with vectors on a device, the quickest way."""
-    if device.type == "cpu":
-        return lambda vector: torch.from_numpy(matrix @ vector.numpy())
-    return torch_product(matrix, device)
+    if device.type != "cpu":
+        return torch_product(matrix, device)
+    if compiled_for():
+        return lambda vectors: add_product(
+            matrix, vectors, vectors.new_zeros(matrix.shape[0], *vectors.shape[1:]), 0.0, 1.0
+        )
+    return lambda vectors: torch.from_numpy(matrix @ vectors.numpy())
+
+
+def add_product(
+    matrix: csr_array,
+    vectors: Float[Tensor, "column ..."],
+    found: Float[Tensor, "row ..."],
+    keep: float,
+    gain: float,
+) -> Float[Tensor, "row ..."]:
+    """Give ``keep * found + gain * matrix @ vectors`` by compiled kernels, in ``found``'s place."""
+    from pimper_torch.kernels import sparse
+
+    over_rows(
+        sparse.product, len(found), *_parts(matrix), _columns(vectors), _columns(found), keep, gain
+    )
+    return found
 
 
 def torch_product(matrix: csr_array, device: torch.device) -> Product:
@@ -144,19 +247,28 @@ def may_keep(new: Float[Tensor, "..."], old: Float[Tensor, "..."]) -> bool:
 
 
 def _smooth(
-    level: Level, residual: Float[Tensor, " unknown"], start: Float[Tensor, " unknown"] | None
-) -> Float[Tensor, " unknown"]:
+    level: Level,
+    residual: Float[Tensor, "unknown ..."],
+    start: Float[Tensor, "unknown ..."] | None,
+) -> Float[Tensor, "unknown ..."]:
     """Take two Chebyshev steps of Jacobi's iteration towards A x = residual."""
     center, radius = 1 + 1 / _SPAN, 1 - 1 / _SPAN
-    left = residual if start is None else residual - level.product(start)
-    step = level.inverse_diagonal * left
-    step /= center
-    left = left - level.product(step)
+    left = residual if start is None else level.rest(residual, start)
+    step = level.scaled(left).div_(center)
     # Of the three-term recurrence of Chebyshev's polynomials, its second member.
     gain = 1 / (2 * center / radius - radius / center)
-    found = step if start is None else start + step
-    found = torch.add(found, step, alpha=gain * radius / center)
-    return found.addcmul_(level.inverse_diagonal, left, value=2 * gain / radius)
+    before = torch.zeros_like(step) if start is None else start
+    return level.corrected(before, left, step, 1 + gain * radius / center, 2 * gain / radius)
+
+
+def _parts(matrix: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return matrix.indptr, matrix.indices, matrix.data
+
+
+def _columns(vectors: Float[Tensor, "unknown ..."]) -> np.ndarray:
+    """Give vectors as the kernels want them: one column a right-hand side."""
+    array: np.ndarray = vectors.contiguous().numpy()
+    return array.reshape(len(array), -1)
 
 
 def _dense_inverse(matrix: csr_array) -> Float[Tensor, "unknown unknown"]:

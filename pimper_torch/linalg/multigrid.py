@@ -38,12 +38,12 @@ class Iterate:
     """A solution and how it was reached.
 
     Attributes:
-        values: The solution, float64.
+        values: The solution, float64; one column a right-hand side where there are several.
         iterations: Cycles taken.
-        residual: With the diagonal scaled to 1, next to the right-hand side.
+        residual: With the diagonal scaled to 1, next to the right-hand side; the worst of them.
     """
 
-    values: Float[Tensor, " unknown"]
+    values: Float[Tensor, "unknown ..."]
     iterations: int
     residual: float
 
@@ -52,18 +52,18 @@ def solve_with_hierarchy(
     product: Product,
     hierarchy: Hierarchy,
     diagonal: Float[Tensor, " unknown"],
-    rhs: Float[Tensor, " unknown"],
+    rhs: Float[Tensor, "unknown ..."],
     tolerance: float,
     what: str,
-    start: Float[Tensor, " unknown"] | None = None,
+    start: Float[Tensor, "unknown ..."] | None = None,
 ) -> Iterate:
-    """Solve A x = b for one right-hand side in float64, by conjugate gradients.
+    """Solve A x = b in float64 by conjugate gradients, for all right-hand sides at once.
 
     Args:
         product: Of A.
         hierarchy: Approximates the inverse of A.
         diagonal: Of A; only to measure the residual.
-        rhs: ``b``.
+        rhs: ``b``, one column a right-hand side if there are several.
         tolerance: Of the error's energy norm, as the hierarchy estimates it, next to that of
             the solution.
         what: Names the system in errors.
@@ -77,13 +77,14 @@ def solve_with_hierarchy(
         hierarchy.precondition,
         rhs,
         start=start,
+        dims=(0,),
         tolerance=tolerance,
         max_iterations=_MOST_CYCLES,
     )
-    scale = diagonal.rsqrt()
-    size = float((scale * rhs).norm())
-    misfit = float((scale * (rhs - product(found))).norm())
-    share = misfit / size if size > 0 else misfit
+    scale = diagonal.rsqrt().reshape(-1, *[1] * (rhs.ndim - 1))
+    size = (scale * rhs).norm(dim=0)
+    misfit = (scale * (rhs - product(found))).norm(dim=0)
+    share = float((misfit / torch.where(size > 0, size, 1)).max())
     worst = max(_WORST_MISFIT, _MISFIT_TOLERANCES * tolerance)
     if not (share < worst and converged):
         raise SingularSystemError(
@@ -134,10 +135,10 @@ class Multigrid:
         self._size, self._what, self._tolerance = size, what, tolerance
         matrix = _compressed(rows, cols, values, size)
         self._take(matrix, values)
-        self._hierarchy = Hierarchy(matrix, values.device, self._product)
+        self._hierarchy = Hierarchy(matrix, values.device)
 
     def solve(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
-        """Solve for one right-hand side or several, one after the other.
+        """Solve for one right-hand side or several at once.
 
         Differentiable in ``rhs`` and in the matrix's ``values``, any number of times.
 
@@ -148,10 +149,10 @@ class Multigrid:
 
     def iterate(
         self,
-        rhs: Float[Tensor, " unknown"],
-        start: Float[Tensor, " unknown"] | None = None,
+        rhs: Float[Tensor, "unknown ..."],
+        start: Float[Tensor, "unknown ..."] | None = None,
     ) -> Iterate:
-        """Solve for one right-hand side and say how; not differentiable."""
+        """Solve and say how; not differentiable."""
         with torch.no_grad():
             return solve_with_hierarchy(
                 self._product,
@@ -165,9 +166,10 @@ class Multigrid:
 
     def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         """Solve without a trace for autograd."""
-        columns = rhs.reshape(self._size, -1).unbind(dim=1)
-        found = [self.iterate(column).values for column in columns]
-        return torch.stack(found, dim=1).reshape(rhs.shape).to(rhs) if found else rhs.clone()
+        if rhs.numel() == 0:
+            return rhs.clone()
+        columns = rhs if rhs.ndim == 1 else rhs.reshape(self._size, -1)
+        return self.iterate(columns).values.reshape(rhs.shape).to(rhs)
 
     def refreshed(self, values: Float[Tensor, " entry"]) -> "Multigrid":
         """Prepare the matrix with other values of the same entries.

@@ -1,13 +1,17 @@
 """One door to the solvers of sparse matrices: whichever suits size and device."""
 
+from contextlib import suppress
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.sparse import csr_array
 from torch import Tensor
 
-from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid
-from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.hierarchy import Hierarchy, sparse_product
+from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid, solve_with_hierarchy
+from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 from pimper_torch.linalg.sparse import SparseCholesky
 
 # Here a factor takes three times as long to make as a hierarchy, and a third as long to use; it
@@ -91,9 +95,45 @@ def solutions(
     return tuple(factor.solve(side) for side in sides)
 
 
+def solve_compressed(
+    matrix: csr_array,
+    sides: Float[Tensor, "unknown side"],
+    *,
+    what: str,
+    tolerance: float,
+    start: Float[Tensor, "unknown side"] | None = None,
+) -> Float[Tensor, "unknown side"]:
+    """Do what :func:`solutions` does for a matrix in compressed rows, without gradients.
+
+    Args:
+        matrix: Symmetric positive definite; float64.
+        sides: Right-hand sides, float64, on the CPU.
+        what: Names the system in errors.
+        tolerance: Of multigrid.
+        start: Where its iterations begin.
+
+    Raises:
+        SingularSystemError: See :func:`prepare`.
+    """
+    rows = np.repeat(np.arange(len(sides)), np.diff(matrix.indptr))
+    off = torch.from_numpy(matrix.data)[torch.from_numpy(rows != matrix.indices)]
+    if len(sides) > _CHOLESKY_UNKNOWNS and _mostly_negative(off):
+        diagonal = torch.from_numpy(matrix.diagonal())
+        refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
+        product = sparse_product(matrix, sides.device)
+        system = product, Hierarchy(matrix, sides.device), diagonal, sides, tolerance, what, start
+        with suppress(SingularSystemError):
+            return solve_with_hierarchy(*system).values
+    index = torch.from_numpy(rows), torch.from_numpy(matrix.indices).long()
+    return SparseCholesky(*index, torch.from_numpy(matrix.data), len(sides), what).solve(sides)
+
+
 def _like_a_laplacian(
     rows: Int[Tensor, " entry"], cols: Int[Tensor, " entry"], values: Float[Tensor, " entry"]
 ) -> bool:
-    off = values.detach()[rows != cols]
+    return _mostly_negative(values.detach()[rows != cols])
+
+
+def _mostly_negative(off: Float[Tensor, " entry"]) -> bool:
     positive = float(torch.where(off > 0, off, 0).sum())
     return positive <= _POSITIVE_SHARE * float(off.abs().sum())

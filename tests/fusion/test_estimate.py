@@ -4,6 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.fusion.estimate import fuse_evidence, noise_factor
 from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.metrics.derivatives import check_derivatives
@@ -145,18 +146,21 @@ def test_the_noise_is_told_in_spite_of_outliers(generator, outliers):
     assert abs(noise_factor(square) / 9 - 1) < (0.25 if outliers else 0.05)
 
 
-def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch):
+@pytest.mark.parametrize("kernels", ["numba", "torch"])
+def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch, kernels):
     kinds = [steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02), places(0 * smooth(), 0.1)]
     expected = fused(kinds)
     stuck = []
 
-    def refusing(self, rhs):
-        stuck.append(rhs)
+    def refusing(*told):
+        stuck.append(told)
         raise SingularSystemError("no convergence")
 
     monkeypatch.setattr("pimper_torch.linalg.systems._CHOLESKY_UNKNOWNS", 100)
     monkeypatch.setattr(Multigrid, "solve", refusing)
-    found = fused(kinds)
+    monkeypatch.setattr("pimper_torch.linalg.systems.solve_with_hierarchy", refusing)
+    with using(kernels):
+        found = fused(kinds)
     assert stuck
     assert_close(found.heights, expected.heights)
     assert found.factors == pytest.approx(expected.factors)

@@ -1,0 +1,104 @@
+"""Products with sparse matrices in compressed rows, fused with what multigrid does with them.
+
+Vectors have one column a right-hand side, so that a matrix is read once for all of them. Every
+function works on the rows from ``first`` up to ``last`` alone.
+"""
+
+import numpy as np
+
+from pimper_torch.kernels.switch import compiled
+
+Array = np.ndarray
+
+_MATRIX = "int32[::1], int32[::1], float64[::1]"
+_VECTORS = "float64[:,::1]"
+
+
+@compiled(f"void({_MATRIX}, {_VECTORS}, {_VECTORS}, float64, float64, int64, int64)")
+def product(
+    starts: Array,
+    columns: Array,
+    entries: Array,
+    vectors: Array,
+    found: Array,
+    keep: float,
+    gain: float,
+    first: int,
+    last: int,
+) -> None:
+    """Write ``keep * found + gain * A @ vectors`` to ``found``."""
+    width = vectors.shape[1]
+    if width == 1:
+        for row in range(first, last):
+            one = 0.0
+            for place in range(starts[row], starts[row + 1]):
+                one += entries[place] * vectors[columns[place], 0]
+            found[row, 0] = keep * found[row, 0] + gain * one
+    elif width == 2:
+        for row in range(first, last):
+            one, two = 0.0, 0.0
+            for place in range(starts[row], starts[row + 1]):
+                column, entry = columns[place], entries[place]
+                one += entry * vectors[column, 0]
+                two += entry * vectors[column, 1]
+            found[row, 0] = keep * found[row, 0] + gain * one
+            found[row, 1] = keep * found[row, 1] + gain * two
+    else:
+        for row in range(first, last):
+            for side in range(width):
+                found[row, side] *= keep
+            for place in range(starts[row], starts[row + 1]):
+                column, entry = columns[place], gain * entries[place]
+                for side in range(width):
+                    found[row, side] += entry * vectors[column, side]
+
+
+@compiled(
+    f"void({_MATRIX}, float64[::1], {_VECTORS}, {_VECTORS}, {_VECTORS}, {_VECTORS}, "
+    "float64, float64, int64, int64)"
+)
+def corrected(
+    starts: Array,
+    columns: Array,
+    entries: Array,
+    inverse_diagonal: Array,
+    residual: Array,
+    step: Array,
+    start: Array,
+    found: Array,
+    of_step: float,
+    of_rest: float,
+    first: int,
+    last: int,
+) -> None:
+    """Write ``start + of_step * step + of_rest * D^-1 (residual - A @ step)`` to ``found``.
+
+    ``found`` may be ``start`` or ``residual``, but not ``step``.
+    """
+    width = step.shape[1]
+    if width == 1:
+        for row in range(first, last):
+            rest = residual[row, 0]
+            for place in range(starts[row], starts[row + 1]):
+                rest -= entries[place] * step[columns[place], 0]
+            found[row, 0] = (
+                start[row, 0] + of_step * step[row, 0] + of_rest * inverse_diagonal[row] * rest
+            )
+    elif width == 2:
+        for row in range(first, last):
+            rest, more = residual[row, 0], residual[row, 1]
+            for place in range(starts[row], starts[row + 1]):
+                column, entry = columns[place], entries[place]
+                rest -= entry * step[column, 0]
+                more -= entry * step[column, 1]
+            gain = of_rest * inverse_diagonal[row]
+            found[row, 0] = start[row, 0] + of_step * step[row, 0] + gain * rest
+            found[row, 1] = start[row, 1] + of_step * step[row, 1] + gain * more
+    else:
+        for row in range(first, last):
+            gain = of_rest * inverse_diagonal[row]
+            for side in range(width):
+                rest = residual[row, side]
+                for place in range(starts[row], starts[row + 1]):
+                    rest -= entries[place] * step[columns[place], side]
+                found[row, side] = start[row, side] + of_step * step[row, side] + gain * rest

@@ -1,0 +1,29 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.linalg.equations import compressed_equations, normal_equations
+
+
+@pytest.mark.parametrize("real", [torch.float32, torch.float64])
+def test_compressed_rows_are_those_of_the_entries(real):
+    generator = torch.Generator().manual_seed(4)
+    size = 40
+    hold = torch.rand(size, generator=generator, dtype=torch.float64) + 0.1
+    start = torch.randn(size, generator=generator, dtype=real)
+    kinds, dense, side = [], torch.diag(hold), hold * start
+    for terms, count in ((2, 90), (1, 25), (3, 10), (1, 0)):
+        unknowns = torch.randint(0, size, (count, terms), generator=generator)
+        coefficients = torch.randn(count, terms, generator=generator, dtype=real)
+        targets = torch.randn(count, generator=generator, dtype=real)
+        weights = torch.rand(count, generator=generator, dtype=torch.float64)
+        kinds.append((unknowns, coefficients, targets, weights))
+        wide = unknowns, coefficients.double(), targets.double(), weights
+        rows, cols, values, told = normal_equations(*wide, size)
+        dense = dense.index_put((rows, cols), values, accumulate=True)
+        side = side + told
+    matrix, found = compressed_equations(kinds, hold, start)
+    assert_close(torch.from_numpy(matrix.toarray()), dense)
+    assert_close(found, side)
+    assert matrix.has_sorted_indices
+    assert matrix.has_canonical_format  # each entry once
