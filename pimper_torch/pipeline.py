@@ -177,14 +177,15 @@ class Pimper(nn.Module):
         coarse = self._coarse(scene, outlines, rims, mesh)
         swept: SweptPatches | None = None
         surface: Surface | None = None
-        for scale in self.config.rounds.scales:
+        last = len(self.config.rounds.scales)
+        for number, scale in enumerate(self.config.rounds.scales, start=1):
             if surface is not None:
                 coarse = self.adapt(swept, surface, rims)
             patches = self.decompose(coarse, cameras, surface, scale)
             seen = self.warp(views, cameras, patches)
             photometric = self.factorize(seen)
             swept = self.sweep(views, cameras, seen, photometric)
-            surface = self.mend(self.fuse(swept, rims))
+            surface = self.mend(self.fuse(swept, rims, expected=number == last))
         assert swept is not None  # there is a round at least
         assert surface is not None
         return swept, surface

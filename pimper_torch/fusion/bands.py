@@ -15,36 +15,47 @@ from torch import Tensor
 
 from pimper_torch.geometry.lattice import Lattice
 from pimper_torch.linalg.equations import normal_equations
-from pimper_torch.linalg.systems import solutions
+from pimper_torch.linalg.systems import prepare
 
 # Weight that a corner is held to zero by, beside 1 for every vertex of the lattice: it decides
 # nothing.
 _HOLD = 1e-3
 
 
-def coarse_part(
-    values: Float[Tensor, " vertex"], lattice: Lattice, facets: Int[Tensor, "facet 3"]
-) -> Float[Tensor, " vertex"]:
-    """Give the continuous function linear on every facet that is nearest to values.
+class CoarsePart:
+    """Gives the continuous function linear on every facet that is nearest to values.
 
     Args:
-        values: At the lattice's vertices.
         lattice: The facets, subdivided.
         facets: The coarse mesh's faces.
-
-    Differentiable.
     """
-    size = int(facets.max()) + 1
-    corner, share = facets[lattice.facet], lattice.barycentric.double()
-    row, col, entry, right = normal_equations(
-        corner, share, values.double(), torch.ones_like(values, dtype=torch.float64), size
-    )
-    each = torch.arange(size, device=values.device)
-    (at,) = solutions(
-        torch.cat([each, row]),
-        torch.cat([each, col]),
-        torch.cat([torch.full_like(each, _HOLD, dtype=entry.dtype), entry]),
-        right,
-        what="the fusion's coarse shape",
-    )
-    return lattice.interpolate(at[:, None], facets)[:, 0].to(values)
+
+    def __init__(self, lattice: Lattice, facets: Int[Tensor, "facet 3"]) -> None:
+        self._lattice, self._facets = lattice, facets
+        self._corner, self._share = facets[lattice.facet], lattice.barycentric.double()
+        self._size = int(facets.max()) + 1
+        row, col, entry, _ = normal_equations(
+            self._corner,
+            self._share,
+            torch.zeros_like(self._share[:, 0]),
+            torch.ones_like(self._share[:, 0]),
+            self._size,
+        )
+        each = torch.arange(self._size, device=facets.device)
+        held = torch.full_like(each, _HOLD, dtype=entry.dtype)
+        self._normal = prepare(
+            torch.cat([each, row]),
+            torch.cat([each, col]),
+            torch.cat([held, entry]),
+            self._size,
+            "the fusion's coarse shape",
+        )
+
+    def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
+        """Give it at the lattice's vertices, in one column or several. Differentiable."""
+        columns = values.double().reshape(len(values), -1)
+        told = self._share[..., None] * columns[:, None]
+        side = told.new_zeros(self._size, columns.shape[1])
+        side = side.index_add(0, self._corner.flatten(), told.flatten(0, 1))
+        at = self._normal.solve(side)
+        return self._lattice.interpolate(at, self._facets).to(values).reshape(values.shape)

@@ -6,6 +6,7 @@ further order; but it would tie these a thousand times as strongly as slopes do,
 wrong sign for multigrid.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,21 @@ from torch import Tensor
 from pimper_torch.fusion.evidence import LEAST_FACING, Evidence
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import FacetPoints, Record, RimPoints
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Contacts(Record):
+    """Places that the surface passes through.
+
+    Attributes:
+        places: World.
+        lines: Along which they are known, unit.
+        variance: Of where they are along these; scene units squared.
+    """
+
+    places: Float[Tensor, "place 3"]
+    lines: Float[Tensor, "place 3"]
+    variance: Float[Tensor, " place"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -45,46 +61,53 @@ class Ground(Record):
         return self.directions[torch.as_tensor(nearest, device=self.faces.device)]
 
 
-def cloud_points(points: FacetPoints, ground: Ground) -> Evidence:
-    """Say that points of the cloud lie on the surface.
+def cloud_points(points: FacetPoints, ground: Ground) -> Contacts:
+    """Let the surface pass through points of the cloud; lines are the directions nearest to them.
 
-    Differentiable; which vertex and which face are nearest is constant.
+    Differentiable; which vertex is nearest is constant.
     """
     line = ground.lines_at(points.points_world)
     covariance = points.covariance_world.to(line)
     variance = torch.einsum("pi,pij,pj->p", line, covariance, line)
-    return _passing(points.points_world.to(line), line, variance, ground)
+    return Contacts(places=points.points_world.to(line), lines=line, variance=variance)
 
 
-def rim_tangents(rims: RimPoints, ground: Ground) -> Evidence:
-    """Say that the surface touches the rays through the outlines.
+def rim_tangents(rims: RimPoints, ground: Ground) -> Contacts:
+    """Let the surface touch the rays through the outlines.
 
     A ray lies in the plane that touches the surface there, so that where on the ray the place is
     matters little. Where directions run along that plane, heights cannot bring the surface to it.
 
-    Differentiable; where the rays touch, and which vertex and face are nearest, is constant.
+    Differentiable; where the rays touch, and which vertex is nearest, is constant.
     """
     line = ground.lines_at(rims.points_world)
     facing = (line * rims.normals_world.to(line)).sum(dim=-1)
     told = facing.detach() > LEAST_FACING
-    variance = rims.variance.to(line)[told] / facing[told].square()
-    return _passing(rims.points_world.to(line)[told], line[told], variance, ground)
+    return Contacts(
+        places=rims.points_world.to(line)[told],
+        lines=line[told],
+        variance=rims.variance.to(line)[told] / facing[told].square(),
+    )
 
 
-def _passing(
-    places: Float[Tensor, "place 3"],
-    line: Float[Tensor, "place 3"],
-    variance: Float[Tensor, " place"],
-    ground: Ground,
-) -> Evidence:
-    """Say that the surface passes through places, known along their lines by a variance."""
-    hits = _above_or_below(ground.places, ground.faces, places, line)
+def passing(contacts: Sequence[Contacts], ground: Ground) -> list[Evidence]:
+    """Say that the surface passes through places, kind by kind.
+
+    Differentiable; which face is nearest is constant.
+    """
+    caster = RayCaster(ground.places, ground.faces) if contacts else None
+    return [_passing(each, ground, caster) for each in contacts if caster is not None]
+
+
+def _passing(contacts: Contacts, ground: Ground, caster: RayCaster) -> Evidence:
+    line = contacts.lines
+    hits = _above_or_below(caster, ground, contacts.places, line)
     lift = -hits.distance
     met = (hits.face >= 0) & (lift.abs() <= ground.reach)
     corners, share, line = ground.faces[hits.face[met]], hits.barycentric[met], line[met]
     vertex = corners.gather(1, share.argmax(dim=1, keepdim=True))
     facing = (ground.directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(LEAST_FACING)
-    variance = variance[met]
+    variance = contacts.variance[met]
     return Evidence(
         unknowns=vertex,
         coefficients=torch.ones_like(facing)[:, None],
@@ -95,13 +118,12 @@ def _passing(
 
 
 def _above_or_below(
-    surface: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
+    caster: RayCaster,
+    ground: Ground,
     places: Float[Tensor, "point 3"],
     line: Float[Tensor, "point 3"],
 ) -> Hits:
     """Find where the line through each place meets the nearer of the faces on both sides."""
-    caster = RayCaster(surface, faces)
     ahead, behind = caster.cast(places, line), caster.cast(places, -line)
     first = ahead.distance <= behind.distance
     nearer = Hits(
@@ -109,4 +131,4 @@ def _above_or_below(
         distance=torch.where(first, ahead.distance, -behind.distance),
         barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
     )
-    return nearer.refined(surface, faces, places, line)
+    return nearer.refined(ground.places, ground.faces, places, line)

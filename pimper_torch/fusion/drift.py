@@ -40,10 +40,9 @@ class Drift(Record):
     count: Float[Tensor, " facet"]
     known: Bool[Tensor, " facet"]
 
-    def common(self, lattice: Lattice) -> Common:
+    def variance(self) -> Float[Tensor, ""]:
         """Give the variance of a tilt, robustly, for normals that still have theirs."""
-        square = self.tilt[self.known].square().sum(dim=-1)
-        return Common(variance=square.median() / MEDIAN_OF_TILT, count=self.count[lattice.facet])
+        return self.tilt[self.known].square().sum(dim=-1).median() / MEDIAN_OF_TILT
 
     def at(self, lattice: Lattice, facets: Int[Tensor, "facet 3"]) -> Float[Tensor, "vertex 3"]:
         """Blend the tilts over the lattice, continuous across facets."""
@@ -84,13 +83,13 @@ def drift(
     return Drift(tilt=summed / count.clamp_min(1)[:, None], count=count, known=count > 0)
 
 
-def common_height(
+def common_variance(
     found: Evidence,
     heights: Float[Tensor, " vertex"],
     facet: Int[Tensor, " vertex"],
     held: Int[Tensor, " place"],
-) -> Common:
-    """Tell what swept heights of one facet are too high by together.
+) -> Float[Tensor, ""]:
+    """Tell by which variance swept heights of one facet are too high together.
 
     Args:
         found: The heights; one equation has one unknown.
@@ -108,6 +107,12 @@ def common_height(
     mean = off.new_zeros(size).index_add(0, facet[vertex], weight * off)
     judged = torch.zeros_like(total, dtype=torch.bool).index_fill(0, held, True) & (total > 0)
     square = (mean[judged] / total[judged]).square()
-    count = torch.bincount(facet[vertex], minlength=size)[facet].to(off)
-    variance = square.median() / _MEDIAN_SQUARE if len(square) > 0 else off.new_zeros(())
-    return Common(variance=variance, count=count)
+    return square.median() / _MEDIAN_SQUARE if len(square) > 0 else off.new_zeros(())
+
+
+def alike(
+    variance: Float[Tensor, ""], facet: Int[Tensor, " vertex"], told: Bool[Tensor, " vertex"]
+) -> Common:
+    """Say that what is told of the vertices of one facet errs by a variance together."""
+    count = torch.bincount(facet[told], minlength=int(facet.max()) + 1)
+    return Common(variance=variance, count=count[facet].to(variance))

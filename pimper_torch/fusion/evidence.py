@@ -188,7 +188,7 @@ def swept_heights(
         correlated: Vertices in a window, which have one offset.
         common: What neighbours are too high by alike, in windows of their own.
     """
-    known = ((information > 0) & (facing > LEAST_FACING)).nonzero()[:, 0]
+    known = upright_heights(information, facing).nonzero()[:, 0]
     steep = facing[known]
     together = 1 / (information[known] * steep.square())
     each = together / correlated
@@ -202,3 +202,10 @@ def swept_heights(
         information=1 / together,
         correlated=together / each,
     )
+
+
+def upright_heights(
+    information: Float[Tensor, " vertex"], facing: Float[Tensor, " vertex"]
+) -> Bool[Tensor, " vertex"]:
+    """Mark vertices whose swept offsets tell heights."""
+    return (information > 0) & (facing > LEAST_FACING)

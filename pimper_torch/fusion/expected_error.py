@@ -22,13 +22,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.fusion.bands import coarse_part
+from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.estimate import Fused
 from pimper_torch.fusion.evidence import Evidence
 from pimper_torch.geometry.lattice import Lattice
 from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.linalg.multigrid import Multigrid
-from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.systems import prepare
 
 # Side of the regions that err alike, in edges of a facet of usual size. Errors of the fused
@@ -65,23 +63,36 @@ def expected_error(
         SingularSystemError: See :func:`~pimper_torch.linalg.systems.prepare`.
     """
     generator = torch.Generator().manual_seed(0)  # of noise: any will do
-    systems = [_prepared(one) for one in ((coarse,) if fine is coarse else (coarse, fine))]
     region = regions(lattice)
-    square = torch.zeros_like(coarse.heights)
+    noises, held = [], []
     for _ in range(draws):
-        noise = [
-            _noise(kind, weight, factor, lattice, region, generator)
-            for kind, weight, factor in zip(
-                coarse.kinds, coarse.weights, coarse.factors, strict=True
-            )
-        ]
-        held = _normal(generator, coarse.hold) / coarse.hold.double().sqrt()
-        off = systems[0].solve(_answerable(coarse, noise, held))
-        if fine is not coarse:
-            detail = systems[1].solve(_answerable(fine, noise, held))
-            off = detail + coarse_part(off - detail, lattice, facets)
-        square = square + off.square()
-    return (square / draws).sqrt()
+        noises.append(
+            [
+                _noise(kind, weight, factor, lattice, region, generator)
+                for kind, weight, factor in zip(
+                    coarse.kinds, coarse.weights, coarse.factors, strict=True
+                )
+            ]
+        )
+        held.append(_normal(generator, coarse.hold) / coarse.hold.double().sqrt())
+    off = _answers(coarse, noises, held)
+    if fine is not coarse:
+        detail = _answers(fine, noises, held)
+        off = detail + CoarsePart(lattice, facets)(off - detail)
+    return off.square().mean(dim=1).sqrt()
+
+
+def _answers(
+    fused: Fused,
+    noises: list[list[Float[Tensor, " _"]]],
+    held: list[Float[Tensor, " vertex"]],
+) -> Float[Tensor, "vertex draw"]:
+    """Give the heights' answers to errors of the targets, all draws at once."""
+    sides = [_answerable(fused, *each) for each in zip(noises, held, strict=True)]
+    rows, cols, values = fused.matrix()
+    what = "the expected error"
+    system = prepare(rows, cols, values, len(fused.heights), what, tolerance=_ACCURACY)
+    return system.solve(torch.stack(sides, dim=1))
 
 
 def regions(lattice: Lattice) -> Int[Tensor, " facet"]:
@@ -96,13 +107,6 @@ def regions(lattice: Lattice) -> Int[Tensor, " facet"]:
     edge = (4 / math.sqrt(3) * area[area > 0].median()).sqrt()  # of an equilateral facet
     _, label = torch.unique((middle / (_ALIKE * edge)).floor(), dim=0, return_inverse=True)
     return label
-
-
-def _prepared(fused: Fused) -> SparseCholesky | Multigrid:
-    rows, cols, values = fused.matrix()
-    return prepare(
-        rows, cols, values, len(fused.heights), "the expected error", tolerance=_ACCURACY
-    )
 
 
 def _noise(

@@ -19,7 +19,7 @@ from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.lattice import Lattice
 from pimper_torch.geometry.reliefs import intersect_relief, sample_raster
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.progress import track
+from pimper_torch.parallel import side_by_side
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
@@ -110,16 +110,19 @@ def unite(
     patches and samples are blended is constant.
     """
     coarse = depths.patches.coarse
-    held = torch.bincount(lattice.facet, minlength=len(coarse.mesh.faces)).tolist()
-    vertices_of = torch.split(lattice.facet.argsort(stable=True), held)
+    faces = coarse.mesh.faces
+    vertices = _Lists.of(lattice.facet, torch.arange(len(lattice.points)).to(faces), len(faces))
+    around = _facets_around(faces)
     heights = swept if swept is not None else [None] * len(depths.buckets)
     buckets = zip(
         depths.patches.buckets, depths.buckets, depths.photometric.buckets, heights, strict=True
     )
-    estimates = [
-        _estimates(coarse, *bucket, lattice, directions, vertices_of)
-        for bucket in track(list(buckets))
-    ]
+    estimates = list(
+        side_by_side(
+            lambda bucket: _estimates(coarse, *bucket, lattice, directions, around, vertices),
+            list(buckets),
+        )
+    )
     joined = _Estimates(
         vertex=torch.cat([one.vertex for one in estimates]),
         height=torch.cat([one.height for one in estimates]),
@@ -156,13 +159,12 @@ def _estimates(
     swept: Heights | None,
     lattice: Lattice,
     directions: Float[Tensor, "vertex 3"],
-    vertices_of: Sequence[Int[Tensor, "..."]],
+    around: "_Lists",
+    vertices: "_Lists",
 ) -> _Estimates:
     """Intersect the rays near each patch of a bucket with its relief."""
     corners, bands = _bands(coarse, templates)
-    vertex, present = _rays_near(
-        coarse, templates, corners, bands, lattice, directions, vertices_of
-    )
+    vertex, present = _rays_near(templates, corners, bands, lattice, directions, around, vertices)
     origins = transform(templates.patch_from_world, lattice.points[vertex])
     along = rotate(templates.patch_from_world, directions[vertex])
     points, hit = intersect_relief(
@@ -212,48 +214,68 @@ def _bands(
 
 
 def _rays_near(
-    coarse: CoarseMesh,
     templates: Templates,
     corners: Float[Tensor, "patch 3 2"],
     bands: Float[Tensor, "patch 3"],
     lattice: Lattice,
     directions: Float[Tensor, "vertex 3"],
-    vertices_of: Sequence[Int[Tensor, "..."]],
+    around: "_Lists",
+    vertices: "_Lists",
 ) -> tuple[Int[Tensor, "patch ray"], Bool[Tensor, "patch ray"]]:
     """List, for each patch, the vertices of its facet and of those around it that it may know.
 
     Returns:
         Vertices, padded with 0, and which entries are meant.
     """
-    from_patch = _barycentric_map(corners)
-    near = []
-    for patch, around in enumerate(_facets_around(coarse, templates.facet)):
-        vertex = torch.cat([vertices_of[facet] for facet in around])
-        frame = templates.patch_from_world[patch]
-        start = lattice.points[vertex] @ frame[:3, :3].T + frame[:3, 3]
-        along = directions[vertex] @ frame[:3, :3].T
-        facing = along[:, 2] < -_FACING
-        distance = -start[:, 2] / torch.where(facing, along[:, 2], 1)
-        crossing = start[:, :2] + distance[:, None] * along[:, :2]
-        barycentric = crossing @ from_patch[patch, :, :2].T + from_patch[patch, :, 2]
-        close = (barycentric > -(1 + _SLACK_BANDS) * bands[patch]).all(dim=-1)
-        near.append(vertex[facing & close])
-    listed = pad_sequence(near, batch_first=True)
-    counts = torch.tensor([len(vertex) for vertex in near], device=listed.device)
+    patch, facet = around.take(templates.facet)
+    place, vertex = vertices.take(facet)
+    patch = patch[place]
+    frame, from_patch = templates.patch_from_world, _barycentric_map(corners)
+    start = transform(frame[patch], lattice.points[vertex, None])[:, 0]
+    along = rotate(frame[patch], directions[vertex, None])[:, 0]
+    facing = along[:, 2] < -_FACING
+    distance = -start[:, 2] / torch.where(facing, along[:, 2], 1)
+    crossing = start[:, :2] + distance[:, None] * along[:, :2]
+    barycentric = (from_patch[patch, :, :2] @ crossing[..., None])[..., 0] + from_patch[patch, :, 2]
+    close = (barycentric > -(1 + _SLACK_BANDS) * bands[patch]).all(dim=-1)
+    near = facing & close
+    counts = torch.bincount(patch[near], minlength=len(templates.facet))
+    listed = pad_sequence(vertex[near].split(counts.tolist()), batch_first=True)
     return listed, torch.arange(listed.shape[1], device=listed.device) < counts[:, None]
 
 
-def _facets_around(coarse: CoarseMesh, facets: Int[Tensor, " patch"]) -> list[list[int]]:
-    """List, for each facet, itself and the facets that share a corner with it."""
-    at_corner: dict[int, list[int]] = {}
-    faces: list[list[int]] = coarse.mesh.faces.tolist()
-    for facet, face in enumerate(faces):
-        for corner in face:
-            at_corner.setdefault(corner, []).append(facet)
-    return [
-        sorted({facet for corner in faces[own] for facet in at_corner[corner]})
-        for own in facets.tolist()
-    ]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Lists:
+    """Numbers in lists of different lengths, in a row."""
+
+    start: Int[Tensor, " list"]
+    count: Int[Tensor, " list"]
+    number: Int[Tensor, " entry"]
+
+    @staticmethod
+    def of(which: Int[Tensor, " entry"], number: Int[Tensor, " entry"], size: int) -> "_Lists":
+        """Put each number into the list that it belongs to."""
+        order = which.argsort(stable=True)
+        count = torch.bincount(which, minlength=size)
+        return _Lists(start=count.cumsum(0) - count, count=count, number=number[order])
+
+    def take(
+        self, which: Int[Tensor, " taken"]
+    ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"]]:
+        """Give the numbers of some lists, and at which place of these each stands."""
+        count = self.count[which]
+        place = torch.arange(len(which), device=which.device).repeat_interleave(count)
+        within = torch.arange(len(place), device=which.device) - (count.cumsum(0) - count)[place]
+        return place, self.number[self.start[which][place] + within]
+
+
+def _facets_around(faces: Int[Tensor, "facet 3"]) -> _Lists:
+    """List, for each facet, itself and the facets that share a corner with it, in order."""
+    own = torch.arange(len(faces), device=faces.device)[:, None].expand_as(faces).flatten()
+    corner = faces.flatten()
+    place, facet = _Lists.of(corner, own, int(corner.max()) + 1).take(corner)
+    pairs = torch.unique(torch.stack([own[place], facet], dim=1), dim=0)
+    return _Lists.of(pairs[:, 0], pairs[:, 1], len(faces))
 
 
 def _barycentric_map(corners: Float[Tensor, "patch 3 2"]) -> Float[Tensor, "patch 3 3"]:

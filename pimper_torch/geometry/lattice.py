@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pimper_torch.geometry.surfaces import face_edges, face_normals
@@ -22,6 +23,10 @@ from pimper_torch.records import Record
 # of the same area: those of a half square's diagonal, and at most 2 points a spacing squared,
 # where the equilateral lattice has 1.2.
 _MOST_PIECES = 1.32
+
+# Vertices that a value is blended from, as many as a face has; and a distance, scene units, at
+# which one counts alone.
+_BLENDED, _TOGETHER = 3, 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -98,6 +103,23 @@ def subdivide(
         first_inner=len(vertices) + int((pieces - 1).sum()),
     )
     return _assemble(vertices, facets, cuts)
+
+
+def transferred(
+    values: Float[Tensor, " vertex"], source: Lattice, target: Lattice
+) -> Float[Tensor, " vertex"]:
+    """Give values known on one lattice at the vertices of another over the same facets.
+
+    They are blended from the three nearest vertices, by the inverse of the distance. For what is
+    smooth. A constant to autograd but in ``values``.
+    """
+    tree = cKDTree(source.points.detach().cpu().double().numpy())
+    asked = target.points.detach().cpu().double().numpy()
+    count = min(_BLENDED, len(source.points))
+    apart, near = tree.query(asked, k=list(range(1, count + 1)), workers=-1)
+    closeness = 1 / torch.from_numpy(apart).clamp_min(_TOGETHER)
+    share = (closeness / closeness.sum(dim=1, keepdim=True)).to(values)
+    return (share * values[torch.from_numpy(near).to(values.device)]).sum(dim=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

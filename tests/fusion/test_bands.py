@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.fusion.bands import coarse_part
+from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.geometry.lattice import subdivide
 
 FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
@@ -17,22 +17,22 @@ def lattice():
 def test_what_is_linear_on_every_facet_is_coarse_whole(lattice):
     corners = torch.tensor([0.3, -1.0, 2.0, 0.7], dtype=torch.float64)
     values = lattice.interpolate(corners[:, None], FACETS)[:, 0]
-    assert_close(coarse_part(values, lattice, FACETS), values, rtol=0, atol=1e-4)
+    assert_close(CoarsePart(lattice, FACETS)(values), values, rtol=0, atol=1e-4)
 
 
 def test_a_needle_and_waves_are_none_of_it(lattice):
     needle = torch.zeros(len(lattice.points), dtype=torch.float64)
     needle[len(needle) // 2] = 1.0
-    assert coarse_part(needle, lattice, FACETS).abs().max() < 0.01
+    assert CoarsePart(lattice, FACETS)(needle).abs().max() < 0.01
     waves = torch.sin(60 * lattice.points[:, 0]) * torch.sin(60 * lattice.points[:, 1])
-    assert coarse_part(waves, lattice, FACETS).abs().max() < 0.05
+    assert CoarsePart(lattice, FACETS)(waves).abs().max() < 0.05
 
 
 def test_it_is_the_nearest_and_can_be_differentiated(lattice):
     generator = torch.Generator().manual_seed(79)
     values = torch.randn(len(lattice.points), generator=generator, dtype=torch.float64)
     values.requires_grad_()
-    found = coarse_part(values, lattice, FACETS)
+    found = CoarsePart(lattice, FACETS)(values)
     # What is left is at right angles to all functions that are linear on the facets.
     for corner in torch.eye(4, dtype=torch.float64):
         hat = lattice.interpolate(corner[:, None], FACETS)[:, 0]

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.drift import common_height, drift
+from pimper_torch.fusion.drift import alike, common_variance, drift
 from pimper_torch.fusion.evidence import swept_heights
 from pimper_torch.geometry.lattice import subdivide
 
@@ -64,7 +64,8 @@ def test_the_variance_of_tilts_is_told_whatever_their_number():
     tilts = 0.02 * torch.randn(600, 2, generator=generator).double()
     normals = torch.cat([tilts, torch.ones(600, 1).double()], dim=1)[lattice.facet]
     known = torch.ones(len(shape), dtype=torch.bool)
-    found = drift(lattice, facets, normals, shape, known).common(lattice)
+    variance = drift(lattice, facets, normals, shape, known).variance()
+    found = alike(variance, lattice.facet, known)
     assert float(found.variance) == pytest.approx(0.02**2, rel=0.15)
     assert_close(found.count, torch.bincount(lattice.facet).double()[lattice.facet])
 
@@ -73,16 +74,17 @@ def test_what_heights_of_a_facet_are_off_by_together_is_told_where_it_can_be():
     facet = torch.arange(800).repeat_interleave(50)
     generator = torch.Generator().manual_seed(78)
     nothing = torch.zeros(len(facet), dtype=torch.float64)
-    alike = 0.3 * torch.randn(800, generator=generator).double()
+    shared = 0.3 * torch.randn(800, generator=generator).double()
     own = torch.randn(len(facet), generator=generator).double()
-    alike[400:] += 10  # where nothing else is known, the surface may be wrong instead
-    alike[:10] = 5.0
+    shared[400:] += 10  # where nothing else is known, the surface may be wrong instead
+    shared[:10] = 5.0
     information = torch.ones_like(nothing)
     information[facet == 399] = 0
     found = swept_heights(
-        nothing, alike[facet] + 0.1 * own, information, torch.ones_like(nothing), 1.0
+        nothing, shared[facet] + 0.1 * own, information, torch.ones_like(nothing), 1.0
     )
-    common = common_height(found, nothing, facet, torch.arange(400).repeat(2))
+    variance = common_variance(found, nothing, facet, torch.arange(400).repeat(2))
+    common = alike(variance, facet, information > 0)
     assert float(common.variance) == pytest.approx(0.3**2, rel=0.15)
     assert common.count[facet != 399].unique().tolist() == [50]
     assert common.count[facet == 399].unique().tolist() == [0]
@@ -92,5 +94,5 @@ def test_heights_that_nothing_else_can_judge_are_taken_at_their_word():
     facet = torch.zeros(4, dtype=torch.long)
     ones = torch.ones(4, dtype=torch.float64)
     found = swept_heights(0 * ones, ones, ones, ones, 1.0)
-    nowhere = common_height(found, 0 * ones, facet, torch.zeros(0, dtype=torch.long))
-    assert float(nowhere.variance) == 0
+    nowhere = common_variance(found, 0 * ones, facet, torch.zeros(0, dtype=torch.long))
+    assert float(nowhere) == 0

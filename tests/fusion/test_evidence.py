@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.contacts import Ground, cloud_points, rim_tangents
+from pimper_torch.fusion.contacts import Ground, cloud_points, passing, rim_tangents
 from pimper_torch.fusion.evidence import (
     Common,
     kept_slopes,
@@ -18,6 +18,11 @@ from pimper_torch.metrics.derivatives import check_derivatives
 from pimper_torch.records import FacetPoints, RimPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def told_of(contacts, known, ground):
+    """Give what places say of the surface that they are found on."""
+    return passing([contacts(known, ground)], ground)[0]
 
 
 @pytest.fixture
@@ -148,7 +153,7 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
         reach=1.0,
         finest=1e-9,
     )
-    found = cloud_points(cloud, ground)
+    found = told_of(cloud_points, cloud, ground)
     assert len(found.targets) == 40
     assert found.unknowns.shape == (40, 1)
     assert_close(found.coefficients, torch.ones(40, 1).double())
@@ -159,7 +164,8 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
     # On a surface that leans, what it is lifted by is what it is off by at the point.
     leaning = lattice.points + (0.3 * lattice.points[:, :1]) * UP
     raised = torch.cat([xy, 0.3 * xy[:, :1] + 0.02], dim=1)
-    above = cloud_points(
+    above = told_of(
+        cloud_points,
         cloud.replace(points_world=raised),
         ground.replace(places=leaning, heights=leaning[:, 2], directions=UP.expand_as(along)),
     )
@@ -167,7 +173,7 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
     # Uncertain across, sure along: only what is across a slanting line blurs it.
     assert (1 / found.information < 0.05).all()
     assert (1 / found.information >= 1e-4).all()
-    near = cloud_points(cloud, ground.replace(reach=0.01))
+    near = told_of(cloud_points, cloud, ground.replace(reach=0.01))
     assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())
 
 
@@ -197,13 +203,13 @@ def test_rims_are_planes_that_touch_the_surface(lattice, generator):
         view=torch.zeros(30, dtype=torch.long),
         ray=torch.arange(30),
     )
-    found = rim_tangents(rims, ground)
+    found = told_of(rim_tangents, rims, ground)
     facing = float(along[0] @ normal)
     assert_close(found.targets, torch.full((30,), 0.04 / facing).double())
     assert_close(1 / found.information, torch.full((30,), 1e-4 / facing**2).double())
     # What a direction runs along cannot be reached by heights: nothing is said.
     beside = rims.replace(normals_world=torch.tensor([0.0, 1.0, 0.0]).double().expand(30, 3))
-    assert len(rim_tangents(beside, ground).targets) == 0
+    assert len(told_of(rim_tangents, beside, ground).targets) == 0
 
 
 @pytest.mark.parametrize("kind", ["slopes", "kept_slopes", "kept_steps", "swept_heights"])
@@ -275,7 +281,7 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(lattice
             reach=9.0,
             finest=1e-3,
         )
-        found = cloud_points(points, ground)
+        found = told_of(cloud_points, points, ground)
         return {"target": found.targets}
 
     inputs = {"heights": height, "points": places, "all": torch.zeros(()).double()}
@@ -312,7 +318,7 @@ def test_a_rim_stays_where_it_is_as_the_surface_is_raised(lattice, generator):
             reach=9.0,
             finest=1e-3,
         )
-        found = rim_tangents(rims, ground)
+        found = told_of(rim_tangents, rims, ground)
         return {"target": found.targets, "information": found.information}
 
     inputs = {

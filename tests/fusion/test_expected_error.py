@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.bands import coarse_part
+from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.estimate import fuse_evidence
 from pimper_torch.fusion.evidence import Evidence
 from pimper_torch.fusion.expected_error import expected_error, regions
@@ -138,7 +138,7 @@ def test_detail_of_one_solve_and_shape_of_another_err_by_the_same_noise(square):
     coarse = solved(lattice, tied, heights(lattice, 0.1))
     found = expected_error(fine, coarse, lattice, facets, DRAWS)
     eye = torch.eye(len(lattice.points)).double()
-    low = torch.stack([coarse_part(one, lattice, facets) for one in eye], dim=1)
+    low = torch.stack([CoarsePart(lattice, facets)(one) for one in eye], dim=1)
     (_, of_fine), (_, of_coarse) = dense(fine), dense(coarse)
     answer = of_fine + low @ (of_coarse - of_fine)
     # Noise is that of the coarse solve: in a region, edges share a part of it.

@@ -3,7 +3,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from pimper_torch.geometry.lattice import Lattice, subdivide
+from pimper_torch.geometry.lattice import Lattice, subdivide, transferred
 from pimper_torch.geometry.surfaces import face_normals
 
 
@@ -147,3 +147,19 @@ def test_points_carry_gradients_to_the_coarse_mesh():
     lattice.points.sum().backward()
     assert vertices.grad is not None
     assert_close(vertices.grad.sum(), torch.tensor(3.0 * len(lattice.points)).double())
+
+
+def test_what_is_smooth_is_transferred_from_a_coarser_lattice_over_the_same_facets():
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    fine, rough = (
+        subdivide(corners, facets, torch.full((2,), side).double()) for side in (0.02, 0.04)
+    )
+
+    def wave(lattice):
+        return 1 + torch.sin(3 * lattice.points[:, 0]) * lattice.points[:, 1]
+
+    off = transferred(wave(rough), rough, fine) - wave(fine)
+    assert off.abs().max() < 3.2 * 0.04 / 2  # the slope, over half a spacing
+    assert off.abs().mean() < 0.005
+    assert_close(transferred(wave(rough), rough, rough), wave(rough))
