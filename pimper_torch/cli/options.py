@@ -27,6 +27,9 @@ class CommonOptions:
         device: Where everything after structure from motion runs; cuda has never been run on a GPU.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         overwrite: Replace a former result in OUT.
+        full_mesh: Write every vertex that was found. Without it mesh.ply and mesh.glb have fewer
+            where the surface is smooth: those left out are within a tenth of a sample's spacing
+            of it, their normals within two degrees.
         cache: Folder where structure from motion is kept from run to run, so that a change of a
             later stage costs only the later stages; none unless given.
     """
@@ -36,6 +39,7 @@ class CommonOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     max_size_px: int = 0
     overwrite: Flag = False
+    full_mesh: Flag = False
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
 
 

@@ -67,7 +67,14 @@ def _write(job: Job, result: Reconstruction) -> None:
         "device": job.common.device,
         "torch": str(torch.__version__),
     }
-    write_result(result, job.config, job.out, overwrite=job.common.overwrite, about=about)
+    write_result(
+        result,
+        job.config,
+        job.out,
+        overwrite=job.common.overwrite,
+        about=about,
+        full_mesh=job.common.full_mesh,
+    )
 
 
 def _watched(bars: Bars, name: str, work: Callable[[], Output]) -> Output:
@@ -104,9 +111,10 @@ def _conclude(console: Console, job: Job, result: Reconstruction) -> None:
     for report in result.report:
         table.add_row(report.name, f"{report.seconds:.1f}", f"{report.peak_memory_mb:.0f}")
     console.print(table)
+    fewer = "" if job.common.full_mesh else " (simplified; --full-mesh writes every vertex)"
     console.print(headline(result), highlight=False)
     console.print(
-        f"{job.out}/mesh.ply is the surface, {job.out}/overview.png shows it.",
+        f"{job.out}/mesh.ply is the surface{fewer}, {job.out}/overview.png shows it.",
         highlight=False,
         soft_wrap=True,
     )

@@ -13,7 +13,8 @@ from torch import Tensor
 from pimper_torch.config import to_yaml
 from pimper_torch.io.accounts import lights_account, summary_account
 from pimper_torch.io.folders import written_whole
-from pimper_torch.io.meshes import write_glb, write_ply
+from pimper_torch.io.meshes import write_glb, write_ply, written_channels
+from pimper_torch.meshing.simplify import simplify
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Outlines, Reconstruction, SparseScene
 from pimper_torch.sfm.scene import write_model
@@ -43,6 +44,7 @@ def write_result(
     *,
     overwrite: bool = False,
     about: Mapping[str, object] | None = None,
+    full_mesh: bool = False,
 ) -> None:
     """Write everything a run found into a folder.
 
@@ -65,6 +67,11 @@ def write_result(
     `overview.png`   contact sheet, every photograph with its outline below
     ===============  ==============================================================
 
+    The mesh is simplified, unless ``full_mesh``: every vertex of ``result.mesh`` is within a tenth
+    of a sample's spacing of it, its normal within two degrees, and its colour, confidence and
+    expected error within :func:`~pimper_torch.io.meshes.written_channels` of what is blended
+    there (``summary.json`` tells how far off they are). The pictures show what is written.
+
     It is there whole or not at all; see :func:`pimper_torch.io.folders.written_whole`.
 
     Args:
@@ -73,17 +80,30 @@ def write_result(
         folder: New or empty; its parents are made.
         overwrite: Replace a former result.
         about: More for ``summary.json``.
+        full_mesh: Write every vertex.
 
     Raises:
         OutputError: The folder holds something else, or cannot be written.
     """
     folder = Path(folder)
     with written_whole(folder, RESULT_NAMES, overwrite=overwrite) as staging:
-        _write_all(result.to("cpu"), config, staging, about or {})
+        whole = result.to("cpu")
+        summary = summary_account(whole, about or {})
+        if not full_mesh:
+            found = simplify(whole.mesh, told=written_channels(whole.mesh))
+            whole = whole.replace(mesh=found.mesh)
+            summary["simplified"] = {
+                "vertices": len(found.mesh.vertices_world),
+                "faces": len(found.mesh.faces),
+                "spacing": found.spacing,
+                "max_spacings": found.max_spacings,
+                "max_angle_deg": found.max_angle_deg,
+            }
+        _write_all(whole, config, staging, summary)
 
 
 def _write_all(
-    result: Reconstruction, config: object, folder: Path, about: Mapping[str, object]
+    result: Reconstruction, config: object, folder: Path, summary: Mapping[str, object]
 ) -> None:
     write_ply(result.mesh, folder / "mesh.ply")
     write_glb(result.mesh, folder / "mesh.glb")
@@ -93,7 +113,7 @@ def _write_all(
     _write_maps(result, folder)
     _write_json(lights_account(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    _write_json(summary_account(result, about), folder / "summary.json", indent=2)
+    _write_json(summary, folder / "summary.json", indent=2)
     draw_overview(result, folder / "overview.png")
 
 

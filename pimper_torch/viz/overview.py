@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.geometry.projection import project
+from pimper_torch.meshing.simplify import with_few_faces
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
@@ -25,6 +26,7 @@ _ACROSS = 4
 _PANEL_IN, _GAP_IN, _TITLE_IN, _HEADLINE_IN = 3.9, 0.1, 0.35, 0.4
 _DPI = 100
 _THUMBNAILS_ACROSS = 8
+_MOST_FACES = 200_000  # more than a panel has pixels to show; rays take four times as long at 10^6
 _TALLEST = 1.6  # a panel that is higher for its width is shown narrower
 
 
@@ -153,6 +155,7 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     """Make the pictures of the contact sheet."""
     reference = result.coarse.reference
     own = result.cameras.take([reference])
+    shape = with_few_faces(result.mesh, _MOST_FACES)
     vertices = result.mesh.vertices_world
     camera = frame(own, vertices, panel_px, _MARGIN)
     name = result.scene.views.names[reference]
@@ -164,7 +167,7 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
         frame(turn(own, center, angle), vertices, panel_px, _MARGIN)
         for angle in (-_TURN_DEG, _TURN_DEG)
     ]
-    mesh, coarse = result.mesh, result.coarse.mesh
+    coarse = result.coarse.mesh
     return [
         Panel(title=f"photograph {name}", picture=photograph, inside=inside),
         Panel(
@@ -173,11 +176,11 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
             lines=facets,
         ),
         Panel(title="facets, shaded", picture=_array(shade(coarse, camera, flat=True))),
-        Panel(title="surface, shaded", picture=_array(shade(mesh, camera))),
+        Panel(title="surface, shaded", picture=_array(shade(shape, camera))),
         Panel(title="normals", picture=_array(normal_colors(maps.normals_cam))),
         Panel(title="albedo", picture=_array(_rgb(srgb_from_linear(albedo)))),
-        Panel(title=f"surface from {_TURN_DEG:.0f}° left", picture=_array(shade(mesh, sides[0]))),
-        Panel(title=f"surface from {_TURN_DEG:.0f}° right", picture=_array(shade(mesh, sides[1]))),
+        Panel(title=f"surface from {_TURN_DEG:.0f}° left", picture=_array(shade(shape, sides[0]))),
+        Panel(title=f"surface from {_TURN_DEG:.0f}° right", picture=_array(shade(shape, sides[1]))),
     ]
 
 

@@ -20,13 +20,13 @@ from pimper_torch.scenes.meshes import icosphere
 RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
-        "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
+        "--full-mesh --preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0)"
     ],
     "demo": [
         "-o {out} --preset fast --reference 38 --device cpu --max-size-px 60 --overwrite "
-        "--cache {out}_kept",
+        "--full-mesh --cache {out}_kept",
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "

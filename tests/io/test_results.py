@@ -12,14 +12,16 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import OutputError
 from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io import results
 from pimper_torch.io.accounts import common_lights, lights_account, summary_account, world_lights
 from pimper_torch.io.folders import prepare_output
-from pimper_torch.io.meshes import write_glb, write_ply
+from pimper_torch.io.meshes import read_mesh, write_glb, write_ply, written_channels
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.records import Outlines
+from pimper_torch.records import Mesh, Outlines
+from pimper_torch.scenes.meshes import icosphere
 from pimper_torch.viz.maps import albedo_scale
 
 
@@ -344,3 +346,45 @@ def test_outlines_are_written_as_masks_that_can_be_given(reconstruction, tmp_pat
     assert found == ["a.png", "b.png", "c.png"]
     drawn = np.array(Image.open(tmp_path / "out" / "masks" / "b.png"))
     assert np.array_equal(drawn > 0, inside[1].numpy() > 0.5)
+
+
+def test_the_written_mesh_is_simplified_and_the_summary_says_how_far(reconstruction, tmp_path):
+    vertices, faces = icosphere(4)
+    ball = Mesh(
+        vertices_world=vertices.float(),
+        faces=faces,
+        albedo=0.5 + 0.4 * vertices[:, :1].float(),
+        confidence=torch.ones(len(vertices)),
+        expected_error=torch.full((len(vertices),), 0.01),
+    )
+    result = reconstruction.replace(mesh=ball)
+    write_result(result, Config(), tmp_path / "few")
+    write_result(result, Config(), tmp_path / "all", full_mesh=True)
+    summaries = [
+        json.loads((tmp_path / name / "summary.json").read_text()) for name in ("few", "all")
+    ]
+    assert [summary["vertices"] for summary in summaries] == [len(vertices)] * 2
+    assert "simplified" not in summaries[1]
+    told = summaries[0]["simplified"]
+    few, whole = (read_mesh(tmp_path / name / "mesh.ply") for name in ("few", "all"))
+    assert len(few.vertices_world) == told["vertices"] < len(vertices)
+    assert len(few.faces) == told["faces"]
+    assert 0 < told["max_spacings"] <= 0.1
+    assert 0 < told["max_angle_deg"] <= 2.0
+    distance = NearestSurface(few).query(whole.vertices_world).distance
+    assert distance.max() <= 0.1 * told["spacing"] * 1.001
+    assert len(whole.vertices_world) == len(vertices)
+    glb = [read_mesh(tmp_path / name / "mesh.glb").faces for name in ("few", "all")]
+    assert [len(one) for one in glb] == [len(few.faces), len(faces)]
+
+
+def test_channels_are_in_units_of_what_they_may_be_off(reconstruction):
+    mesh = reconstruction.mesh.replace(expected_error=torch.full((225,), 0.02))
+    channels = written_channels(mesh)
+    more = mesh.replace(confidence=mesh.confidence + 0.1, expected_error=torch.full((225,), 0.0221))
+    assert_close(written_channels(more)[:, 3] - channels[:, 3], torch.ones(225))
+    assert (written_channels(more)[:, 4] - channels[:, 4] > 0.99).all()
+    encoded = 255 * srgb_from_linear((mesh.albedo * albedo_scale(mesh)).clamp(0, 1))
+    assert_close(8 * channels[:, :3], encoded)
+    bare = mesh.replace(albedo=None, confidence=None, expected_error=None)
+    assert written_channels(bare).shape == (225, 0)

@@ -1,0 +1,188 @@
+"""Simplification: a mesh of fewer vertices that all former vertices stay near."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.parallel import side_by_side
+from pimper_torch.records import Mesh, Record
+
+# Slices of the mesh that threads work on side by side; a fixed number, so that the result does
+# not depend on the number of threads. Vertices between slices come last.
+_SLICES = 4
+_DOUBLINGS = 5
+_EDGES = 100_000  # tell their median to a few thousandths
+_ROUNDS = 30  # few vertices go after the first ten
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bounds:
+    """What a former vertex may be off from the mesh that is left.
+
+    Attributes:
+        spacings: Distance to the surface, in multiples of the former mesh's median edge.
+        angle_deg: Between its normal and the surface's, which is blended from the corners.
+    """
+
+    spacings: float
+    angle_deg: float
+
+
+# A tenth of a sample's spacing and two degrees: the demo's 551,056 vertices become 70,000.
+FAITHFUL = Bounds(spacings=0.1, angle_deg=2.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Simplified(Record):
+    """A mesh with fewer vertices, and how far the others are from it.
+
+    Attributes:
+        mesh: Its vertices are former ones, with all that they carried.
+        kept: Which ones.
+        face: The face of ``mesh`` that every former vertex is nearest to among those that took
+            the place of its own; -1 for vertices that are kept.
+        spacing: Median edge of the former mesh, scene units.
+        max_spacings: Largest distance of a former vertex from its face, in multiples of that.
+        max_angle_deg: Largest angle between its normal and that of its face.
+    """
+
+    mesh: Mesh
+    kept: Int[Tensor, " kept"]
+    face: Int[Tensor, " vertex"]
+    spacing: float
+    max_spacings: float
+    max_angle_deg: float
+
+
+def simplify(
+    mesh: Mesh, bounds: Bounds = FAITHFUL, told: Float[Tensor, "vertex channel"] | None = None
+) -> Simplified:
+    """Merge vertices with their neighbours as long as every former vertex stays near.
+
+    Vertices of a border, and where more than one fan of faces meets, stay. Nothing moves: the
+    vertices that are left keep place, normal and whatever else they carry to the last digit.
+    Topology stays, too. A constant to autograd but for the values of what is kept.
+
+    Args:
+        mesh: Any; without normals, those of its shape are taken.
+        bounds: How near.
+        told: More that is blended over the faces, in units of what it may be off; what it is of
+            a removed vertex, and what its face says, differ by 1 at most.
+    """
+    from pimper_torch.kernels import decimation  # compiled when it is imported
+
+    if len(mesh.faces) == 0:
+        everything = torch.arange(len(mesh.vertices_world), device=mesh.faces.device)
+        return Simplified(
+            mesh=mesh,
+            kept=everything,
+            face=torch.full_like(everything, -1),
+            spacing=0.0,
+            max_spacings=0.0,
+            max_angle_deg=0.0,
+        )
+    vertices = mesh.vertices_world.detach().cpu().double()
+    normals = mesh.normals_world
+    if normals is None:
+        normals = vertex_normals(mesh.vertices_world, mesh.faces)
+    spacing = _median_edge(vertices, mesh.faces.cpu())
+    points = (vertices - vertices.mean(dim=0)).float().contiguous().numpy()
+    faces = mesh.faces.to("cpu", torch.int32, copy=True).contiguous().numpy()
+    channels = np.zeros((len(points), 0), np.float32) if told is None else _rows(told)
+    head = np.empty(len(points), np.int32)
+    following = np.empty(faces.size, np.int32)
+    first, after = np.full(len(faces), -1, np.int32), np.full(len(points), -1, np.int32)
+    off = np.tile(np.array([0, 1], np.float32), (len(points), 1))
+    decimation.link_corners(faces, head, following)
+
+    def thin_out(part: np.ndarray, mine: int, fresh: np.ndarray) -> int:
+        return decimation.decimate(
+            points,
+            _rows(normals),
+            channels,
+            bounds.spacings * spacing,
+            float(np.cos(np.radians(bounds.angle_deg))),
+            _ROUNDS,
+            faces,
+            head,
+            following,
+            part,
+            mine,
+            fresh,
+            first,
+            after,
+            off,
+        )
+
+    parts = _slices(points)
+    corners = parts[faces]
+    between = np.zeros(len(points), bool)
+    between[faces[(corners != corners[:, :1]).any(axis=1)]] = True
+    fresh = ~between
+    list(side_by_side(lambda mine: thin_out(parts, mine, fresh), range(_SLICES), tracked=False))
+    thin_out(np.zeros_like(parts), 0, fresh | between)
+
+    left = faces[:, 0] >= 0
+    kept, renumbered = np.unique(faces[left], return_inverse=True)
+    face = np.full(len(points), -1, np.int32)
+    decimation.read_lists(first[left], after, face)
+    chosen = torch.from_numpy(kept).long().to(mesh.faces.device)
+    return Simplified(
+        mesh=_taken(mesh, chosen, torch.from_numpy(renumbered.reshape(-1, 3)).to(mesh.faces)),
+        kept=chosen,
+        face=torch.from_numpy(face).to(mesh.faces),
+        spacing=spacing,
+        max_spacings=float(off[:, 0].max()) / spacing,
+        max_angle_deg=float(np.degrees(np.arccos(min(1.0, float(off[:, 1].min()))))),
+    )
+
+
+def with_few_faces(mesh: Mesh, most: int) -> Mesh:
+    """Simplify a mesh for pictures, its shape only, until it has few faces.
+
+    Args:
+        mesh: Any; one that is small enough comes back as it is.
+        most: Faces. Borders stay, however many faces they have.
+    """
+    bounds = Bounds(spacings=1.0, angle_deg=180.0)
+    for _ in range(_DOUBLINGS):
+        if len(mesh.faces) <= most:
+            break
+        mesh = simplify(mesh, bounds).mesh
+        bounds = Bounds(spacings=2 * bounds.spacings, angle_deg=bounds.angle_deg)
+    return mesh
+
+
+def _taken(mesh: Mesh, kept: Int[Tensor, " kept"], faces: Int[Tensor, "face 3"]) -> Mesh:
+    def of(values: Tensor | None) -> Tensor | None:
+        return None if values is None else values[kept]
+
+    return Mesh(
+        vertices_world=mesh.vertices_world[kept],
+        faces=faces,
+        normals_world=of(mesh.normals_world),
+        albedo=of(mesh.albedo),
+        confidence=of(mesh.confidence),
+        expected_error=of(mesh.expected_error),
+    )
+
+
+def _rows(values: Float[Tensor, "vertex channel"]) -> np.ndarray:
+    rows: np.ndarray = values.detach().cpu().float().contiguous().numpy()
+    return rows
+
+
+def _median_edge(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> float:
+    some = faces[:: max(1, len(faces) // _EDGES)]
+    return float((vertices[some[:, 0]] - vertices[some[:, 1]]).norm(dim=1).median())
+
+
+def _slices(points: np.ndarray) -> np.ndarray:
+    """Number slices across the mesh's longest side, of as many vertices each."""
+    along = points[:, np.ptp(points, axis=0).argmax()]
+    cuts = np.quantile(along, np.arange(1, _SLICES) / _SLICES)
+    return np.searchsorted(cuts, along).astype(np.int8)
