@@ -1,6 +1,7 @@
 """``pimper bench``: the table."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +25,35 @@ def run(command: str, arguments: Sequence[str]) -> None:
     Raises:
         PimperError: Before anything is written.
     """
+    job = checked(command, arguments)
+    with Bars(Console(stderr=True)) as bars:
+        table = run_bench(
+            job.config, job.out, observer=bars, overwrite=job.overwrite, cache=job.cache
+        )
+    console = Console()
+    console.print(terminal(table))
+    console.print(
+        f"{job.out}/table.md is the table, {job.out}/sheet.png shows it.",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    out: Path
+    config: BenchConfig
+    cache: Path
+    overwrite: bool
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and refuse a folder that is taken.
+
+    Raises:
+        PimperError: An impossible setting, or the folder holds something else.
+        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+    """
     kept = user_cache()
 
     def bench(
@@ -31,7 +61,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
         config: Annotated[BenchConfig, tyro.conf.arg(name="")] = _QUICK,
         cache: Annotated[Path, tyro.conf.arg(metavar="DIR")] = kept,
         overwrite: Flag = False,
-    ) -> None:
+    ) -> _Job:
         """Run presets and rivals on scenes with known truth, and print and save the table.
 
         Args:
@@ -41,15 +71,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
                 of a later stage costs only the later stages.
             overwrite: Replace a former result in OUT.
         """
-        prepare_output(out, BENCH_NAMES, overwrite)
-        with Bars(Console(stderr=True)) as bars:
-            table = run_bench(config, out, observer=bars, overwrite=overwrite, cache=cache)
-        console = Console()
-        console.print(terminal(table))
-        console.print(
-            f"{out}/table.md is the table, {out}/sheet.png shows it.",
-            highlight=False,
-            soft_wrap=True,
-        )
+        return _Job(out=out, config=config, cache=cache, overwrite=overwrite)
 
-    tyro.cli(bench, prog=f"pimper {command}", args=list(arguments))
+    job = tyro.cli(bench, prog=f"pimper {command}", args=list(arguments))
+    prepare_output(job.out, BENCH_NAMES, job.overwrite)
+    return job

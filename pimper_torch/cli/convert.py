@@ -131,8 +131,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
     Raises:
         PimperError: Before anything is written.
     """
-    job = parse(arguments)
-    prepare_output(job.out, RESULT_NAMES, job.overwrite)
+    job = checked(command, arguments)
     with Bars(Console(stderr=True)) as bars:
         bars.started("read")
         began = time.perf_counter()
@@ -142,6 +141,19 @@ def run(command: str, arguments: Sequence[str]) -> None:
     with written_whole(job.out, RESULT_NAMES, overwrite=job.overwrite) as staging:
         write(capture, job.target, staging)
     Console().print(describe(capture, job), highlight=False, soft_wrap=True)
+
+
+def checked(command: str, arguments: Sequence[str]) -> Job:
+    """Read the arguments, and refuse what can be told without reading DATA.
+
+    Raises:
+        PimperError: The folder for the result is taken, or there is no data.
+    """
+    job = parse(arguments)
+    prepare_output(job.out, RESULT_NAMES, job.overwrite)
+    if not job.data.exists():
+        raise InputError(f"{job.data}: found nothing; needed: the folder or file of a data set.")
+    return job
 
 
 def parse(arguments: Sequence[str]) -> Job:

@@ -108,11 +108,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
     Raises:
         PimperError: Nothing is written then.
     """
-    job = parse(arguments)
+    job = checked(command, arguments)
     config = job.options.config()
-    for path in (job.out, job.calibration):
-        if path is not None:
-            _check_writable(path)
     estimate = read_estimate(job.result)
     if job.calibration is not None and estimate.mesh.expected_error is None:
         raise InputError(
@@ -130,6 +127,23 @@ def run(command: str, arguments: Sequence[str]) -> None:
     if job.calibration is not None:
         _draw(evaluation, job.calibration)
         console.print(f"{job.calibration} is drawn.", highlight=False, soft_wrap=True)
+
+
+def checked(command: str, arguments: Sequence[str]) -> Job:
+    """Read the arguments, and refuse what can be told without reading RESULT and TRUTH.
+
+    Raises:
+        PimperError: An impossible setting, nothing to measure, or files that cannot be written.
+    """
+    job = parse(arguments)
+    job.options.config()
+    for path in (job.result, job.truth):
+        if not path.exists():
+            raise InputError(f"{path}: found nothing; needed: a result, and what it should be.")
+    for file in (job.out, job.calibration):
+        if file is not None:
+            _check_writable(file)
+    return job
 
 
 def parse(arguments: Sequence[str]) -> Job:

@@ -39,7 +39,7 @@ albedo and light.
 
 `pimper COMMAND --help` tells every option, and every setting of every stage.
 """
-# Where each is carried out.
+# Where each is carried out, and where its arguments are read if that is elsewhere.
 _COMMANDS = {
     "reconstruct": "pimper_torch.cli.run",
     "demo": "pimper_torch.cli.run",
@@ -49,6 +49,7 @@ _COMMANDS = {
     "convert": "pimper_torch.cli.convert",
     "gamma": "pimper_torch.cli.gamma",
 }
+_READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}
 _FAILED, _INTERRUPTED = 2, 130
 
 
@@ -58,6 +59,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         0; 2 for anything the user can mend, told in one message; 130 when interrupted.
     """
+    try:
+        try:
+            return _main(arguments)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # as of `pimper --help | head`: whoever reads has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # flushed again at exit
+        return 0
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] in ("-h", "--help"):
         sys.stdout.write(_HELP)
@@ -81,8 +93,10 @@ def _run(command: str, arguments: list[str]) -> int:
     # those they wait for when the machine is busy, and many small steps then take ten times
     # as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    module = import_module(_COMMANDS[command])
+    home = _COMMANDS[command]
     try:
+        _refuse_at_once(_READERS.get(home, home), command, arguments)
+        module = import_module(home)
         module.run(command, arguments)
     except PimperError as error:
         _tell("error", str(error))
@@ -91,6 +105,25 @@ def _run(command: str, arguments: list[str]) -> int:
         _tell("error", "interrupted; nothing was written.")
         return _INTERRUPTED
     return 0
+
+
+def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:
+    """Answer ``--help``, and refuse arguments, before torch is loaded.
+
+    Raises:
+        PimperError: What ``checked`` of the command's module raises.
+        SystemExit: As tyro does.
+    """
+    from pimper_torch.cli.light import light
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # told when the arguments are read in earnest
+            light(home, "checked")(command, arguments)
+    except (PimperError, BrokenPipeError):
+        raise
+    except Exception:
+        pass
 
 
 def _tell(kind: str, message: str) -> None:

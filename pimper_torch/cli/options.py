@@ -9,6 +9,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from pimper_torch.io.folders import prepare_output
+from pimper_torch.io.photographs import list_images
+from pimper_torch.io.results import RESULT_NAMES
 from pimper_torch.pipeline import PimperConfig, load_config
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
@@ -147,6 +150,21 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
             enclose=dataclasses.replace(job.config.enclose, reference=named),
         )
         job = dataclasses.replace(job, config=config)
+    return job
+
+
+def checked(command: str, arguments: Sequence[str]) -> Job:
+    """Read the arguments, and refuse what can be told without reading photographs.
+
+    Raises:
+        PimperError: As :func:`parse`; the folder for the result is taken, or there are no
+            photographs.
+    """
+    job = parse(command, arguments)
+    prepare_output(job.out, RESULT_NAMES, job.common.overwrite)
+    for folder in (job.photos, job.inputs.masks):
+        if folder is not None:
+            list_images(folder)
     return job
 
 

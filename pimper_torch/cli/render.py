@@ -36,7 +36,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
     Raises:
         PimperError: Before anything is written.
     """
-    job = _parse(command, arguments)
+    job = checked(command, arguments)
     console = Console(stderr=True)
     with Bars(console) as bars:
         began = time.perf_counter()
@@ -67,7 +67,14 @@ def run(command: str, arguments: Sequence[str]) -> None:
     )
 
 
-def _parse(command: str, arguments: Sequence[str]) -> _Job:
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments of ``render``.
+
+    Raises:
+        ConfigError: An impossible setting.
+        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+    """
+
     def render(
         scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")],
         out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],

@@ -9,12 +9,11 @@ from rich.console import Console
 from rich.table import Table
 
 from pimper_torch.cli.bars import Bars
-from pimper_torch.cli.options import Job, parse
+from pimper_torch.cli.options import Job, checked
 from pimper_torch.errors import ConfigError
-from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
-from pimper_torch.io.results import RESULT_NAMES, write_result
+from pimper_torch.io.results import write_result
 from pimper_torch.pipeline import Pimper
 from pimper_torch.progress import listening
 from pimper_torch.records import Reconstruction, StageReport, Views
@@ -30,9 +29,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
     Raises:
         PimperError: Before anything is written.
     """
-    job = parse(command, arguments)
+    job = checked(command, arguments)
     common = job.common
-    prepare_output(job.out, RESULT_NAMES, common.overwrite)
     _check_device(common.device)
     console = Console(stderr=True)
     with Bars(console) as bars:
