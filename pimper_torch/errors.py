@@ -3,6 +3,11 @@
 Every message says where, what was found, what was needed, and what to do.
 """
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
 
 class PimperError(Exception):
     """Base of every error this package raises on purpose."""
@@ -30,3 +35,41 @@ class MissingProgramError(ReconstructionError):
 
 class PimperWarning(UserWarning):
     """The result is delivered, but something about it should be known."""
+
+
+_held: ContextVar[list[str] | None] = ContextVar("held", default=None)
+
+
+def caution(message: str, stacklevel: int = 1) -> None:
+    """Warn of something, at once or, inside :func:`held`, when the block's owner says so.
+
+    Args:
+        message: Of the :class:`PimperWarning`.
+        stacklevel: As of :func:`warnings.warn`, counted from the caller.
+    """
+    held_back = _held.get()
+    if held_back is None:
+        warnings.warn(message, PimperWarning, stacklevel=stacklevel + 1)
+    else:
+        held_back.append(message)
+
+
+@contextmanager
+def held() -> Iterator[list[str]]:
+    """Hold back what is cautioned of in one round of many, as the last round's is enough.
+
+    Where the block ends in an error, what was held back is told before it.
+
+    Yields:
+        The messages so far, for :func:`caution` after the last round.
+    """
+    messages: list[str] = []
+    token = _held.set(messages)
+    try:
+        yield messages
+    except BaseException:
+        _held.reset(token)
+        for message in messages:
+            caution(message)
+        raise
+    _held.reset(token)

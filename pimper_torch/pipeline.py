@@ -1,6 +1,6 @@
 """The chain: photographs in, surface out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from pimper_torch.coarse.adapt import Adapt, AdaptConfig
 from pimper_torch.coarse.enclose import Enclose, EncloseConfig
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.config import build, find_config, overlay, read_mapping, require
+from pimper_torch.errors import caution, held
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
 from pimper_torch.meshing.extract import Extract, ExtractConfig
@@ -177,15 +178,19 @@ class Pimper(nn.Module):
         coarse = self._coarse(scene, outlines, rims, mesh)
         swept: SweptPatches | None = None
         surface: Surface | None = None
+        cautions: Sequence[str] = ()
         last = len(self.config.rounds.scales)
         for number, scale in enumerate(self.config.rounds.scales, start=1):
-            if surface is not None:
-                coarse = self.adapt(swept, surface, rims)
-            patches = self.decompose(coarse, cameras, surface, scale)
-            seen = self.warp(views, cameras, patches)
-            photometric = self.factorize(seen)
-            swept = self.sweep(views, cameras, seen, photometric)
-            surface = self.mend(self.fuse(swept, rims, expected=number == last))
+            with held() as cautions:
+                if surface is not None:
+                    coarse = self.adapt(swept, surface, rims)
+                patches = self.decompose(coarse, cameras, surface, scale)
+                seen = self.warp(views, cameras, patches)
+                photometric = self.factorize(seen)
+                swept = self.sweep(views, cameras, seen, photometric)
+                surface = self.mend(self.fuse(swept, rims, expected=number == last))
+        for message in cautions:
+            caution(message, stacklevel=3)
         assert swept is not None  # there is a round at least
         assert surface is not None
         return swept, surface

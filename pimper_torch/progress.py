@@ -37,3 +37,24 @@ def listening(listener: Listener | None) -> Iterator[None]:
         yield
     finally:
         _listener.reset(token)
+
+
+@contextmanager
+def part(place: int, count: int) -> Iterator[None]:
+    """Let what is reported inside the ``with`` block fill one of ``count`` equal parts.
+
+    Parts nest, so that a stage of several steps, which report by themselves, has one bar.
+
+    Args:
+        place: Of the part, from 0.
+        count: Of parts.
+    """
+    whole = _listener.get()
+
+    def inside(done: int, total: int) -> None:
+        if whole is not None:
+            whole(place * total + done, count * total)
+
+    with listening(inside):
+        yield
+    report(place + 1, count)

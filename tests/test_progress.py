@@ -1,4 +1,4 @@
-from pimper_torch.progress import listening, report, track
+from pimper_torch.progress import listening, part, report, track
 
 
 def test_every_batch_is_reported_with_the_total():
@@ -25,3 +25,20 @@ def test_the_inner_listener_hears_and_the_outer_one_comes_back():
         report(2, 2)
     assert inner == [1]
     assert outer == [2]
+
+
+def test_parts_of_a_stage_share_one_bar_and_nest():
+    heard = []
+    with listening(lambda done, total: heard.append(done / total)):
+        with part(0, 2):
+            list(track("ab"))
+        with part(1, 2):
+            with part(0, 2):
+                report(1, 4)
+            report(3, 4)
+    assert heard == [0.25, 0.5, 0.5, 0.5625, 0.75, 0.875, 1.0]
+
+
+def test_a_part_that_nobody_listens_to_is_silent():
+    with part(0, 2):
+        report(1, 2)

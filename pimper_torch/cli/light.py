@@ -75,7 +75,7 @@ class _Source:
         self.name = name
         self.made = types.ModuleType(f"{name} (light)")
         # No file of that name: looking for the sources of classes takes longer than all else.
-        self.made.__file__ = f"{path} (light)"
+        self.made.__file__ = self.path = f"{path} (light)"
         sys.modules[self.made.__name__] = self.made
         tree = ast.parse(path.read_text(encoding="utf-8"))
         self.statements = {name: each for each in tree.body for name in _defined(each)}
@@ -124,9 +124,7 @@ def _execute(statement: ast.stmt, source: _Source) -> None:
         isinstance(base, ast.Name) and getattr(source.made, base.id, None) is not ABSENT
         for base in bases
     ):
-        exec(
-            compile(ast.Module([statement], []), source.made.__file__, "exec"), source.made.__dict__
-        )
+        exec(compile(ast.Module([statement], []), source.path, "exec"), source.made.__dict__)
 
 
 def _imported(home: str, statement: ast.stmt, name: str) -> object:

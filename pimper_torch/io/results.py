@@ -15,6 +15,7 @@ from pimper_torch.io.accounts import lights_account, summary_account
 from pimper_torch.io.folders import written_whole
 from pimper_torch.io.meshes import write_glb, write_ply, written_channels
 from pimper_torch.meshing.simplify import simplify
+from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Outlines, Reconstruction, SparseScene
 from pimper_torch.sfm.scene import write_model
@@ -35,6 +36,7 @@ RESULT_NAMES = (
     "summary.json",
     "overview.png",
 )
+_PARTS = 4  # of the bar: simplification, meshes and cameras, maps, contact sheet
 
 
 def write_result(
@@ -90,7 +92,8 @@ def write_result(
         whole = result.to("cpu")
         summary = summary_account(whole, about or {})
         if not full_mesh:
-            found = simplify(whole.mesh, told=written_channels(whole.mesh))
+            with part(0, _PARTS):
+                found = simplify(whole.mesh, told=written_channels(whole.mesh))
             whole = whole.replace(mesh=found.mesh)
             summary["simplified"] = {
                 "vertices": len(found.mesh.vertices_world),
@@ -105,16 +108,19 @@ def write_result(
 def _write_all(
     result: Reconstruction, config: object, folder: Path, summary: Mapping[str, object]
 ) -> None:
-    write_ply(result.mesh, folder / "mesh.ply")
-    write_glb(result.mesh, folder / "mesh.glb")
-    write_model(result.scene, folder / "sparse")
-    if result.outlines is not None:
-        _write_masks(result.outlines, result.scene, folder / "masks")
-    _write_maps(result, folder)
+    with part(1, _PARTS):
+        write_ply(result.mesh, folder / "mesh.ply")
+        write_glb(result.mesh, folder / "mesh.glb")
+        write_model(result.scene, folder / "sparse")
+        if result.outlines is not None:
+            _write_masks(result.outlines, result.scene, folder / "masks")
+    with part(2, _PARTS):
+        _write_maps(result, folder)
     _write_json(lights_account(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     _write_json(summary, folder / "summary.json", indent=2)
-    draw_overview(result, folder / "overview.png")
+    with part(3, _PARTS):
+        draw_overview(result, folder / "overview.png")
 
 
 def _write_masks(outlines: Outlines, scene: SparseScene, folder: Path) -> None:

@@ -123,7 +123,7 @@ def simplify(
     between = np.zeros(len(points), bool)
     between[faces[(corners != corners[:, :1]).any(axis=1)]] = True
     fresh = ~between
-    list(side_by_side(lambda mine: thin_out(parts, mine, fresh), range(_SLICES), tracked=False))
+    list(side_by_side(lambda mine: thin_out(parts, mine, fresh), range(_SLICES)))
     thin_out(np.zeros_like(parts), 0, fresh | between)
 
     left = faces[:, 0] >= 0

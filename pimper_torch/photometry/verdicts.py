@@ -1,6 +1,5 @@
 """Whether light told the shape of a patch, and what kept it from that."""
 
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 
@@ -8,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import PimperWarning
+from pimper_torch.errors import caution
 from pimper_torch.photometry.certainty import light_varies
 from pimper_torch.records import PatchVerdict, Photometry, Registered, Templates
 
@@ -67,11 +66,10 @@ def warn_of_verdicts(
         PatchVerdict.FAILED: "in {} the solver found no finite answer",
     }
     parts = [text.format(verdicts[code]) for code, text in causes.items() if verdicts[code]]
-    warnings.warn(
+    caution(
         f"Factorization: {undetermined} of {total} patches keep the normals of the coarse mesh: "
         f"{'; '.join(parts)}. Their geometry is delivered without photometric detail. "
         "Photograph these sides under more positions of the light, or lower "
         "`factorize.min_views` or `factorize.min_light_variation`.",
-        PimperWarning,
         stacklevel=4,
     )

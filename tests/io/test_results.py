@@ -19,6 +19,7 @@ from pimper_torch.io.accounts import common_lights, lights_account, summary_acco
 from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply, written_channels
 from pimper_torch.io.results import RESULT_NAMES, write_result
+from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Mesh, Outlines
 from pimper_torch.scenes.meshes import icosphere
@@ -41,7 +42,11 @@ def names(folder: Path):
 
 
 def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
-    write_result(reconstruction, Config(), tmp_path / "deep" / "out", about={"preset": "paper"})
+    heard = []
+    with listening(lambda done, total: heard.append(done / total)):
+        write_result(reconstruction, Config(), tmp_path / "deep" / "out", about={"preset": "paper"})
+    assert heard == sorted(heard)  # one bar, filled once
+    assert 0 < heard[0] < heard[-1] == 1
     out = tmp_path / "deep" / "out"
     assert names(out) == sorted({*RESULT_NAMES} - {"masks"})
     assert names(tmp_path / "deep") == ["out"]

@@ -1,0 +1,61 @@
+"""What every round would warn of is said once, as the last round has it."""
+
+from types import SimpleNamespace
+
+import pytest
+from torch import nn
+
+from pimper_torch.errors import PimperWarning, caution, held
+from pimper_torch.pipeline import Pimper, PimperConfig
+
+
+class Stub(nn.Module):
+    def __init__(self, work):
+        super().__init__()
+        self.work = work
+
+    def forward(self, *_):
+        return self.work()
+
+
+def rounds(messages):
+    """A chain whose factorization warns of something else in every round."""
+    pimper, left = Pimper(PimperConfig()), list(messages)
+    for name, _ in list(pimper.named_children()):
+        setattr(pimper, name, Stub(object))
+
+    def factorize():
+        for message in left.pop(0):
+            caution(message)
+
+    pimper.factorize = Stub(factorize)
+    scene = SimpleNamespace(views=None, cameras=None)
+    return pimper._in_rounds(scene, None, None)
+
+
+def test_the_last_rounds_figures_are_said_once():
+    with pytest.warns(PimperWarning) as caught:
+        rounds([["9 of 10", "no rims"], ["5 of 10"], ["3 of 10"]])
+    assert [str(warning.message) for warning in caught] == ["3 of 10"]
+
+
+def test_what_the_last_round_has_mended_is_not_said(recwarn):
+    rounds([["9 of 10"], [], []])
+    assert not recwarn.list
+
+
+def broken_round():
+    with held():
+        caution("3 of 10")
+        raise ValueError("broken")
+
+
+def test_a_round_that_fails_says_what_it_held_back():
+    with pytest.warns(PimperWarning, match="3 of 10"), pytest.raises(ValueError, match="broken"):
+        broken_round()
+
+
+def test_outside_of_rounds_a_caution_comes_at_once():
+    with pytest.warns(PimperWarning, match="now") as caught:
+        caution("now")
+    assert caught[0].filename == __file__
