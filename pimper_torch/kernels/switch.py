@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib import import_module
+from inspect import unwrap
 from pkgutil import iter_modules
 from typing import Literal, TypeVar
 
@@ -36,17 +37,31 @@ def compiled_for(*tensors: Tensor) -> bool:
     return _chosen.get() == "numba" and on_cpu and not asked
 
 
-def compiled(*signatures: str) -> Callable[[Function], Function]:
+# What compiled sums may do besides IEEE's arithmetic: add in another order, in several lanes at
+# once. NaN and infinity keep their meaning.
+_FAST = {"reassoc", "contract", "arcp", "nsz"}
+
+
+def compiled(*signatures: str, fast: bool = False) -> Callable[[Function], Function]:
     """Compile a function for the given types when its module is imported.
 
     Once an installation: the machine code is kept on disk. It holds no lock of the interpreter.
+
+    Args:
+        signatures: Without any, the function is a part of other kernels, and compiled with them.
+        fast: Whether sums may be taken in any order, as several lanes at once do.
     """
     import numba
 
-    decorate: Callable[[Function], Function] = numba.njit(
-        list(signatures), cache=True, nogil=True, error_model="numpy"
+    decorate = numba.njit(
+        list(signatures) or None,
+        cache=True,
+        nogil=True,
+        error_model="numpy",
+        fastmath=_FAST if fast else False,
     )
-    return decorate
+    # Checkers of shapes wrap what they check; Python inside them cannot be compiled.
+    return lambda function: decorate(unwrap(function))
 
 
 def compile_all() -> None:

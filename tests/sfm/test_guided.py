@@ -8,14 +8,17 @@ import torch
 from torch.nn.functional import pad
 
 from pimper_torch.io.photographs import load_views
+from pimper_torch.kernels.switch import using
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.features import find_features
 from pimper_torch.sfm.guided import (
     Features,
+    NearEpipolarLines,
+    NearMappedPoints,
+    compiled_likeness,
     guided_matches,
+    likeness,
     match_guided,
-    near_epipolar_lines,
-    near_mapped_points,
 )
 from pimper_torch.sfm.matching import match_pairs
 from pimper_torch.sfm.reconstruct import ReconstructConfig
@@ -41,22 +44,22 @@ def test_a_twin_off_the_line_is_no_rival_and_one_on_it_is():
     second = features(
         [[30.0, 11.0], [40.0, 30.0], [30.0, 60.0], [40.0, 61.5]], [10.0, 0.0, 90.0, 92.0]
     )
-    found = guided_matches(first, second, near_epipolar_lines(ROWS, 2.0), 0.8)
+    found = guided_matches(first, second, NearEpipolarLines(ROWS, 2.0), 0.8)
     assert found.tolist() == [[0, 0], [1, 2]]  # 0 against 2 degrees: clear
     ratio = features([[30.0, 11.0], [40.0, 9.0]], [10.0, 12.0])
-    assert guided_matches(first, ratio, near_epipolar_lines(ROWS, 2.0), 0.8).tolist() == []
-    assert guided_matches(first, ratio, near_epipolar_lines(ROWS, 2.0), 0.9).tolist() == [[0, 0]]
+    assert guided_matches(first, ratio, NearEpipolarLines(ROWS, 2.0), 0.8).tolist() == []
+    assert guided_matches(first, ratio, NearEpipolarLines(ROWS, 2.0), 0.9).tolist() == [[0, 0]]
 
 
 def test_matches_are_each_others_best():
     first = features([[5.0, 10.0], [9.0, 10.5]], [0.0, 10.0])
     second = features([[30.0, 10.0]], [2.0])
-    assert guided_matches(first, second, near_epipolar_lines(ROWS, 2.0), 0.8).tolist() == [[0, 0]]
+    assert guided_matches(first, second, NearEpipolarLines(ROWS, 2.0), 0.8).tolist() == [[0, 0]]
 
 
 def test_descriptors_that_are_unlike_do_not_match_though_nothing_rivals():
     first, second = features([[5.0, 10.0]], [0.0]), features([[30.0, 10.0]], [45.0])
-    assert guided_matches(first, second, near_epipolar_lines(ROWS, 2.0), 0.8).tolist() == []
+    assert guided_matches(first, second, NearEpipolarLines(ROWS, 2.0), 0.8).tolist() == []
 
 
 def test_the_distance_from_epipolar_lines_is_sampsons():
@@ -69,7 +72,7 @@ def test_the_distance_from_epipolar_lines_is_sampsons():
     lines, back = ends[0] @ fundamental.mT, ends[1] @ fundamental
     slope = lines[:, None, :2].square().sum(dim=2) + back[None, :, :2].square().sum(dim=2)
     error = residual.abs() / slope.sqrt()
-    near = near_epipolar_lines(fundamental, 2.0)(first, second)
+    near = NearEpipolarLines(fundamental, 2.0)(first, second)
     assert near.any()
     assert not near[error > 2.01].any()
     assert near[error < 1.99].all()
@@ -79,7 +82,42 @@ def test_a_homography_maps_to_a_circle():
     shift = torch.tensor([[1.0, 0, 20], [0, 1, -5], [0, 0, 1]], dtype=torch.float64)
     first = torch.tensor([[10.0, 10.0]], dtype=torch.float64)
     second = torch.tensor([[30.0, 5.0], [31.9, 5.0], [31.5, 6.5]], dtype=torch.float64)
-    assert near_mapped_points(shift, 2.0)(first, second).tolist() == [[True, True, False]]
+    assert NearMappedPoints(shift, 2.0)(first, second).tolist() == [[True, True, False]]
+
+
+@pytest.mark.parametrize("length", [128, 13])
+@pytest.mark.parametrize("planar", [False, True])
+def test_the_kernel_finds_what_torch_finds(generator, length, planar):
+    def some(count):
+        described = torch.rand(count, length, generator=generator)
+        pixels = 200 * torch.rand(count, 2, generator=generator, dtype=torch.float64)
+        return Features(pixels=pixels, descriptors=described / described.norm(dim=1, keepdim=True))
+
+    first, second = some(300), some(200)
+    if planar:
+        near = NearMappedPoints(torch.diag(torch.tensor([1.1, 0.9, 1.0]).double()), 20.0)
+    else:
+        turned = torch.tensor([[1e-6, -3e-6, 0.001], [2e-6, 1e-6, -0.01], [-0.002, 0.01, 0.05]])
+        near = NearEpipolarLines(turned.double(), 5.0)
+    for mine, theirs in zip(
+        compiled_likeness(first, second, near), likeness(first, second, near), strict=True
+    ):
+        assert (theirs.best >= 0).sum() > 0.8 * len(theirs.best)  # most have some that are near
+        assert (theirs.products[:, 1] >= 0).sum() > 0.5 * len(theirs.best)
+        assert torch.equal(mine.best, theirs.best)
+        torch.testing.assert_close(mine.products, theirs.products, rtol=0, atol=1e-6)  # float32
+
+
+def test_matches_are_the_same_without_kernels():
+    first = features([[5.0, 10.0], [5.0, 60.0]], [0.0, 90.0])
+    second = features([[30.0, 11.0], [40.0, 30.0], [30.0, 60.0]], [10.0, 0.0, 90.0])
+    with using("torch"):
+        found = guided_matches(first, second, NearEpipolarLines(ROWS, 2.0), 0.8)
+    assert found.tolist() == [[0, 0], [1, 2]]
+    nothing = features([[5.0, 200.0]], [0.0])
+    for kernels in ("torch", "numba"):
+        with using(kernels):
+            assert len(guided_matches(nothing, second, NearEpipolarLines(ROWS, 2.0), 0.8)) == 0
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,108 @@
+"""The most alike of the features near each feature's epipolar line, of two photographs at once.
+
+The compiled twin of :func:`pimper_torch.sfm.guided.likeness`.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from pimper_torch.kernels.switch import compiled
+
+Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+@compiled(
+    "void(float64[:,::1], float64[:,::1], float32[:,::1], float32[:,::1], float64[:,::1], boolean,"
+    " float64, float32[:,::1], float32[:,::1], int64[::1], int64[::1])"
+)
+def most_alike(
+    first: Doubles,
+    second: Doubles,
+    first_descriptors: Floats,
+    second_descriptors: Floats,
+    matrix: Doubles,
+    planar: bool,
+    max_error_px: float,
+    first_products: Floats,
+    second_products: Floats,
+    first_best: Indices,
+    second_best: Indices,
+) -> None:
+    """Find, for every feature, the two largest products of descriptors among those near.
+
+    Args:
+        first: Pixels in one photograph.
+        second: In the other.
+        first_descriptors: Of length 1.
+        second_descriptors: The same.
+        matrix: Homography from the first photograph, or fundamental matrix.
+        planar: Whether it is a homography.
+        max_error_px: Distance from the mapped point, or Sampson's from the epipolar line.
+        first_products: The largest and the second largest go there, before that -1.
+        second_products: The same for features of the other photograph.
+        first_best: Which feature the largest is with, before that -1.
+        second_best: The same.
+    """
+    count, length = len(second), second_descriptors.shape[1]
+    x, y = np.empty(count, np.float32), np.empty(count, np.float32)
+    slope, near = np.zeros(count, np.float32), np.empty(count, np.int64)
+    # From the middle of all on, single precision tells a hundredth of a pixel.
+    middle_x, middle_y = second[:, 0].mean(), second[:, 1].mean()
+    for j in range(count):
+        u, v = second[j, 0], second[j, 1]
+        x[j], y[j] = u - middle_x, v - middle_y
+        if not planar:
+            back_u = u * matrix[0, 0] + v * matrix[1, 0] + matrix[2, 0]
+            back_v = u * matrix[0, 1] + v * matrix[1, 1] + matrix[2, 1]
+            slope[j] = max_error_px**2 * (back_u**2 + back_v**2)
+    limit = np.float32(max_error_px**2)
+    for i in range(len(first)):
+        u, v = first[i, 0], first[i, 1]
+        a = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]
+        b = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]
+        c = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
+        found = 0
+        if planar:
+            at_x, at_y = np.float32(a / c - middle_x), np.float32(b / c - middle_y)
+            for j in range(count):
+                near[found] = j
+                found += (x[j] - at_x) ** 2 + (y[j] - at_y) ** 2 <= limit
+        else:
+            line_x, line_y = np.float32(a), np.float32(b)
+            offset = np.float32(a * middle_x + b * middle_y + c)
+            own = np.float32(max_error_px**2 * (a * a + b * b))
+            for j in range(count):
+                near[found] = j
+                found += (x[j] * line_x + y[j] * line_y + offset) ** 2 <= own + slope[j]
+        mine = first_descriptors[i]
+        for place in range(found):
+            j = near[place]
+            theirs = second_descriptors[j]
+            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = np.float32(0)
+            whole = length - length % 8
+            for k in range(0, whole, 8):
+                s0 += mine[k] * theirs[k]
+                s1 += mine[k + 1] * theirs[k + 1]
+                s2 += mine[k + 2] * theirs[k + 2]
+                s3 += mine[k + 3] * theirs[k + 3]
+                s4 += mine[k + 4] * theirs[k + 4]
+                s5 += mine[k + 5] * theirs[k + 5]
+                s6 += mine[k + 6] * theirs[k + 6]
+                s7 += mine[k + 7] * theirs[k + 7]
+            for k in range(whole, length):
+                s0 += mine[k] * theirs[k]
+            product = ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
+            if product > first_products[i, 0]:
+                first_products[i, 1] = first_products[i, 0]
+                first_products[i, 0] = product
+                first_best[i] = j
+            elif product > first_products[i, 1]:
+                first_products[i, 1] = product
+            if product > second_products[j, 0]:
+                second_products[j, 1] = second_products[j, 0]
+                second_products[j, 0] = product
+                second_best[j] = i
+            elif product > second_products[j, 1]:
+                second_products[j, 1] = product
