@@ -15,7 +15,8 @@ Indices = npt.NDArray[np.int64]
 
 @compiled(
     "void(float64[:,::1], float64[:,::1], float32[:,::1], float32[:,::1], float64[:,::1], boolean,"
-    " float64, float32[:,::1], float32[:,::1], int64[::1], int64[::1])"
+    " float64, float32[:,::1], float32[:,::1], int64[::1], int64[::1])",
+    fast=True,
 )
 def most_alike(
     first: Doubles,
@@ -80,20 +81,9 @@ def most_alike(
         for place in range(found):
             j = near[place]
             theirs = second_descriptors[j]
-            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = np.float32(0)
-            whole = length - length % 8
-            for k in range(0, whole, 8):
-                s0 += mine[k] * theirs[k]
-                s1 += mine[k + 1] * theirs[k + 1]
-                s2 += mine[k + 2] * theirs[k + 2]
-                s3 += mine[k + 3] * theirs[k + 3]
-                s4 += mine[k + 4] * theirs[k + 4]
-                s5 += mine[k + 5] * theirs[k + 5]
-                s6 += mine[k + 6] * theirs[k + 6]
-                s7 += mine[k + 7] * theirs[k + 7]
-            for k in range(whole, length):
-                s0 += mine[k] * theirs[k]
-            product = ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
+            product = np.float32(0)
+            for k in range(length):
+                product += mine[k] * theirs[k]
             if product > first_products[i, 0]:
                 first_products[i, 1] = first_products[i, 0]
                 first_products[i, 0] = product

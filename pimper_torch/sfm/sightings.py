@@ -14,13 +14,15 @@ features in the place of the logarithm.
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels
-from pimper_torch.progress import track
+from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Record
 from pimper_torch.sfm.tangents import Tangents, plane_homographies
@@ -190,19 +192,21 @@ def sight(
     with torch.no_grad():
         window = _Window(settings.radius_px, like=pictures.log)
         templates = _templates(pictures, cameras, tangents, window)
-        parts = []
-        for view in track(range(len(pictures.log))):
-            wanted = tangents.candidates[:, view] & templates.usable
-            for some in torch.split(torch.nonzero(wanted)[:, 0], _AT_ONCE):
-                homographies = plane_homographies(tangents, cameras, view, some)
+
+        def in_view(view: int) -> tuple[Tensor, Tensor, Tensor]:
+            (some,) = torch.nonzero(tangents.candidates[:, view] & templates.usable, as_tuple=True)
+            found = [(some[:0], some[:0], tangents.points_world[:0, :2])]
+            for chosen in torch.split(some, _AT_ONCE):
+                homographies = plane_homographies(tangents, cameras, view, chosen)
                 kept, pixels = _aligned(
-                    pictures, view, homographies, templates.take(some), window, settings
+                    pictures, view, homographies, chosen, templates, window, settings
                 )
-                parts.append((some[kept], torch.full_like(some[kept], view), pixels[kept]))
-        if not parts:
-            parts.append(
-                (tangents.reference[:0], tangents.reference[:0], _own(tangents, cameras)[:0])
-            )
+                shown = chosen[kept]
+                found.append((shown, torch.full_like(shown, view), pixels[kept]))
+            point, view_, pixels = (torch.cat(part) for part in zip(*found, strict=True))
+            return point, view_, pixels
+
+        parts = side_by_side(in_view, range(len(pictures.log)))
         point, view_, pixels = (torch.cat(part) for part in zip(*parts, strict=True))
         found = torch.zeros_like(templates.usable)
         found[point] = True
@@ -249,20 +253,90 @@ def _aligned(
     pictures: Pictures,
     view: int,
     homographies: Float[Tensor, "point 3 3"],
+    chosen: Int[Tensor, " point"],
     templates: _Templates,
     window: _Window,
     settings: SightingSettings,
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "point 2"]]:
     """Align one view's patches; tell which were found, and where."""
-    count, log = len(homographies), pictures.log[view]
-    shift = homographies.new_zeros(count, 2)
-    deviation = homographies.new_full((count,), torch.inf)
-    correlation = homographies.new_zeros(count)
-    active = torch.arange(count, device=shift.device)
+    fast = compiled_for(pictures.log, homographies, templates.values)
+    alignment = (_compiled_alignment if fast else _iterated)(
+        pictures.log[view], homographies, chosen, templates, window, settings.max_shift_px
+    )
+    arrived = alignment.shift.isfinite().all(dim=1)
+    final = _shifted(homographies, torch.where(arrived[:, None], alignment.shift, 0))
+    found = arrived & (alignment.correlation >= settings.min_correlation)
+    found &= alignment.deviation <= settings.max_deviation_px
+    found &= _complete(pictures.unusable[view], final, window)
+    return found, final[:, :2, 2] / final[:, 2:, 2]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Alignment(Record):
+    """How patches of a view came to lie on their templates.
+
+    Attributes:
+        shift: Along the plane, in its steps; infinite where the patch was lost or did not arrive.
+        deviation: Of the place along its worst direction, in the same.
+        correlation: With the template, light taken out.
+    """
+
+    shift: Float[Tensor, "point 2"]
+    deviation: Float[Tensor, " point"]
+    correlation: Float[Tensor, " point"]
+
+
+def _compiled_alignment(
+    log: Float[Tensor, "height width"],
+    homographies: Float[Tensor, "point 3 3"],
+    chosen: Int[Tensor, " point"],
+    templates: _Templates,
+    window: _Window,
+    max_shift_px: float,
+) -> _Alignment:
+    """Do what :func:`_iterated` does, by a compiled kernel."""
+    from pimper_torch.kernels.patch_alignment import align
+
+    found = _nothing_aligned(homographies)
+    limits = (_ITERATIONS, _LONGEST_STEP, _CONVERGED, _TRIAL, _HOPELESS, *_CONTRAST, max_shift_px)
+    align(
+        log.numpy(),
+        homographies.contiguous().numpy(),
+        chosen.contiguous().numpy(),
+        *(each.contiguous().numpy() for each in (templates.values, templates.slopes)),
+        templates.inverse.contiguous().numpy(),
+        *(each.contiguous().numpy() for each in (window.places, window.root, window.light)),
+        np.array(limits, dtype=np.float64),
+        *(each.numpy() for each in (found.shift, found.deviation, found.correlation)),
+    )
+    return found
+
+
+def _iterated(
+    log: Float[Tensor, "height width"],
+    homographies: Float[Tensor, "point 3 3"],
+    chosen: Int[Tensor, " point"],
+    templates: _Templates,
+    window: _Window,
+    max_shift_px: float,
+) -> _Alignment:
+    """Align one view's patches by Gauss-Newton.
+
+    Args:
+        log: Of the view's radiance.
+        homographies: From steps of the plane to the view's pixels.
+        chosen: The template of each.
+        templates: To align them with.
+        window: Of both.
+        max_shift_px: From where the cameras put the point.
+    """
+    found = _nothing_aligned(homographies)
+    shift = found.shift.zero_()
+    active = torch.arange(len(homographies), device=shift.device)
     for iteration in range(_ITERATIONS):
         if len(active) == 0:
             break
-        some = templates.take(active)
+        some = templates.take(chosen[active])
         patches = window.freed(_look_up(log, _shifted(homographies[active], shift[active]), window))
         power = some.values.square().sum(dim=1).clamp_min(1e-12)
         common = (patches * some.values).sum(dim=1)
@@ -272,22 +346,25 @@ def _aligned(
         shift[active] += step * (_LONGEST_STEP / length.clamp_min(_LONGEST_STEP))[:, None]
         variance = left.square().sum(dim=1) / window.total
         spread = torch.linalg.eigvalsh(some.inverse)[:, -1]
-        deviation[active] = (variance * spread).sqrt().double()
+        found.deviation[active] = (variance * spread).sqrt().double()
         alike = common / (patches.norm(dim=1) * power.sqrt()).clamp_min(1e-12)
-        correlation[active] = alike.double()
-        lost = shift[active].norm(dim=1) > settings.max_shift_px
+        found.correlation[active] = alike.double()
+        lost = shift[active].norm(dim=1) > max_shift_px
         if iteration >= _TRIAL:
             lost |= alike < _HOPELESS
         shift[active[lost]] = torch.inf
         active = active[~lost & (length > _CONVERGED)]
-    arrived = torch.ones(count, dtype=torch.bool, device=shift.device)
-    arrived[active] = False
-    arrived &= shift.isfinite().all(dim=1)
-    final = _shifted(homographies, torch.where(arrived[:, None], shift, 0))
-    found = arrived & (correlation >= settings.min_correlation)
-    found &= deviation <= settings.max_deviation_px
-    found &= _complete(pictures.unusable[view], final, window)
-    return found, final[:, :2, 2] / final[:, 2:, 2]
+    shift[active] = torch.inf
+    return found
+
+
+def _nothing_aligned(homographies: Float[Tensor, "point 3 3"]) -> _Alignment:
+    count = len(homographies)
+    return _Alignment(
+        shift=homographies.new_full((count, 2), torch.inf),
+        deviation=homographies.new_full((count,), torch.inf),
+        correlation=homographies.new_zeros(count),
+    )
 
 
 def _shifted(

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
-from pimper_torch.progress import track
+from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.binding import release_memory
@@ -55,14 +55,16 @@ def undistorted(
     Yields:
         Radiance, and where it is valid.
     """
-    grids: dict[Lens, _Grid | None] = {}
-    for index in track(range(views.num_views)):
+    alike = len(set(lenses)) == 1
+    shared = _grid(lenses[0], like=views.images) if alike else None
+
+    def one(index: int) -> tuple[Tensor, Tensor]:
         lens = lenses[index]
-        if lens not in grids:
-            # The last alone, for grids are large.
-            grids = {lens: None if is_pinhole(lens) else _grid(lens, like=views.images)}
-        release_memory()  # of the grid, and of the photograph before
-        yield _undistort_image(views, index, lens, grids[lens])
+        return _undistort_image(views, index, lens, shared if alike else _grid(lens, views.images))
+
+    for found in side_by_side(one, range(views.num_views)):
+        yield found
+        release_memory()  # of the photograph, and of its grid
 
 
 def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
@@ -74,8 +76,13 @@ def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
 _Grid = tuple[Float[Tensor, "1 height width 2"], Bool[Tensor, "height width"]]
 
 
-def _grid(lens: Lens, like: Tensor) -> _Grid:
-    """Give where pixels of the pinhole image are in the photograph, and which are in it at all."""
+def _grid(lens: Lens, like: Tensor) -> _Grid | None:
+    """Give where pixels of the pinhole image are in the photograph, and which are in it at all.
+
+    Nothing for a lens without distortion.
+    """
+    if is_pinhole(lens):
+        return None
     sources = photograph_pixels(lens).to(like)
     size = sources.new_tensor([lens.width, lens.height])
     within = ((sources >= 0) & (sources <= size)).all(dim=-1)  # false for NaN

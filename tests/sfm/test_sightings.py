@@ -1,7 +1,10 @@
+import dataclasses
+
 import pytest
 import torch
 
 from pimper_torch.geometry.projection import project
+from pimper_torch.kernels.switch import using
 from pimper_torch.sfm.sightings import SightingSettings, log_pictures, sight
 from pimper_torch.sfm.tangents import tangents
 from tests.sfm import ball
@@ -37,6 +40,27 @@ def test_points_are_found_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
     )
     assert len(found.point) > 0.85 * 6 * 150
     assert errors(found, pixels).median() < (0.05 if lit else 0.02)
+
+
+def test_the_kernel_finds_what_torch_finds(scene):
+    cameras, planes, _ = scene
+    turned = cameras.cam_from_world.clone()
+    turned[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels: several steps, and some too far
+    views = ball.photographs(cameras, wall=True)
+    images = views.images.clone()
+    noise = torch.Generator().manual_seed(5)
+    images[2] = torch.rand(images[2].shape, generator=noise, dtype=images.dtype)  # hopeless
+    shown, wrong = pictures(views.replace(images=images)), cameras.replace(cam_from_world=turned)
+    settings = dataclasses.replace(SETTINGS, max_shift_px=2.2)
+    with using("torch"):
+        expected = sight(shown, wrong, planes, settings)
+    found = sight(shown, wrong, planes, settings)
+    assert (expected.view == 3).sum() > 50
+    assert len(expected.point) < planes.candidates.sum() - 50
+    assert torch.equal(found.point, expected.point)
+    assert torch.equal(found.view, expected.view)
+    # Both add up in single precision.
+    torch.testing.assert_close(found.pixels, expected.pixels, rtol=0, atol=1e-4)
 
 
 def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
