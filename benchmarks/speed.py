@@ -158,14 +158,22 @@ def clocks(stage: str) -> Cost:
 
 
 def added(stage: str, costs: Sequence[Cost]) -> Cost:
-    """Add up costs of what ran one after the other."""
+    """Add up costs of what ran one after the other.
+
+    A round without a floor, as of a fusion so small that it is solved directly, is taken to be as
+    far from it as the others.
+    """
+    seconds = sum(cost.seconds for cost in costs)
+    known = [cost for cost in costs if not math.isnan(cost.floor_seconds)]
+    share = sum(cost.seconds for cost in known) / seconds if seconds else 0
+    floor = sum(cost.floor_seconds for cost in known) / share if share else math.nan
     return Cost(
         stage=stage,
-        seconds=sum(cost.seconds for cost in costs),
+        seconds=seconds,
         cpu_seconds=sum(cost.cpu_seconds for cost in costs),
         page_faults=sum(cost.page_faults for cost in costs),
         peak_mb=max((cost.peak_mb for cost in costs), default=math.nan),
-        floor_seconds=sum(cost.floor_seconds for cost in costs),
+        floor_seconds=floor,
     )
 
 
@@ -370,8 +378,8 @@ def rows_of(found: Mapping[str, Any], rounds: bool = False) -> list[Cost]:
     after = costs[names.index("reconstruct") + 1 :] if "reconstruct" in names else costs
     return [
         *(costs if rounds else by_stage(costs)),
-        added("after structure from motion", after),
-        added("all", costs),
+        replace(added("after structure from motion", after), floor_seconds=math.nan),
+        replace(added("all", costs), floor_seconds=math.nan),
     ]
 
 

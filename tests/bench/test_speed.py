@@ -51,6 +51,16 @@ def test_rounds_of_a_stage_add_up_and_peaks_do_not(speed):
     assert (warp.peak_mb, fuse.seconds, fuse.peak_mb) == (70.0, 2, 90.0)
 
 
+def test_a_round_without_a_floor_is_as_far_from_it_as_the_others(speed):
+    rounds = [
+        speed.Cost(stage="fuse", seconds=seconds, cpu_seconds=1, page_faults=0, floor_seconds=floor)
+        for seconds, floor in ((6.0, math.nan), (10.0, 0.1), (30.0, 0.7))
+    ]
+    found = speed.added("fuse", rounds)
+    assert_close(found.seconds / found.floor_seconds, (10 + 30) / (0.1 + 0.7))
+    assert math.isnan(speed.added("fuse", rounds[:1]).floor_seconds)
+
+
 def test_a_stage_has_the_peak_of_its_own_time_though_others_begin_in_it(speed):
     with peak_memory() as peak:
         if peak() is None:
