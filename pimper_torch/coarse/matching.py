@@ -5,6 +5,7 @@ through the field, and windows are compared in what comes back: they are slanted
 the field is, at the price of one sample a pixel.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers, scale_intrinsics
+from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.records import Cameras, Record, SparseScene
 
 # Added to radiance over its bright level before the root: without it, the noise of black
@@ -150,6 +152,33 @@ class Matcher:
         # Around the mean, so that no difference of large numbers is left for single precision.
         self._deviation = self._weight * (around - self._mean)
         self._power = (self._deviation * (around - self._mean)).sum(dim=0)
+
+    def scores(
+        self, field: Float[Tensor, "height width"], offsets: Sequence[float]
+    ) -> Float[Tensor, "offset height width"]:
+        """Give the score of a field of inverse depths moved by each of some offsets."""
+        smallest = torch.finfo(field.dtype).tiny
+        if field.dtype != torch.float32 or not compiled_for(field, self._sources):
+            return torch.stack([self.score((field + one).clamp_min(smallest)) for one in offsets])
+        from pimper_torch.kernels.windows import window_scores
+
+        found = field.new_empty(len(offsets), *field.shape)
+        window_scores(
+            field.contiguous().numpy(),
+            field.new_tensor(offsets).numpy(),
+            self._pairing.ray.numpy(),
+            self._pairing.shift.numpy(),
+            self._sources[:, 0].numpy(),
+            (self._usable[:, 0] > 0).numpy(),
+            self._weight.numpy(),
+            self._deviation.numpy(),
+            self._power.numpy(),
+            self._here.numpy(),
+            self._windows.contrast**2,
+            self._windows.best,
+            found.numpy(),
+        )
+        return found
 
     def score(self, inverse_depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
         """Give the mean correlation of the best sources, 0 where none sees the pixel."""

@@ -12,6 +12,8 @@ from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize, pad
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.parallel import num_workers, side_by_side
 from pimper_torch.records import Record, SparseScene
 
 # Radius of the windows that planes are fitted in, pixels.
@@ -25,6 +27,10 @@ _REACH_STEPS = 3.0
 # contour of what is in front, which windows that match make too large.
 _LEAST_SHARE = 0.7
 
+# How often planes are fitted, again with what lies off the last one left out; what is added to the
+# diagonal of their normal equations.
+_FITTINGS, _RIDGE = 3, 1e-3
+
 # Points round a sparse one that tell its normal; the standard deviation across their plane
 # over the smaller one along it that is still a plane; the cosine to the mean ray at least.
 _NEIGHBOURS, _FLAT, _FACING = 12, 0.3, 0.2
@@ -37,7 +43,7 @@ _MOST_DOUBLINGS = 3
 _MOST_NOISE_STEPS = 1.0
 
 # Points whose places make a normal, and how many normals are made at once; bounds memory.
-_COMMON, _AT_ONCE = 24, 50_000
+_COMMON, _AT_ONCE = 24, 10_000
 
 # Length of the mean of unit normals round a point, at least: that of normals which scatter by
 # 60 degrees.
@@ -94,16 +100,18 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
     Args:
         maps: Of all resolutions, the coarsest first.
     """
-    clouds = []
-    for view in range(maps[0].valid.shape[0]):
-        finer = None
+
+    def of_view(view: int) -> OrientedPoints:
+        clouds, finer = [], None
         for one in reversed(maps):
             wanted = torch.ones_like(one.valid[view])
             if finer is not None:
                 wanted &= ~_covered(finer, wanted)
             cloud, finer = _of_view(one, view, wanted)
             clouds.append(cloud)
-    return joined_points(*clouds)
+        return joined_points(*clouds)
+
+    return joined_points(*side_by_side(of_view, range(maps[0].valid.shape[0])))
 
 
 def _covered(
@@ -163,33 +171,59 @@ def fitted_planes(
         The planes' inverse depths and slopes a pixel, the standard deviation of that inverse
         depth, and where there were enough neighbours on the plane.
     """
+    if inverse_depth.dtype == torch.float32 and compiled_for(inverse_depth):
+        fits = _compiled_fits(inverse_depth, valid, max(step, 1e-30))
+    else:
+        fits = _fits(inverse_depth, valid, max(step, 1e-30))
+    offset, across, down, variance, share = fits
+    fine = valid & (share >= _LEAST_SHARE) & (offset.abs() < 1)
+    # Neighbouring windows overlap, so that their errors are alike: no gain from averaging.
+    spread = step * variance.sqrt().clamp_min(0.05)
+    return inverse_depth + step * offset, step * torch.stack([across, down], dim=-1), spread, fine
+
+
+def _fits(
+    inverse_depth: Float[Tensor, "height width"], valid: Bool[Tensor, "height width"], step: float
+) -> Float[Tensor, "5 height width"]:
+    """Give offset, slopes, variance and mean weight of the planes, in steps; 0 where not valid."""
     steps = torch.arange(-_RADIUS, _RADIUS + 1).to(inverse_depth)
     v, u = (one.reshape(-1) for one in torch.meshgrid(steps, steps, indexing="ij"))
     basis = torch.stack([torch.ones_like(u), u, v], dim=-1)
     around = torch.stack(_neighbours(inverse_depth), dim=-1) - inverse_depth[..., None]
     counted = torch.stack(_neighbours(valid.to(inverse_depth)), dim=-1)
-    chosen = valid.nonzero(as_tuple=True)
-    around, counted = around[chosen] / max(step, 1e-30), counted[chosen]
+    around, counted = around[valid] / step, counted[valid]
     weight = counted * torch.exp(-(around / _REACH_STEPS).square() / 2)
     fit = torch.zeros_like(around[:, :3])
-    for _ in range(3):  # again with what lies off the plane left out
+    for _ in range(_FITTINGS):
         normal = torch.einsum("pk,ki,kj->pij", weight, basis, basis)
-        normal = normal + 1e-3 * torch.eye(3).to(normal)
+        normal = normal + _RIDGE * torch.eye(3).to(normal)
         fit = torch.linalg.solve(normal, torch.einsum("pk,ki,pk->pi", weight, basis, around))
         residual = around - fit @ basis.T
         weight = counted * torch.exp(-residual.square() / 2)
     share = weight.sum(dim=-1) / len(basis)
     variance = (weight * residual.square()).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1e-6)
-    fine = (share >= _LEAST_SHARE) & (fit[:, 0].abs() < 1)
-    # Neighbouring windows overlap, so that their errors are alike: no gain from averaging.
-    results = [torch.zeros_like(inverse_depth) for _ in range(4)]
-    for target, values in zip(
-        results, (fit[:, 0], fit[:, 1], fit[:, 2], variance.sqrt().clamp_min(0.05)), strict=True
-    ):
-        target[chosen] = step * values
-    kept = torch.zeros_like(valid)
-    kept[chosen] = fine
-    return inverse_depth + results[0], torch.stack(results[1:3], dim=-1), results[3], kept
+    results = inverse_depth.new_zeros(5, *inverse_depth.shape)
+    results[:, valid] = torch.stack([*fit.unbind(dim=1), variance, share])
+    return results
+
+
+def _compiled_fits(
+    inverse_depth: Float[Tensor, "height width"], valid: Bool[Tensor, "height width"], step: float
+) -> Float[Tensor, "5 height width"]:
+    from pimper_torch.kernels.planes import plane_fits
+
+    results = inverse_depth.new_zeros(5, *inverse_depth.shape)
+    plane_fits(
+        inverse_depth.contiguous().numpy(),
+        valid.contiguous().numpy(),
+        step,
+        _RADIUS,
+        _REACH_STEPS,
+        _RIDGE,
+        _FITTINGS,
+        results.numpy(),
+    )
+    return results
 
 
 def _neighbours(values: Float[Tensor, "height width"]) -> list[Float[Tensor, "height width"]]:
@@ -274,11 +308,11 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
     points = cloud.points_world.detach().cpu().numpy()
     if len(points) < 3:
         return cloud
-    _, nearest = cKDTree(points).query(points, k=min(_COMMON, len(points)))
+    _, nearest = cKDTree(points).query(points, k=min(_COMMON, len(points)), workers=num_workers())
     normals, places = cloud.normals_world.double().cpu(), cloud.points_world.double().cpu()
     weight = 1 / cloud.noise.double().cpu().clamp_min(1e-12).square()
-    found, agreement = [], []
-    for around in torch.split(torch.from_numpy(nearest), _AT_ONCE):
+
+    def common(around: Int[Tensor, "some near"]) -> tuple[Tensor, Tensor]:
         share = weight[around] / weight[around].sum(dim=1, keepdim=True)
         mean = (share[..., None] * normals[around]).sum(dim=1)
         alike = (normals[around] * mean[:, None]).sum(dim=-1) > 0
@@ -289,11 +323,12 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
         across = axes[:, :, 0]
         across = across * (across * mean).sum(dim=-1, keepdim=True).sign()
         flat = width[:, 0] < _FLAT**2 * width[:, 1]
-        found.append(torch.where(flat[:, None], across, normalize(mean, dim=-1)))
-        agreement.append(mean.norm(dim=-1))
-    common = torch.cat(found).to(cloud.normals_world)
-    alike = torch.cat(agreement).to(common) > _LEAST_AGREEMENT
-    return cloud.replace(normals_world=common).take(alike)
+        return torch.where(flat[:, None], across, normalize(mean, dim=-1)), mean.norm(dim=-1)
+
+    parts = torch.split(torch.from_numpy(nearest), _AT_ONCE)
+    found, agreement = zip(*side_by_side(common, parts, tracked=False), strict=True)
+    alike = torch.cat(agreement).to(cloud.normals_world) > _LEAST_AGREEMENT
+    return cloud.replace(normals_world=torch.cat(found).to(cloud.normals_world)).take(alike)
 
 
 def sparse_oriented(

@@ -19,6 +19,7 @@ from pimper_torch.geometry.surfaces import (
     side_lengths,
 )
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.parallel import num_workers, side_by_side
 from pimper_torch.records import Cameras, Record
 
 # Cosine between a face's normal and the ray to a camera, above which the view shows it.
@@ -66,8 +67,9 @@ def evidence(
     normals = normalize(face_normals(vertices, faces), dim=-1)
     side = side_lengths(vertices[faces]).amax(dim=1)
     caster = RayCaster(vertices, faces)
-    seen, lit, denied = (torch.zeros_like(faces[:, 0]) for _ in range(3))
-    for view in range(cameras.num_views):
+
+    def said(view: int) -> Int[Tensor, "kind face"]:
+        seen, lit, denied = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
         asked, column, row, depth = _shown(middle, cameras, view)
         center = cameras.centers_world[view]
         towards = normalize(center - middle[asked], dim=-1)
@@ -77,11 +79,17 @@ def evidence(
         row = row.clamp_max(level.tone.shape[-2] - 1)
         if maps is not None:
             behind = maps.inverse_depth[view, row, column] + _DENIED_STEPS * maps.step[view]
-            denied[asked] += maps.valid[view, row, column] & (1 / depth > behind)
+            denied[asked] = (maps.valid[view, row, column] & (1 / depth > behind)).long()
         open_ = ~caster.occluded(middle[asked], center, 0.5 * side[asked])
         open_ &= level.usable[view, row, column]
-        seen[asked] += open_
-        lit[asked] += open_ & (level.tone[view, row, column] > _LIT_TONE)
+        seen[asked] = open_.long()
+        lit[asked] = (open_ & (level.tone[view, row, column] > _LIT_TONE)).long()
+        return torch.stack([seen, lit, denied])
+
+    total = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
+    for one in side_by_side(said, range(cameras.num_views), tracked=False):
+        total += one
+    seen, lit, denied = total
     return Evidence(seen=seen, lit=lit, denied=denied)
 
 
@@ -99,7 +107,8 @@ def point_distances(
     places: Float[Tensor, "place 3"], points: Float[Tensor, "point 3"]
 ) -> Float[Tensor, " place"]:
     """Give each place's distance to the nearest point."""
-    distance, _ = cKDTree(points.detach().cpu().numpy()).query(places.detach().cpu().numpy())
+    tree = cKDTree(points.detach().cpu().numpy())
+    distance, _ = tree.query(places.detach().cpu().numpy(), workers=num_workers())
     return torch.from_numpy(distance).to(places)
 
 

@@ -14,6 +14,7 @@ from torch.nn.functional import grid_sample, pad
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.outlines.opencv import signed_distance
+from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Outlines, Record
 
 _VOXELS = 2**16  # at once: their 256 kB stay in a core's cache
@@ -127,7 +128,12 @@ def visual_hull(
         ``None`` where the outlines have nothing in common inside the box.
     """
     views = outlines.trusted.nonzero()[:, 0].tolist()
-    maps = [_framed(outlines.masks[view], cameras.sizes_px[view].tolist()) for view in views]
+    masks = outlines.masks
+
+    def framed(view: int) -> Float[Tensor, "high wide"]:
+        return _framed(masks[view], cameras.sizes_px[view].tolist())
+
+    maps = list(side_by_side(framed, views, tracked=False))
     chosen = cameras.take(views)
     low, high = box_world.to(chosen.intrinsics)
     first = _voted(maps, chosen, box_world, _FIRST, (disagreeing, least_seen))
@@ -239,10 +245,11 @@ def _voted(
     steps = spacing * from_world[..., :3]
     reach = [torch.arange(count).to(low) for count in counts.tolist()]
     slab = max(1, _VOXELS // int(counts[1:].prod()))
-    distance = [
-        _vote(maps, cameras, (first, steps), (some, reach[1], reach[2]), shares)
-        for some in torch.split(reach[0], slab)
-    ]
+
+    def vote(some: Float[Tensor, " x"]) -> Float[Tensor, "x y z"]:
+        return _vote(maps, cameras, (first, steps), (some, reach[1], reach[2]), shares)
+
+    distance = list(side_by_side(vote, torch.split(reach[0], slab), tracked=False))
     return Hull(origin_world=low, spacing=spacing, distance=torch.cat(distance))
 
 

@@ -18,6 +18,7 @@ from pimper_torch.outlines.opencv import signed_distance
 from pimper_torch.outlines.parallax import plane_agreement
 from pimper_torch.outlines.pictures import working_pictures
 from pimper_torch.outlines.rounds import Cues, Cuts, cut_in_rounds
+from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Outlines, SparseScene, Views
 
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
@@ -209,14 +210,18 @@ def _at_full_size(cuts: Cuts, views: Views) -> Float[Tensor, "view height width"
     """Turn cuts into probabilities at the photographs' size; 0 in the padding."""
     height, width = views.images.shape[-2:]
     device = views.images.device
-    found = torch.empty(len(cuts.masks), height, width, device=device)
-    for view, (cut, margin) in enumerate(zip(cuts.masks, cuts.margins_px, strict=True)):
+
+    def enlarged(view: int) -> Float[Tensor, "height width"]:
+        cut, margin = cuts.masks[view], cuts.margins_px[view]
         layers = torch.stack([signed_distance(cut), margin.clamp(-100, 100)])
         border, hull = interpolate(
             layers[None], (height, width), mode="bilinear", align_corners=False
         )[0]
         inside = torch.sigmoid(border / _SOFT)
         inside = torch.where((border > 2) & (hull < -2), _UNSURE_INSIDE, inside)
-        inside = torch.where((border < -2) & (hull > 2), _UNSURE_OUTSIDE, inside)
+        return torch.where((border < -2) & (hull > 2), _UNSURE_OUTSIDE, inside)
+
+    found = torch.empty(len(cuts.masks), height, width, device=device)
+    for view, inside in enumerate(side_by_side(enlarged, range(len(cuts.masks)), tracked=False)):
         found[view] = inside.to(device)
     return found * views.inside

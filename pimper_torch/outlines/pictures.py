@@ -8,6 +8,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.outlines.opencv import shrunk
+from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry.srgb import srgb_from_linear
 from pimper_torch.records import Cameras, Record, Views
 
@@ -42,15 +43,16 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> Pictures:
     factor = min(1.0, size_px / max(height, width))
     wide, high = max(1, round(factor * width)), max(1, round(factor * height))
     factors = (wide / width, high / height)
-    colours, opponent, grey = [], [], []
-    for image in views.images.detach().cpu():
+
+    def shown(image: Float[Tensor, "channel _ _"]) -> tuple[Tensor, Tensor, Tensor]:
         small = shrunk(image, wide, high)
         level = torch.quantile(small.mean(dim=0).flatten()[::7], _BRIGHT).clamp_min(1e-6)
         radiance = (small / level).clamp(0, 1).expand(3, -1, -1)
-        shown = (255 * srgb_from_linear(radiance)).round().byte()
-        colours.append(shown.permute(1, 2, 0))
-        opponent.append(_opponent(radiance))
-        grey.append(torch.log(small.mean(dim=0) / level + _DARK))
+        colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)
+        return colours, _opponent(radiance), torch.log(small.mean(dim=0) / level + _DARK)
+
+    images = views.images.detach().cpu()
+    colours, opponent, grey = zip(*side_by_side(shown, images, tracked=False), strict=True)
     scale = torch.tensor(factors)
     return Pictures(
         colours=torch.stack(colours).contiguous(),

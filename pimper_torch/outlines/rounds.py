@@ -1,5 +1,6 @@
 """Rounds of cutting every view and of voting on what the cuts have in common."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +27,7 @@ from pimper_torch.outlines.seeds import (
     off_level,
     off_plane,
 )
-from pimper_torch.progress import track
+from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Outlines, Record
 
 # Points of the object that a view must observe, in the median, to be seeded by them.
@@ -121,24 +122,26 @@ def _filled(
     cues: Cues, masks: Bool[Tensor, "view height width"]
 ) -> Bool[Tensor, "view height width"]:
     """Fill holes that the plane is not seen through."""
-    if cues.agreement is None:
+    agreement = cues.agreement
+    if agreement is None:
         return masks
-    return torch.stack([filled(*pair) for pair in zip(masks, cues.agreement, strict=True)])
+    return _of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
 
 
 def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
     """Cut from points and parallax; where hardly any points are the object's, parallax alone."""
     height, width = cues.pictures.grey.shape[1:]
-    found = []
-    for view, own_px in enumerate(cues.own_px):
+
+    def first(view: int) -> Bool[Tensor, "height width"]:
+        own_px = cues.own_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
         if agreement is not None and not cues.has_points:
-            found.append(off_plane(agreement))
-            continue
+            return off_plane(agreement)
         labels = labels_from_points(own_px, cues.other_px[view], agreement, (width, height))
         margin = signed_distance(convex_hull_of(own_px, (width, height)))
-        found.append(_cut(cues, view, labels, margin))
-    return torch.stack(found)
+        return _cut(cues, view, labels, margin)
+
+    return _of_views(first, cues.num_views)
 
 
 def _again(
@@ -147,14 +150,15 @@ def _again(
     seen: Float[Tensor, "view height width"],
 ) -> Bool[Tensor, "view height width"]:
     """Cut from the last cut and the hull; drop what does not meet the hull."""
-    found = []
-    for view in track(range(cues.num_views)):
+
+    def again(view: int) -> Bool[Tensor, "height width"]:
         own_px = cues.own_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
         labels = labels_from_hull(seen[view], masks[view], own_px, agreement)
         cut = _cut(cues, view, labels, seen[view])
-        found.append(without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel())))
-    return torch.stack(found)
+        return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
+
+    return _of_views(again, cues.num_views)
 
 
 def _cut(
@@ -183,10 +187,14 @@ def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
     That is what the object's points surround and the plane is not seen through, and what is
     brighter or darker than the plane can be.
     """
-    if cues.agreement is None or not cues.has_points:
+    own_px, agreement = cues.own_px, cues.agreement
+    if agreement is None or not cues.has_points:
         return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
-    pairs = zip(cues.own_px, cues.agreement, strict=True)
-    return torch.stack([not_seen_through(*pair) | off_level(pair[1]) for pair in pairs])
+
+    def likely(view: int) -> Bool[Tensor, "height width"]:
+        return not_seen_through(own_px[view], agreement[view]) | off_level(agreement[view])
+
+    return _of_views(likely, cues.num_views)
 
 
 def _voted(
@@ -205,9 +213,14 @@ def _voted(
     if cues.plane is not None:
         hull = hull.above(cues.plane.normal_world, cues.plane.offset)
     height, width = masks.shape[1:]
-    return torch.stack(
-        [
-            margins(hull, cameras.intrinsics[view], cameras.cam_from_world[view], (width, height))
-            for view in range(len(masks))
-        ]
-    )
+
+    def margin(view: int) -> Float[Tensor, "height width"]:
+        frame = cameras.cam_from_world[view]
+        return margins(hull, cameras.intrinsics[view], frame, (width, height))
+
+    return _of_views(margin, len(masks))
+
+
+def _of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
+    """Stack what is computed of every view by itself."""
+    return torch.stack(list(side_by_side(work, range(count))))

@@ -94,12 +94,13 @@ def box_round(outlines: Outlines, cameras: Cameras) -> Float[Tensor, "2 3"] | No
     Returns:
         ``None`` where fewer than two trusted views show anything.
     """
-    views = (outlines.trusted & outlines.masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
+    masks = outlines.masks
+    views = (outlines.trusted & masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
     if len(views) < 2:
         return None
     chosen, boxes = cameras.take(views), []
     for view in views:
-        rows, columns = (outlines.masks[view].any(dim=1 - axis).nonzero() for axis in (0, 1))
+        rows, columns = (masks[view].any(dim=1 - axis).nonzero() for axis in (0, 1))
         low = torch.stack([columns.amin(), rows.amin()])
         boxes.append(torch.stack([low, torch.stack([columns.amax(), rows.amax()]) + 1]))
     low, high = torch.stack(boxes).to(chosen.intrinsics).unbind(dim=1)

@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 from pimper_torch.config import require
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
+from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Outlines, RimRays
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -87,10 +88,12 @@ def rim_rays(outlines: Outlines, cameras: Cameras, config: RimConfig | None = No
         and what lies at the photograph's border have none. A constant to autograd.
     """
     config = config or RimConfig()
-    found = [_nothing(cameras)] + [
-        _of_view(outlines.inside[view], cameras, view, config)
-        for view in outlines.trusted.nonzero()[:, 0].tolist()
-    ]
+
+    def of_view(view: int) -> RimRays:
+        return _of_view(outlines.inside[view], cameras, view, config)
+
+    views = outlines.trusted.nonzero()[:, 0].tolist()
+    found = [_nothing(cameras), *side_by_side(of_view, views)]
     return RimRays(
         view=torch.cat([one.view for one in found]),
         pixels=torch.cat([one.pixels for one in found]),

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.outlines.hull import Hull
+from pimper_torch.parallel import num_workers
 from pimper_torch.records import Cameras, RimPoints, RimRays
 
 # Cosine between the offset from the nearest point's disc and its normal, from which on a place
@@ -111,7 +112,7 @@ class _SignedDistance:
         self._points, self._normals, self._tree = points, normals, cKDTree(places)
 
     def __call__(self, places: Float[Tensor, "place 3"]) -> Float[Tensor, " place"]:
-        _, nearest = self._tree.query(places.detach().cpu().double().numpy())
+        _, nearest = self._tree.query(places.detach().cpu().double().numpy(), workers=num_workers())
         index = torch.from_numpy(nearest).to(self._points.device)
         offset, normals = places - self._points[index], self._normals[index]
         height = (offset * normals).sum(dim=1)
@@ -122,7 +123,8 @@ class _SignedDistance:
     def _radii(self, index: Int[Tensor, " place"]) -> Float[Tensor, " place"]:
         some, place = torch.unique(index, return_inverse=True)
         count = min(_NEIGHBOURS, len(self._points))
-        reach, _ = self._tree.query(self._points[some].detach().cpu().double().numpy(), k=[count])
+        chosen = self._points[some].detach().cpu().double().numpy()
+        reach, _ = self._tree.query(chosen, k=[count], workers=num_workers())
         return torch.from_numpy(np.asarray(reach)[:, 0]).to(self._points)[place]
 
 
