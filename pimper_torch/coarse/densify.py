@@ -92,7 +92,7 @@ class DepthMaps(Record):
         level: The photographs at that resolution.
         inverse_depth: Of every pixel, whether it can be believed or not.
         score: Correlation of the windows.
-        agreed: How many other views agree.
+        agreed: How many other views agree; 0 where the windows do not match.
         valid: True where enough of them do, and the windows match.
         step: Change of inverse depth that moves a pixel by one in the sources; one a view.
         sources: The views each was matched with, -1 for none.
@@ -257,38 +257,44 @@ def agreeing(
     others: Int[Tensor, " other"],
     max_error_px: float,
 ) -> Int[Tensor, "height width"]:
-    """Count the views whose depths say the same: there and back lands on the same pixel."""
+    """Count the views whose depths say the same: there and back lands on the same pixel.
+
+    0 where the view's own depth is not good.
+    """
     height, width = inverse_depth.shape[-2:]
+    count = torch.zeros_like(good[view], dtype=torch.long)
     if len(others) == 0:
-        return torch.zeros_like(good[view], dtype=torch.long)
+        return count
+    chosen, known = good[view], inverse_depth[view][good[view]]
     forth = pair(level, view, others)
-    place, ratio = forth.look(inverse_depth[view])
+    place, ratio = forth.replace(ray=forth.ray[:, :, chosen]).look(known)
     grid = grid_from_pixels(place.movedim(1, -1), width, height)
     there = _looked_up(inverse_depth[others], grid, "nearest")
     fine = _looked_up(good[others].to(there), grid, "nearest") > 0.5
-    expected = inverse_depth[view] / ratio.clamp_min(1e-6)
+    expected = known / ratio.clamp_min(1e-6)
     # Depth there is compared where it is read: how far the source's own point would move
     # on this view's picture is its step in inverse depth, in pixels.
     rate = _pixels_per_inverse_depth(level, view, others, place, there)
     error = (there - expected).abs() * rate
-    return (fine & (ratio > 0) & (error <= max_error_px)).sum(dim=0)
+    count[chosen] = (fine & (ratio > 0) & (error <= max_error_px)).sum(dim=0)
+    return count
 
 
 def _pixels_per_inverse_depth(
     level: Level,
     view: int,
     others: Int[Tensor, " other"],
-    place: Float[Tensor, "other 2 height width"],
-    inverse_depth: Float[Tensor, "other height width"],
-) -> Float[Tensor, "other height width"]:
+    place: Float[Tensor, "other 2 place"],
+    inverse_depth: Float[Tensor, "other place"],
+) -> Float[Tensor, "other place"]:
     """Say how fast the points that sources see move on a view as their inverse depth changes."""
     cameras = level.cameras
     frames, intrinsics = cameras.cam_from_world.double(), cameras.intrinsics.double()
     relative = frames[view] @ torch.linalg.inv(frames[others])
     turn = intrinsics[view] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[others])
-    shift = (intrinsics[view] @ relative[:, :3, 3:])[..., 0].to(place)[:, :, None, None]
+    shift = (intrinsics[view] @ relative[:, :3, 3:])[..., 0].to(place)[:, :, None]
     homogeneous = torch.cat([place, torch.ones_like(place[:, :1])], dim=1)
-    ray = torch.einsum("oij,ojhw->oihw", turn.to(place), homogeneous)
+    ray = torch.einsum("oij,ojp->oip", turn.to(place), homogeneous)
     at = ray + inverse_depth[:, None] * shift
     depth = at[:, 2:].clamp_min(1e-6)
     rate = (shift[:, :2] - at[:, :2] / depth * shift[:, 2:]) / depth
@@ -360,9 +366,21 @@ def spanned(
 def median3(values: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     """Take the median of every pixel and its eight neighbours."""
     wide = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    # Columns of three sorted once, then the largest of the smallest, the median of the middle ones
+    # and the smallest of the largest: their median is that of the nine.
     height, width = values.shape
-    around = [wide[r : r + height, c : c + width] for r in range(3) for c in range(3)]
-    return torch.stack(around).median(dim=0).values
+    low, middle, high = _sorted3(*(wide[row : row + height] for row in range(3)))
+    lows, middles, highs = (
+        [one[:, column : column + width] for column in range(3)] for one in (low, middle, high)
+    )
+    return _sorted3(_sorted3(*lows)[2], _sorted3(*middles)[1], _sorted3(*highs)[0])[1]
+
+
+def _sorted3(one: Tensor, other: Tensor, third: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    low, high = torch.minimum(one, other), torch.maximum(one, other)
+    most = torch.maximum(high, third)
+    rest = torch.minimum(high, third)
+    return torch.minimum(low, rest), torch.maximum(low, rest), most
 
 
 def _nearest_around(
@@ -372,6 +390,6 @@ def _nearest_around(
 
 
 def _looked_up(
-    maps: Float[Tensor, "other height width"], grid: Float[Tensor, "other height width 2"], how: str
-) -> Float[Tensor, "other height width"]:
-    return grid_sample(maps[:, None], grid, mode=how, align_corners=False)[:, 0]
+    maps: Float[Tensor, "other height width"], grid: Float[Tensor, "other place 2"], how: str
+) -> Float[Tensor, "other place"]:
+    return grid_sample(maps[:, None], grid[:, None], mode=how, align_corners=False)[:, 0, 0]

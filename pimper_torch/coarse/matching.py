@@ -76,20 +76,20 @@ class Pairing(Record):
     Attributes:
         view: The view.
         sources: Those it is matched with.
-        ray: ``A_s (u, v, 1)`` of every pixel.
+        ray: ``A_s (u, v, 1)`` of every pixel of the view, or of some.
         shift: ``b_s``.
     """
 
     view: int
     sources: Int[Tensor, " source"]
-    ray: Float[Tensor, "source 3 height width"]
+    ray: Float[Tensor, "source 3 *pixel"]
     shift: Float[Tensor, "source 3"]
 
     def look(
-        self, inverse_depth: Float[Tensor, "height width"]
-    ) -> tuple[Float[Tensor, "source 2 height width"], Float[Tensor, "source height width"]]:
+        self, inverse_depth: Float[Tensor, "*pixel"]
+    ) -> tuple[Float[Tensor, "source 2 *pixel"], Float[Tensor, " source *pixel"]]:
         """Give each pixel's place in the sources, and its depth there over its depth here."""
-        at = self.ray + self.shift[:, :, None, None] * inverse_depth
+        at = self.ray + self.shift.reshape(-1, 3, *(1,) * inverse_depth.dim()) * inverse_depth
         ratio = at[:, 2]
         return at[:, :2] / ratio.clamp_min(1e-6)[:, None], ratio
 
@@ -102,11 +102,12 @@ def pair(level: Level, view: int, sources: Int[Tensor, " source"]) -> Pairing:
     relative = frames[sources] @ torch.linalg.inv(frames[view])
     turn = intrinsics[sources] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[view])
     pixels = pixel_centers(width, height, like=turn)
-    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
+    u, v = pixels[0, :, 0], pixels[:, 0, 1]
+    across, down = turn[:, :, :1] * u, turn[:, :, 1:2] * v + turn[:, :, 2:]
     return Pairing(
         view=view,
         sources=sources,
-        ray=torch.einsum("sij,hwj->sihw", turn, homogeneous).to(level.tone),
+        ray=(down[..., None] + across[:, :, None]).to(level.tone),
         shift=(intrinsics[sources] @ relative[:, :3, 3:])[..., 0].to(level.tone),
     )
 
@@ -142,6 +143,10 @@ class Matcher:
         self._usable = level.usable[pairing.sources, None].to(self._sources)
         self._here = level.usable[pairing.view]
         tone = level.tone[pairing.view]
+        self._compiled = tone.dtype == torch.float32 and compiled_for(tone)
+        if self._compiled:
+            self._weigh(tone)
+            return
         around = torch.stack(_shifted(tone, windows.radius))
         weight = _spatial(windows.radius).to(tone)[:, None, None] * torch.exp(
             -((around - tone) / windows.likeness).square() / 2
@@ -153,12 +158,29 @@ class Matcher:
         self._deviation = self._weight * (around - self._mean)
         self._power = (self._deviation * (around - self._mean)).sum(dim=0)
 
+    def _weigh(self, tone: Float[Tensor, "height width"]) -> None:
+        from pimper_torch.kernels.windows import window_weights
+
+        radius = self._windows.radius
+        self._power = torch.empty_like(tone)
+        self._weight = tone.new_empty((2 * radius + 1) ** 2, *tone.shape)
+        self._deviation = torch.empty_like(self._weight)
+        window_weights(
+            tone.contiguous().numpy(),
+            self._here.contiguous().numpy(),
+            _spatial(radius).double().numpy(),
+            self._windows.likeness,
+            self._weight.numpy(),
+            self._deviation.numpy(),
+            self._power.numpy(),
+        )
+
     def scores(
         self, field: Float[Tensor, "height width"], offsets: Sequence[float]
     ) -> Float[Tensor, "offset height width"]:
         """Give the score of a field of inverse depths moved by each of some offsets."""
-        smallest = torch.finfo(field.dtype).tiny
-        if field.dtype != torch.float32 or not compiled_for(field, self._sources):
+        if not self._compiled:
+            smallest = torch.finfo(field.dtype).tiny
             return torch.stack([self.score((field + one).clamp_min(smallest)) for one in offsets])
         from pimper_torch.kernels.windows import window_scores
 

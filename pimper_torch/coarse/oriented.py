@@ -145,7 +145,7 @@ def _of_view(
     oblique = -(normalize(rays, dim=-1) * normals).sum(dim=-1)
     noise = spread / q.square() * rays.norm(dim=-1) * oblique
     cloud = OrientedPoints(points_world=points, normals_world=normals, noise=noise)
-    borne_out = _denied(maps, view, points) <= maps.agreed[view][fine]
+    borne_out = denied(maps, view, points) <= maps.agreed[view][fine]
     kept = borne_out & (oblique > 0)
     known = ~wanted
     known[fine] = kept
@@ -233,10 +233,22 @@ def _neighbours(values: Float[Tensor, "height width"]) -> list[Float[Tensor, "he
     return [wide[row : row + height, column : column + width] for row in side for column in side]
 
 
-def _denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
+def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
     """Count the views that see something behind the points."""
-    cameras, count = maps.level.cameras, torch.zeros(len(points), dtype=torch.long)
-    count = count.to(points.device)
+    cameras, count = maps.level.cameras, torch.zeros_like(points[:, 0], dtype=torch.long)
+    if points.dtype == maps.inverse_depth.dtype == torch.float32 and compiled_for(points):
+        from pimper_torch.kernels.denied import count_denied
+
+        count_denied(
+            points.contiguous().numpy(),
+            view,
+            (cameras.intrinsics @ cameras.cam_from_world[:, :3]).contiguous().numpy(),
+            maps.inverse_depth.numpy(),
+            maps.valid.numpy(),
+            (_DENIED_STEPS * maps.step).numpy(),
+            count.numpy(),
+        )
+        return count
     height, width = maps.valid.shape[-2:]
     for other in range(cameras.num_views):
         if other == view:

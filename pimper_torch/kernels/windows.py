@@ -1,4 +1,4 @@
-"""Correlation of windows through moved fields: the twin of ``Matcher.scores``."""
+"""Windows and their correlation through moved fields: the twin of ``Matcher``."""
 
 import math
 
@@ -13,8 +13,64 @@ _CACHED = 3 << 18
 _ROW = "float32[::1]"
 
 
+@compiled(
+    "void(float32[:,::1], boolean[:,::1], float64[::1], float64, float32[:,:,::1], "
+    "float32[:,:,::1], float32[:,::1])"
+)
+def window_weights(
+    tone: NDArray[np.float32],
+    here: NDArray[np.bool_],
+    spatial: NDArray[np.float64],
+    likeness: float,
+    weight: NDArray[np.float32],
+    deviation: NDArray[np.float32],
+    power: NDArray[np.float32],
+) -> None:
+    """Fill in what :func:`window_scores` knows of every window of a view beforehand.
+
+    Args:
+        tone: Of the view, ``height width``.
+        here: Where it says something; elsewhere 0 is filled in.
+        spatial: Weight of every place of a window, row by row.
+        likeness: Difference of tone to the middle at which a weight has fallen to 0.6.
+        weight: Filled in, ``place height width``; adds up to 1.
+        deviation: Filled in: weight times the difference of the tone to the window's mean.
+        power: Filled in: variance of the tone in the window.
+    """
+    height, width = tone.shape
+    num_places = len(spatial)
+    side = int(math.sqrt(num_places) + 0.5)
+    around, share = np.empty(num_places), np.empty(num_places)
+    rows, columns = np.empty(num_places, dtype=np.int64), np.empty(num_places, dtype=np.int64)
+    for place in range(num_places):
+        rows[place], columns[place] = place // side - side // 2, place % side - side // 2
+    weight[:] = 0
+    deviation[:] = 0
+    power[:] = 0
+    for y in range(height):
+        for x in range(width):
+            if not here[y, x]:
+                continue
+            total = mean = variance = 0.0
+            for place in range(num_places):
+                row = min(max(y + rows[place], 0), height - 1)
+                column = min(max(x + columns[place], 0), width - 1)
+                around[place] = tone[row, column]
+                away = (around[place] - tone[y, x]) / likeness
+                share[place] = spatial[place] * math.exp(-away * away / 2) * here[row, column]
+                total += share[place]
+                mean += share[place] * around[place]
+            mean /= total
+            for place in range(num_places):
+                weighed = share[place] / total
+                off = weighed * (around[place] - mean)
+                weight[place, y, x], deviation[place, y, x] = weighed, off
+                variance += off * (around[place] - mean)
+            power[y, x] = variance
+
+
 # Loops of one written row and few read ones: only those become vector instructions.
-@compiled(f"void({_ROW}, {_ROW}, {_ROW}, {_ROW}, float32, float32, float32, float32)")
+@compiled(f"void({_ROW}, {_ROW}, {_ROW}, {_ROW}, float32, float32, float32)")
 def _place(
     places: NDArray[np.float32],
     field: NDArray[np.float32],
@@ -23,11 +79,10 @@ def _place(
     offset: float,
     shift: float,
     shift_depth: float,
-    behind: float,
 ) -> None:
     """Give one coordinate of the places that a row of pixels has in a source."""
     tiny, near, zero = np.float32(np.finfo(np.float32).tiny), np.float32(1e-6), np.float32(0)
-    half = np.float32(0.5)
+    half, behind = np.float32(0.5), np.float32(-1e9)  # left of every picture
     for x in range(len(places)):
         q = max(field[x] + offset, tiny)
         ratio = depth[x] + shift_depth * q
@@ -184,13 +239,8 @@ def window_scores(
                     u, v = across[low:high], down[low:high]
                     moved, depth = field[y, low:high], ray[s, 2, y, low:high]
                     offset, along = offsets[index], shift[s, 2]
-                    behind = np.float32(-1e9)
-                    _place(
-                        u, moved, ray[s, 0, y, low:high], depth, offset, shift[s, 0], along, behind
-                    )
-                    _place(
-                        v, moved, ray[s, 1, y, low:high], depth, offset, shift[s, 1], along, behind
-                    )
+                    _place(u, moved, ray[s, 0, y, low:high], depth, offset, shift[s, 0], along)
+                    _place(v, moved, ray[s, 1, y, low:high], depth, offset, shift[s, 1], along)
                     values = seen[s, row, low + radius : high + radius]
                     asked = here[y, low:high]
                     _look_up(values, there[s, row, low:high], u, v, asked, tone[s], usable[s])
@@ -209,9 +259,8 @@ def window_scores(
                         _add_powers(mean, square, weight[place, y, low:high], values)
                         _add(both, deviation[place, y, low:high], values)
                     told = there[s, y - top + radius, low:high]
-                    _correlate(
-                        found[s, low:high], mean, square, both, power[y, low:high], told, floor
-                    )
+                    likeness, varied = found[s, low:high], power[y, low:high]
+                    _correlate(likeness, mean, square, both, varied, told, floor)
                 for rank in range(best):
                     for s in range(num_sources - 1, rank, -1):
                         _swap(found[s - 1, low:high], found[s, low:high])

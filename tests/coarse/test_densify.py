@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.coarse.densify import push_pull, sweep
+from pimper_torch.coarse.densify import agreeing, median3, push_pull, sweep
 from pimper_torch.coarse.matching import Matcher, Windows, level_of, mean_of_largest, pair
 from pimper_torch.coarse.oriented import OrientedPoints, fitted_planes, thinned
 from pimper_torch.coarse.trim import (
@@ -187,3 +187,26 @@ def test_what_spans_a_gap_does_not_go_with_what_hangs_in_the_air_beside_it():
     far = too_far(flat.faces, between, distance, 4.0, 1.0)
     assert (far == (wide < 5)).all()
     assert not too_far(flat.faces, between, distance, 6.0, 1.0).any()
+
+
+def test_the_median_of_nine_is_that_of_a_sort():
+    values = torch.randn(17, 23, generator=torch.Generator().manual_seed(0))
+    wide = torch.nn.functional.pad(values[None], (1, 1, 1, 1), mode="replicate")[0]
+    around = wide.unfold(0, 3, 1).unfold(1, 3, 1).flatten(2)
+    assert torch.equal(median3(values), around.median(dim=2).values)
+
+
+def test_a_view_agrees_with_those_that_see_the_same_surface_and_with_none_that_sees_another():
+    truth, scene = ball()
+    level = level_of(scene, 1)
+    depth = truth.depth.float()
+    inverse_depth = torch.where(depth.isfinite(), 1 / depth, 0.0)
+    good, others = depth.isfinite(), torch.tensor([1, 3])
+    count = agreeing(level, inverse_depth, good, 2, others, 1.0)
+    inner = good[2] & (truth.normals_world[2][..., 2] > 0.7)
+    assert float((count[inner] == 2).double().mean()) > 0.98
+    assert not bool(count[~good[2]].any())
+    wrong = inverse_depth.clone()
+    wrong[3] *= 1.1
+    count = agreeing(level, wrong, good, 2, others, 1.0)
+    assert float((count[inner] == 1).double().mean()) > 0.98
