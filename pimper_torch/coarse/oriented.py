@@ -320,7 +320,7 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
     points = cloud.points_world.detach().cpu().numpy()
     if len(points) < 3:
         return cloud
-    _, nearest = cKDTree(points).query(points, k=min(_COMMON, len(points)), workers=num_workers())
+    nearest = cKDTree(points).query(points, min(_COMMON, len(points)), workers=num_workers())[1]
     normals, places = cloud.normals_world.double().cpu(), cloud.points_world.double().cpu()
     weight = 1 / cloud.noise.double().cpu().clamp_min(1e-12).square()
 

@@ -16,7 +16,8 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.outlines.ground import Gaze, Plane
 from pimper_torch.outlines.opencv import warped, window_means
-from pimper_torch.outlines.pictures import Pictures
+from pimper_torch.outlines.pictures import Pictures, of_views
+from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record
 
 # Shares of the pictures' longer side.
@@ -31,6 +32,7 @@ _STEP = 2.0  # working pixels at the fixation point between samples of the plane
 _FAR_REACH, _FAR_STEP = 2.0, 8.0
 _NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
 _LEAST_VIEWS = 3  # of which two agree
+_SAMPLES = 2**20  # of the plane, over all views, at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -71,20 +73,23 @@ def plane_agreement(
     """
     cameras, longer = pictures.cameras, max(pictures.grey.shape[1:])
     hidden = torch.zeros_like(pictures.grey, dtype=torch.bool) if hidden is None else hidden
-    texture = torch.stack(
-        [_textured(grey, off, longer) for grey, off in zip(pictures.grey, hidden, strict=True)]
-    )
+
+    def textured(view: int) -> Float[Tensor, "height width"]:
+        return _textured(pictures.grey[view], hidden[view], longer)
+
+    texture = of_views(textured, cameras.num_views)
     seen, radiance = (layer.masked_fill(hidden, torch.nan) for layer in (texture, pictures.grey))
     common, spread = _common(seen, cameras, _sheet(cameras, plane, gaze, _REACH, _STEP))
     far = _sheet(cameras, plane, gaze, _FAR_REACH, _FAR_STEP)
     level, level_spread = _common(radiance, cameras, far)
-    found = []
-    for view, one in enumerate(texture):
-        agreement = _agreement(one, common[view], spread[view], longer)
+
+    def agreement_of(view: int) -> Float[Tensor, "height width"]:
+        agreement = _agreement(texture[view], common[view], spread[view], longer)
         other = (pictures.grey[view] - level[view]).abs() > _NO_SHADOW
         other &= level_spread[view] < _NO_SHADOW / 2
-        found.append(torch.where(~(agreement > DISPUTED) & other, -1, agreement))
-    return torch.stack(found)
+        return torch.where(~(agreement > DISPUTED) & other, -1, agreement)
+
+    return of_views(agreement_of, cameras.num_views)
 
 
 def _common(
@@ -92,18 +97,26 @@ def _common(
 ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
     """Give the views' median of each place on the plane, and its spread, as each view sees it."""
     maps = [cameras.intrinsics[v] @ _on_sheet(cameras, sheet, v) for v in range(len(values))]
-    size = (sheet.size_px, sheet.size_px)
-    seen = torch.stack([warped(one, to, size) for one, to in zip(values, maps, strict=True)])
+    square = (sheet.size_px, sheet.size_px)
+    seen = of_views(lambda view: warped(values[view], maps[view], square), len(values))
+    rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * sheet.size_px)), dim=1)
+    common, spread = torch.cat(list(side_by_side(_middle, rows, tracked=False)), dim=1)
+    size = (values.shape[2], values.shape[1])
+
+    def back(view: int) -> Float[Tensor, "layer height width"]:
+        to = torch.linalg.inv(maps[view])
+        return torch.stack([_before(warped(one, to, size), to) for one in (common, spread)])
+
+    common, spread = of_views(back, len(values)).unbind(dim=1)
+    return common, spread
+
+
+def _middle(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row column"]:
+    """Give the views' median and the spread round it; NaN where too few see the plane."""
     common = seen.nanmedian(dim=0).values
     spread = (seen - common).abs().nanmedian(dim=0).values
     few = seen.isfinite().sum(dim=0) < _LEAST_VIEWS
-    common, spread = common.masked_fill(few, torch.nan), spread.masked_fill(few, torch.nan)
-    size = (values.shape[2], values.shape[1])
-    back = [torch.linalg.inv(to) for to in maps]
-    return (
-        torch.stack([_before(warped(common, to, size), to) for to in back]),
-        torch.stack([_before(warped(spread, to, size), to) for to in back]),
-    )
+    return torch.stack([common, spread]).masked_fill(few, torch.nan)
 
 
 def _before(

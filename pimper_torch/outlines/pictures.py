@@ -1,5 +1,6 @@
 """Photographs at the size that outlines are looked for in."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -51,7 +52,7 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> Pictures:
         colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)
         return colours, _opponent(radiance), torch.log(small.mean(dim=0) / level + _DARK)
 
-    images = views.images.detach().cpu()
+    images = views.images.detach().cpu().unbind()
     colours, opponent, grey = zip(*side_by_side(shown, images, tracked=False), strict=True)
     scale = torch.tensor(factors)
     return Pictures(
@@ -64,6 +65,11 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> Pictures:
         ),
         factors=factors,
     )
+
+
+def of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
+    """Stack what is computed of every view by itself."""
+    return torch.stack(list(side_by_side(work, range(count))))
 
 
 def _opponent(radiance: Float[Tensor, "3 height width"]) -> UInt8[Tensor, "height width 3"]:

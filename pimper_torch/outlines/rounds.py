@@ -1,6 +1,5 @@
 """Rounds of cutting every view and of voting on what the cuts have in common."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +16,7 @@ from pimper_torch.outlines.opencv import (
     without_specks,
 )
 from pimper_torch.outlines.parallax import DISPUTED, plane_agreement
-from pimper_torch.outlines.pictures import Pictures
+from pimper_torch.outlines.pictures import Pictures, of_views
 from pimper_torch.outlines.seeds import (
     filled,
     is_deep,
@@ -27,7 +26,6 @@ from pimper_torch.outlines.seeds import (
     off_level,
     off_plane,
 )
-from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Outlines, Record
 
 # Points of the object that a view must observe, in the median, to be seeded by them.
@@ -125,7 +123,7 @@ def _filled(
     agreement = cues.agreement
     if agreement is None:
         return masks
-    return _of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
+    return of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
 
 
 def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
@@ -141,7 +139,7 @@ def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
         margin = signed_distance(convex_hull_of(own_px, (width, height)))
         return _cut(cues, view, labels, margin)
 
-    return _of_views(first, cues.num_views)
+    return of_views(first, cues.num_views)
 
 
 def _again(
@@ -158,7 +156,7 @@ def _again(
         cut = _cut(cues, view, labels, seen[view])
         return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
 
-    return _of_views(again, cues.num_views)
+    return of_views(again, cues.num_views)
 
 
 def _cut(
@@ -194,7 +192,7 @@ def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
     def likely(view: int) -> Bool[Tensor, "height width"]:
         return not_seen_through(own_px[view], agreement[view]) | off_level(agreement[view])
 
-    return _of_views(likely, cues.num_views)
+    return of_views(likely, cues.num_views)
 
 
 def _voted(
@@ -218,9 +216,4 @@ def _voted(
         frame = cameras.cam_from_world[view]
         return margins(hull, cameras.intrinsics[view], frame, (width, height))
 
-    return _of_views(margin, len(masks))
-
-
-def _of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
-    """Stack what is computed of every view by itself."""
-    return torch.stack(list(side_by_side(work, range(count))))
+    return of_views(margin, len(masks))
