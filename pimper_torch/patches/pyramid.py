@@ -7,32 +7,6 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels
-from pimper_torch.records import Views
-
-
-def image_pyramid(
-    views: Views, saturation_level: float, levels: int
-) -> list[Float[Tensor, "view channels _ _"]]:
-    """Halve the images again and again; the last channel is 1 where a pixel is unusable.
-
-    Unusable is what lies outside the undistorted frame or the mask, is not finite, or is
-    saturated in any channel.
-    """
-    by_view = []
-    inside = views.inside
-    for view in range(views.num_views):  # one by one: halving all at once takes several copies
-        image, usable = views.images[view], inside[view]
-        if views.masks is not None:
-            usable = usable & views.masks[view]
-        finite = image.isfinite()
-        usable = usable & finite.all(dim=0) & (image.amax(dim=0) < saturation_level)
-        # NaN times a weight of 0 is NaN: zeros, which are marked, spread nothing.
-        image = torch.where(finite, image, 0)
-        pyramid = [torch.cat([image, (~usable)[None].to(image)])[None]]
-        while len(pyramid) < levels and min(pyramid[-1].shape[-2:]) >= 8:
-            pyramid.append(halve(pyramid[-1]))
-        by_view.append(pyramid)
-    return [torch.cat(level) for level in zip(*by_view, strict=True)]
 
 
 def halve(images: Float[Tensor, "view channels _ _"]) -> Float[Tensor, "view channels _ _"]:

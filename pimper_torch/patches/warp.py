@@ -1,6 +1,8 @@
 """Registration: every view resampled on every template, the matrices J and D."""
 
+import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,8 +13,11 @@ from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.patches.pyramid import image_pyramid, look_up, pyramid_level
-from pimper_torch.progress import track
+from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.parallel import side_by_side
+from pimper_torch.patches.pyramid import look_up, pyramid_level
+from pimper_torch.patches.resample import hide, resampled
+from pimper_torch.patches.sources import LEVELS, Sources, prepare
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,
@@ -40,7 +45,7 @@ class WarpConfig:
     saturation_level: float = SATURATED
     max_tilt_deg: float = 75.0
     occlusion_stride: int = 4
-    pyramid_levels: int = 4
+    pyramid_levels: int = LEVELS
 
     def __post_init__(self) -> None:
         require(0 <= self.dark_level < 1, "dark_level", self.dark_level, "in [0, 1)")
@@ -70,26 +75,44 @@ class Warp(nn.Module):
         super().__init__()
         self.config = config or WarpConfig()
 
-    def forward(self, views: Views, cameras: Cameras, patches: PatchSet) -> PatchViews:
-        """Give J and D of every patch."""
-        pyramid = image_pyramid(views, self.config.saturation_level, self.config.pyramid_levels)
-        mesh = patches.surface or patches.coarse.mesh
-        caster = RayCaster(mesh.vertices_world, mesh.faces)
-        return PatchViews(
-            patches=patches,
-            buckets=tuple(
-                self._register(bucket, cameras, pyramid, caster)
-                for bucket in track(patches.buckets)
-            ),
-        )
-
-    def _register(
+    def forward(
         self,
-        templates: Templates,
+        views: Views,
         cameras: Cameras,
-        pyramid: list[Float[Tensor, "view channels _ _"]],
-        caster: RayCaster,
-    ) -> Registered:
+        patches: PatchSet,
+        sources: Sources | None = None,
+    ) -> PatchViews:
+        """Give J and D of every patch.
+
+        Args:
+            views: Photographs.
+            cameras: Of all views.
+            patches: All, or some buckets of them.
+            sources: The photographs as :meth:`prepare` gives them, and what hides what; made
+                here where not given.
+        """
+        sources = sources or self.prepare(views)
+        if sources.caster is None:
+            sources = sources.hidden_by(patches.surface or patches.coarse.mesh)
+        one = partial(self._register, cameras, sources)
+        return PatchViews(patches=patches, buckets=tuple(side_by_side(one, patches.buckets)))
+
+    def prepare(self, views: Views) -> Sources:
+        """Prepare photographs for any number of calls, here and in the sweep."""
+        return prepare(views, self.config.saturation_level, self.config.pyramid_levels)
+
+    def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Registered:
+        images, config = sources.images.finest, self.config
+        asked = (images, cameras.cam_from_world, cameras.intrinsics, templates.depth)
+        asked = (*asked, templates.patch_from_world, templates.origin, templates.spacing)
+        if images.dtype != torch.float32 or not compiled_for(*asked):
+            return self._reference(cameras, sources, templates)
+        steepest = math.cos(math.radians(config.max_tilt_deg))
+        found = resampled(cameras, sources, templates, steepest, config.dark_level)
+        hide(found, cameras, sources, templates, config.occlusion_stride)
+        return found
+
+    def _reference(self, cameras: Cameras, sources: Sources, templates: Templates) -> Registered:
         world_from_patch = invert_rigid(templates.patch_from_world)
         num, height, width = templates.depth.shape
         points = transform(world_from_patch, templates.points_patch.reshape(num, -1, 3))
@@ -99,7 +122,7 @@ class Warp(nn.Module):
             carried = templates.normals_patch.detach().reshape(num, -1, 3)
             outward = rotate(world_from_patch, carried).reshape(points_world.shape)
         seen = [
-            self._seen_by(view, templates, points_world, outward, cameras, pyramid, caster)
+            self._seen_by(view, templates, points_world, outward, cameras, sources)
             for view in range(cameras.num_views)
         ]
         return Registered(
@@ -114,8 +137,7 @@ class Warp(nn.Module):
         points_world: Float[Tensor, "patch height width 3"],
         outward: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
-        pyramid: list[Float[Tensor, "view channels _ _"]],
-        caster: RayCaster,
+        sources: Sources,
     ) -> tuple[Float[Tensor, "patch channel height width"], Bool[Tensor, "patch height width"]]:
         center = cameras.centers_world[view]
         facing = (normalize(center - points_world, dim=-1) * outward).sum(-1)
@@ -126,20 +148,22 @@ class Warp(nn.Module):
         pixels = pixels.reshape(*points_world.shape[:-1], 2)
         wanted = templates.inside & (facing > steepest) & (depth.reshape(facing.shape) > 0)
         if not wanted.any():
-            channels = pyramid[0].shape[1] - 1
-            return pyramid[0].new_zeros(len(facing), channels, *facing.shape[1:]), wanted
+            finest = sources.images.finest
+            return finest.new_zeros(len(facing), finest.shape[1], *facing.shape[1:]), wanted
         level = pyramid_level(pixels)
         # A sample whose footprint touches the border, or is unusable by a tenth, is missing.
         margin = 0.5 * 2 ** level.detach()[..., None]
         size = cameras.sizes_px[view].to(pixels)
         within = ((pixels >= margin) & (pixels <= size - margin)).all(dim=-1)
         wanted = wanted & within
-        found = look_up([images[view] for images in pyramid], pixels[wanted], level[wanted])
-        usable = (found[:, -1] < 0.1) & (found[:, :-1].mean(dim=1) > self.config.dark_level)
-        radiance = found.new_zeros(*wanted.shape, found.shape[1] - 1)
-        radiance = radiance.index_put((wanted,), found[:, :-1]).movedim(-1, 1)
+        found = look_up(sources.images.levels(view), pixels[wanted], level[wanted])
+        shares = [share.to(found) for share in sources.unusable.levels(view)]
+        lost = look_up(shares, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
+        usable = (lost < 0.1) & (found.mean(dim=1) > self.config.dark_level)
+        radiance = found.new_zeros(*wanted.shape, found.shape[1])
+        radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
         valid = torch.zeros_like(wanted).index_put((wanted,), usable)
-        valid = valid & ~self._hidden(templates, points_world, center, caster, valid)
+        valid = valid & ~self._hidden(templates, points_world, center, sources.caster, valid)
         return radiance * valid[:, None], valid
 
     def _hidden(

@@ -9,13 +9,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.kernels.sweep import ALBEDO_ROUNDS
+
 
 def inconsistency(
     radiance: Float[Tensor, "sample view hypothesis"],
     shading: Float[Tensor, "sample view"],
     seen: Bool[Tensor, "sample view"],
     scale: Float[Tensor, " sample"],
-    rounds: int = 2,
+    rounds: int = ALBEDO_ROUNDS,
 ) -> Float[Tensor, "sample hypothesis"]:
     r"""Give the robust cost of every hypothesis.
 

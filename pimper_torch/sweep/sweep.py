@@ -1,6 +1,7 @@
 """The stage that finds heights: samples are looked up again, higher and lower, in their light."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,12 +11,14 @@ from torch.nn.functional import normalize
 from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.carry import carried_normals
-from pimper_torch.patches.pyramid import image_pyramid, look_up
-from pimper_torch.progress import track
-from pimper_torch.radiometry import SATURATED
+from pimper_torch.patches.pyramid import look_up
+from pimper_torch.patches.sources import Sources, prepare
 from pimper_torch.records import (
     Cameras,
+    CoarseMesh,
     Heights,
     PatchViews,
     PhotometricPatches,
@@ -27,6 +30,7 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.sweep.consistency import inconsistency
+from pimper_torch.sweep.costs import compiled_costs
 from pimper_torch.sweep.minimum import parabola_minimum, posterior_variance
 from pimper_torch.sweep.selection import best_views, view_scores
 from pimper_torch.sweep.windows import level_weight, window_mean, window_size
@@ -54,8 +58,6 @@ class SweepConfig:
         min_views: A sample that fewer views may judge is left where it is.
         loss_scale: Of the robust cost, in standard deviations of the patch's residuals.
         max_slope: Of the template, off its facet: steeper is a cliff, where windows end.
-        pyramid_levels: How often an image may be halved.
-        saturation_level: Radiance at or above which a pixel is unusable.
     """
 
     steps: int = 4
@@ -65,8 +67,6 @@ class SweepConfig:
     min_views: int = 3
     loss_scale: float = 2.0
     max_slope: float = 4.0
-    pyramid_levels: int = 4
-    saturation_level: float = SATURATED
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, "sweep.steps", self.steps, "1 or more")
@@ -75,7 +75,6 @@ class SweepConfig:
         require(self.num_views >= least, "sweep.num_views", self.num_views, "min_views or more")
         for name in ("step_samples", "window_samples", "loss_scale", "max_slope"):
             require(getattr(self, name) > 0, f"sweep.{name}", getattr(self, name), "above 0")
-        require(self.pyramid_levels >= 1, "sweep.pyramid_levels", self.pyramid_levels, "1 or more")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -121,50 +120,55 @@ class Sweep(nn.Module):
         self.config = config or SweepConfig()
 
     def forward(
-        self, views: Views, cameras: Cameras, seen: PatchViews, photometric: PhotometricPatches
+        self,
+        views: Views,
+        cameras: Cameras,
+        seen: PatchViews,
+        photometric: PhotometricPatches,
+        sources: Sources | None = None,
     ) -> SweptPatches:
-        """Sweep all patches."""
-        config = self.config
-        pyramid = image_pyramid(views, config.saturation_level, config.pyramid_levels)
-        gray = [level[:, :-1].mean(dim=1, keepdim=True) for level in pyramid]
+        """Sweep all patches, or those of some buckets.
+
+        Args:
+            views: Photographs.
+            cameras: Of all views.
+            seen: Views on templates.
+            photometric: Light and normals of the same buckets.
+            sources: The photographs as ``Warp`` prepares them; made here where not given.
+        """
         buckets = zip(photometric.patches.buckets, seen.buckets, photometric.buckets, strict=True)
+        coarse = photometric.patches.coarse
+        one = partial(self._sweep, cameras, sources or prepare(views), coarse)
         return SweptPatches(
             photometric=photometric,
-            buckets=tuple(
-                self._sweep(photometric, *bucket, cameras, gray) for bucket in track(list(buckets))
-            ),
-            averaged=window_size(config.window_samples),
+            buckets=tuple(side_by_side(one, list(buckets))),
+            averaged=window_size(self.config.window_samples),
         )
 
     def _sweep(
         self,
-        photometric: PhotometricPatches,
-        templates: Templates,
-        registered: Registered,
-        photometry: Photometry,
         cameras: Cameras,
-        gray: list[Float[Tensor, "view 1 _ _"]],
+        sources: Sources,
+        coarse: CoarseMesh,
+        bucket: tuple[Templates, Registered, Photometry],
     ) -> Heights:
         config = self.config
-        carried = carried_normals(photometric.patches.coarse, templates)
-        rows = self._rows(templates, registered, photometry, carried, cameras)
-        nothing = torch.zeros_like(templates.depth)
+        templates, registered, photometry = bucket
+        carried = carried_normals(coarse, templates)
         shown = registered.valid.flatten(2).any(dim=2).sum(dim=1)
-        if len(rows.place) == 0:
-            return Heights(offset=nothing, information=nothing, num_views=shown)
+        images, given = sources.gray.finest, (templates.depth, templates.patch_from_world)
+        given = (*given, cameras.cam_from_world, cameras.intrinsics, carried)
+        given = (*given, photometry.normals_patch, photometry.lights_patch)
+        given = (images, *given, photometry.convergence.residual)
+        fast = images.dtype == torch.float32 and compiled_for(*given)
+        how = self._compiled_costs if fast else self._costs
+        costs, swept = how(templates, registered, photometry, carried, cameras, sources)
         step = config.step_samples * templates.spacing
-        ladder = torch.arange(-config.steps, config.steps + 1, device=step.device).to(step)
-        moves = step[rows.patch, None] * ladder
-        scale = config.loss_scale * photometry.convergence.residual.clamp_min(LEAST_SPREAD)
-        radiance = self._look_up(rows, templates, moves, cameras, gray)
-        cost = inconsistency(radiance, rows.shading, rows.seen, scale[rows.patch])
-        # Near zero Cauchy's loss is the square over twice its scale's: now over the variance.
-        cost = cost * config.loss_scale**2
-        costs = _spread_out(cost, rows.place, templates)
-        swept = nothing.flatten().index_fill(0, rows.place, 1.0).reshape(nothing.shape)
         window = level_weight(templates.depth.detach(), swept, templates.spacing, config.max_slope)
         averaged = window_size(config.window_samples)
-        costs = window_mean(costs, window, config.window_samples) * (averaged / CORRELATED_SAMPLES)
+        # Near zero Cauchy's loss is the square over twice its scale's: now over the variance.
+        weight = config.loss_scale**2 * averaged / CORRELATED_SAMPLES
+        costs = weight * window_mean(costs, window, config.window_samples)
         costs = costs.movedim(1, -1)
         place, curvature, found = parabola_minimum(costs)
         variance = posterior_variance(costs, curvature)
@@ -176,6 +180,56 @@ class Sweep(nn.Module):
             information=torch.where(found, share / step[:, None, None].square(), 0),
             num_views=shown,
         )
+
+    def _scale(self, photometry: Photometry) -> Float[Tensor, " patch"]:
+        """Give the residuals of each patch that count as large."""
+        return self.config.loss_scale * photometry.convergence.residual.clamp_min(LEAST_SPREAD)
+
+    def _compiled_costs(
+        self,
+        templates: Templates,
+        registered: Registered,
+        photometry: Photometry,
+        carried: Float[Tensor, "patch height width 3"],
+        cameras: Cameras,
+        sources: Sources,
+    ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
+        """Give what :meth:`_costs` gives."""
+        config = self.config
+        return compiled_costs(
+            templates,
+            registered,
+            photometry,
+            carried,
+            cameras,
+            sources,
+            ladder=config.step_samples * torch.arange(-config.steps, config.steps + 1.0),
+            scale=self._scale(photometry),
+            num_views=config.num_views,
+            min_views=config.min_views,
+            least_facing=_LEAST_FACING,
+        )
+
+    def _costs(
+        self,
+        templates: Templates,
+        registered: Registered,
+        photometry: Photometry,
+        carried: Float[Tensor, "patch height width 3"],
+        cameras: Cameras,
+        sources: Sources,
+    ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
+        """Give the cost of every height, and 1 where a sample is swept, else 0."""
+        config = self.config
+        rows = self._rows(templates, registered, photometry, carried, cameras)
+        step = config.step_samples * templates.spacing
+        ladder = torch.arange(-config.steps, config.steps + 1, device=step.device).to(step)
+        moves = step[rows.patch, None] * ladder
+        radiance = self._look_up(rows, templates, moves, cameras, sources)
+        scale = self._scale(photometry)
+        cost = inconsistency(radiance, rows.shading, rows.seen, scale[rows.patch])
+        swept = torch.zeros_like(templates.depth).flatten().index_fill(0, rows.place, 1.0)
+        return _spread_out(cost, rows.place, templates), swept.reshape(templates.depth.shape)
 
     def _rows(
         self,
@@ -235,7 +289,7 @@ class Sweep(nn.Module):
         templates: Templates,
         moves: Float[Tensor, "sample hypothesis"],
         cameras: Cameras,
-        gray: list[Float[Tensor, "view 1 _ _"]],
+        sources: Sources,
     ) -> Float[Tensor, "sample chosen hypothesis"]:
         """Look every sample up at all heights in the views that judge it."""
         found = moves.new_zeros(*rows.chosen.shape, moves.shape[1]).flatten(0, 1)
@@ -256,7 +310,7 @@ class Sweep(nn.Module):
             squeezed = (away * outward).sum(dim=-1).clamp_min(_LEAST_FACING)
             level = (across * squeezed.sqrt()).clamp_min(1).log2()
             level = level[:, None].expand(-1, moves.shape[1]).flatten()
-            radiance = look_up([image[view] for image in gray], pixels, level)
+            radiance = look_up(sources.gray.levels(view), pixels, level)
             found = found.index_copy(0, slot, radiance.reshape(len(slot), -1).to(found))
         return found.reshape(*rows.chosen.shape, -1)
 

@@ -1,0 +1,45 @@
+"""Where a place lies between the pixels of a level of a pyramid."""
+
+import math
+
+from pimper_torch.kernels.switch import compiled
+
+
+@compiled(
+    "Tuple((int64, int64, int64, float32, float32))(int64, int64, float64, float64)",
+)
+def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int, float, float]:
+    """Give the pixel to the upper left, the steps to the others, and how far on the place lies.
+
+    Args:
+        height: Of the level.
+        width: Of it.
+        x: To the right, counted from the first pixel's centre; what lies beyond is at the border.
+        y: Down.
+
+    Returns:
+        An index, the steps to the pixels at the right and below (0 at the border), and the
+        weights of these.
+    """
+    # Not a number compares false, and is at the border too.
+    x = min(x, width - 1.0) if x > 0 else 0.0
+    y = min(y, height - 1.0) if y > 0 else 0.0
+    column, row = int(x), int(y)
+    right = 1 if column < width - 1 else 0
+    below = width if row < height - 1 else 0
+    return row * width + column, right, below, x - column, y - row
+
+
+@compiled("Tuple((int64, float32))(float64, int64)")
+def blended_level(squared_footprint: float, count: int) -> tuple[int, float]:
+    """Give the finer of the two levels that a footprint lies between, and the other's weight.
+
+    Args:
+        squared_footprint: Pixels of the finest level.
+        count: Of the levels.
+    """
+    if squared_footprint <= 1:
+        return 0, 0.0
+    level = min(0.5 * math.log2(squared_footprint), count - 1.0)
+    finer = int(level)
+    return finer, level - finer

@@ -1,0 +1,109 @@
+"""What hands a bucket of templates to the compiled kernels, and takes J and D from them."""
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.kernels import resample
+from pimper_torch.kernels.arrays import as_array
+from pimper_torch.patches.sources import Sources
+from pimper_torch.records import Cameras, Registered, Templates
+
+
+def resampled(
+    cameras: Cameras,
+    sources: Sources,
+    templates: Templates,
+    least_facing: float,
+    dark_level: float,
+) -> Registered:
+    """Resample all views on a bucket of templates; nothing hides anything.
+
+    Places are found in float64; images are looked up in float32.
+
+    Args:
+        cameras: Of all views.
+        sources: Photographs.
+        templates: The bucket.
+        least_facing: Cosine of the steepest angle between a normal and the way to the camera.
+        dark_level: Radiance at or below which a sample is missing.
+    """
+    patch_from_world = templates.patch_from_world.double()
+    exact = cameras.to(torch.float64)
+    image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]
+    image_from_patch = image_from_world @ invert_rigid(patch_from_world)[:, None]
+    outward = templates.normals_patch
+    if outward is None:
+        outward = templates.depth.new_tensor([0, 0, -1]).expand(*templates.depth.shape, 3)
+    shape = len(templates.facet), cameras.num_views
+    height, width = templates.depth.shape[1:]
+    radiance = torch.empty(*shape, sources.images.finest.shape[1], height, width)
+    valid = torch.empty(*shape, height, width, dtype=torch.bool)
+    resample.register(
+        *sources.images.arrays,
+        *sources.unusable.arrays,
+        as_array(sources.images.table),
+        as_array(image_from_patch.flatten(0, 1)),
+        as_array(transform(patch_from_world, exact.centers_world).flatten(0, 1)),
+        as_array(cameras.sizes_px),
+        as_array(templates.origin, torch.float64),
+        as_array(templates.spacing, torch.float64),
+        as_array(templates.depth, torch.float32),
+        as_array(outward, torch.float32),
+        as_array(templates.inside),
+        least_facing,
+        dark_level,
+        as_array(radiance),
+        as_array(valid),
+    )
+    return Registered(radiance=radiance, valid=valid)
+
+
+def hide(
+    registered: Registered, cameras: Cameras, sources: Sources, templates: Templates, stride: int
+) -> None:
+    """Take away, in place, what the surface of the sources hides.
+
+    One ray for every ``stride`` samples either way, from the camera to just before the surface;
+    all of a bucket at once.
+    """
+    assert sources.caster is not None
+    sparse = templates.points_patch[:, stride // 2 :: stride, stride // 2 :: stride].double()
+    if sparse.numel() == 0:
+        return
+    world_from_patch = invert_rigid(templates.patch_from_world.double())
+    height, width = sparse.shape[1:3]
+    points = transform(world_from_patch, sparse.flatten(1, 2)).reshape(sparse.shape)
+    asked = torch.zeros(*registered.valid.shape[:2], height, width, dtype=torch.bool)
+    rows = as_array(_answering(height, templates.depth.shape[1]))
+    columns = as_array(_answering(width, templates.depth.shape[2]))
+    rays = resample.sites(as_array(registered.valid), rows, columns, as_array(asked))
+    starts, directions, reach = torch.empty(rays, 3), torch.empty(rays, 3), torch.empty(rays)
+    # An enlarged triangle dips under its neighbours by the overlap's share of their slope.
+    tolerance = 4 * stride * templates.spacing
+    resample.sight_lines(
+        as_array(asked),
+        as_array(points),
+        as_array(cameras.to(torch.float64).centers_world),
+        as_array(tolerance, torch.float64),
+        as_array(starts),
+        as_array(directions),
+        as_array(reach),
+    )
+    blocked = sources.caster.blocked(starts, directions, reach)
+    resample.hide(
+        as_array(asked),
+        as_array(blocked),
+        rows,
+        columns,
+        as_array(registered.radiance),
+        as_array(registered.valid),
+    )
+
+
+def _answering(sites: int, samples: int) -> Int[Tensor, " sample"]:
+    """Give the site nearest to each of a row of samples."""
+    index = torch.arange(sites, dtype=torch.float32)[None, None]
+    return interpolate(index, size=samples, mode="nearest-exact")[0, 0].long()

@@ -1,0 +1,160 @@
+"""What resampling needs of photographs and surface, prepared once for all patches."""
+
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.kernels.arrays import as_array
+from pimper_torch.parallel import side_by_side
+from pimper_torch.patches.pyramid import halve
+from pimper_torch.radiometry import SATURATED
+from pimper_torch.records import Mesh, Record, Views
+
+# An eighth of the photographs' size, the least at which a template of theirs is looked up.
+LEVELS = 4
+
+# Halves need a few pixels for their blur.
+_SMALLEST = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Pyramid(Record):
+    """Images halved again and again.
+
+    The finest level is by itself, so that it can be the photographs, without a copy.
+
+    Attributes:
+        finest: Of floating point, or shares in 255ths.
+        coarser: All further levels one after another, each of ``channel height width``.
+        sizes: Height and width of every level, the finest first.
+    """
+
+    finest: Float[Tensor, "view channel height width"] | UInt8[Tensor, "view channel height width"]
+    coarser: Float[Tensor, "view entry"] | UInt8[Tensor, "view entry"]
+    sizes: tuple[tuple[int, int], ...]
+
+    def levels(
+        self, view: int
+    ) -> list[Float[Tensor, "channel _ _"] | UInt8[Tensor, "channel _ _"]]:
+        """Give a view's levels, the finest first."""
+        channels = self.finest.shape[1]
+        areas = [channels * height * width for height, width in self.sizes[1:]]
+        rest = zip(self.coarser[view].split(areas), self.sizes[1:], strict=True)
+        return [self.finest[view], *(level.reshape(channels, *size) for level, size in rest)]
+
+    @property
+    def arrays(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Give the finest level and the others as kernels take them: a row a view."""
+        return as_array(self.finest.flatten(1)), as_array(self.coarser)
+
+    @property
+    def table(self) -> Int[Tensor, "level 3"]:
+        """Height and width of every level, and where it starts in a channel of ``coarser``."""
+        areas = torch.tensor([0, 0, *(height * width for height, width in self.sizes[1:])])
+        sizes = torch.tensor(self.sizes)
+        return torch.cat([sizes, areas.cumsum(0)[: len(sizes), None]], dim=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Sources(Record):
+    """Photographs at several sizes, and what hides them.
+
+    Attributes:
+        images: Linear radiance; zero where it is no number.
+        unusable: Share of every pixel that is unusable, in 255ths: outside the undistorted frame
+            or the mask, not finite, or saturated in any channel.
+        gray: Mean over the channels.
+        caster: The surface that hides what is behind it; ``None`` while there is none.
+    """
+
+    images: Pyramid
+    unusable: Pyramid
+    gray: Pyramid
+    caster: RayCaster | None = None
+
+    def hidden_by(self, mesh: Mesh) -> "Sources":
+        """Let a surface hide what is behind it."""
+        return self.replace(caster=RayCaster(mesh.vertices_world, mesh.faces))
+
+
+def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEVELS) -> Sources:
+    """Halve all photographs, once for all rounds of a run.
+
+    Differentiable in the photographs.
+
+    Args:
+        views: Photographs.
+        saturation_level: Radiance at or above which a pixel is unusable.
+        levels: At most so many; fewer of small photographs.
+    """
+    images = views.images
+    if not all(bool(image.isfinite().all()) for image in images):
+        # NaN times a weight of 0 is NaN: zeros, which are marked, spread nothing.
+        images = torch.where(images.isfinite(), images, 0)
+    count, _, height, width = images.shape
+    sizes = _sizes(height, width, levels)
+    one = partial(_one, views, images, saturation_level, len(sizes))
+    parts = side_by_side(one, range(count), tracked=False)
+    first = next(parts)
+    filled = tuple(part.new_empty(count, *part.shape) for part in first)
+    for view, found in enumerate(chain([first], parts)):
+        for whole, part in zip(filled, found, strict=True):
+            whole[view] = part
+    halved, gray, halved_gray, unusable, halved_unusable = filled
+    return Sources(
+        images=Pyramid(finest=images, coarser=halved, sizes=sizes),
+        gray=Pyramid(finest=gray, coarser=halved_gray, sizes=sizes),
+        unusable=Pyramid(finest=unusable, coarser=halved_unusable, sizes=sizes),
+    )
+
+
+def _one(
+    views: Views,
+    images: Float[Tensor, "view channel height width"],
+    saturation_level: float,
+    levels: int,
+    view: int,
+) -> tuple[
+    Float[Tensor, " coloured"],
+    Float[Tensor, "1 height width"],
+    Float[Tensor, " entry"],
+    UInt8[Tensor, "1 height width"],
+    UInt8[Tensor, " entry"],
+]:
+    """Give a view's further levels, its gray levels and its unusable ones."""
+    image = images[view][None]
+    given = views.images[view]
+    width, height = (int(side) for side in views.sizes_px[view])
+    unusable = ~given.isfinite().all(dim=0) | (given.amax(dim=0) >= saturation_level)
+    unusable[height:], unusable[:, width:] = True, True
+    if views.masks is not None:
+        unusable = unusable | ~views.masks[view]
+    lost = unusable[None, None].to(image)
+    coloured, shares = [image], [lost]
+    for _ in range(levels - 1):
+        coloured.append(halve(coloured[-1]))
+        shares.append(halve(shares[-1]))
+    gray = [level[0].mean(dim=0) for level in coloured]
+
+    def row(parts: list[Tensor]) -> Tensor:
+        return torch.cat([part.reshape(-1) for part in parts[1:]] or [image.new_empty(0)])
+
+    in_255ths = (255 * row(shares)).round().to(torch.uint8)
+    finest = 255 * unusable[None].to(torch.uint8)
+    return row(coloured), gray[0][None], row(gray), finest, in_255ths
+
+
+def _sizes(height: int, width: int, levels: int) -> tuple[tuple[int, int], ...]:
+    """Give height and width of every level."""
+    sizes = [(height, width)]
+    while len(sizes) < levels and min(sizes[-1]) >= _SMALLEST:
+        height, width = height // 2, width // 2
+        sizes.append((height, width))
+    return tuple(sizes)

@@ -1,0 +1,72 @@
+"""What hands a bucket's samples to the compiled sweep, and takes the costs of all heights."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.kernels import sweep
+from pimper_torch.kernels.arrays import as_array
+from pimper_torch.patches.sources import Sources
+from pimper_torch.records import Cameras, Photometry, Registered, Templates
+
+
+def compiled_costs(
+    templates: Templates,
+    registered: Registered,
+    photometry: Photometry,
+    carried: Float[Tensor, "patch height width 3"],
+    cameras: Cameras,
+    sources: Sources,
+    *,
+    ladder: Float[Tensor, " hypothesis"],
+    scale: Float[Tensor, " patch"],
+    num_views: int,
+    min_views: int,
+    least_facing: float,
+) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
+    """Give the robust cost of every height, and 1 where a sample is swept, else 0.
+
+    Args:
+        templates: The bucket.
+        registered: Which views have which samples.
+        photometry: Normals and lights.
+        carried: Normals that samples are swept along.
+        cameras: Of all views.
+        sources: Photographs.
+        ladder: Heights that are tried, in samples.
+        scale: Of the robust cost, in units of radiance.
+        num_views: At most so many judge a sample.
+        min_views: At least so many judge one that is swept.
+        least_facing: Cosine of the angle from which on footprints shrink no more.
+    """
+    patch_from_world = templates.patch_from_world.double()
+    exact = cameras.to(torch.float64)
+    image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]
+    image_from_patch = image_from_world @ invert_rigid(patch_from_world)[:, None]
+    shape = templates.depth.shape
+    cost = torch.zeros(shape[0], len(ladder), *shape[1:])
+    swept = torch.zeros(shape)
+    sweep.costs(
+        *sources.gray.arrays,
+        as_array(sources.gray.table),
+        as_array(image_from_patch.flatten(0, 1)),
+        as_array(transform(patch_from_world, exact.centers_world).flatten(0, 1)),
+        as_array((exact.intrinsics[:, 0, 0] * exact.intrinsics[:, 1, 1]).sqrt()),
+        as_array(templates.origin, torch.float64),
+        as_array(templates.spacing, torch.float64),
+        as_array(templates.depth, torch.float32),
+        as_array(carried, torch.float32),
+        as_array(photometry.normals_patch, torch.float32),
+        as_array(photometry.lights_patch[..., :4], torch.float32),
+        as_array(registered.valid),
+        as_array(photometry.valid & templates.inside),
+        as_array(scale, torch.float32),
+        as_array(ladder, torch.float64),
+        num_views,
+        min_views,
+        least_facing,
+        as_array(cost),
+        as_array(swept),
+    )
+    return cost.to(templates.depth), swept.to(templates.depth)
