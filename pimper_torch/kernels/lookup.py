@@ -1,8 +1,14 @@
 """Where a place lies between the pixels of a level of a pyramid."""
 
 import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pimper_torch.kernels.switch import compiled
+
+Array = NDArray[Any]
 
 
 @compiled(
@@ -43,3 +49,28 @@ def blended_level(squared_footprint: float, count: int) -> tuple[int, float]:
     level = min(0.5 * math.log2(squared_footprint), count - 1.0)
     finer = int(level)
     return finer, level - finer
+
+
+@compiled(
+    "float32(float32[:,::1], int64, int64, int64, int64, float32, float32)",
+    "float32(uint8[:,::1], int64, int64, int64, int64, float32, float32)",
+)
+def bilinear(
+    pixels: Array, view: int, at: int, right: int, below: int, across: float, down: float
+) -> float:
+    """Blend four pixels as :func:`corners` gives them."""
+    here, beside = np.float32(pixels[view, at]), np.float32(pixels[view, at + right])
+    above = here + across * (beside - here)
+    at += below
+    here, beside = np.float32(pixels[view, at]), np.float32(pixels[view, at + right])
+    return above + down * (here + across * (beside - here) - above)
+
+
+@compiled("float64[:,::1](int64[:,::1])")
+def shrinkage(levels: Array) -> Array:
+    """Give each level's height and width as shares of the finest one's."""
+    shares = np.empty((len(levels), 2), np.float64)
+    for level in range(len(levels)):
+        for axis in range(2):
+            shares[level, axis] = levels[level, axis] / levels[0, axis]
+    return shares

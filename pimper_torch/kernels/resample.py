@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.lookup import blended_level, corners
+from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrinkage
 from pimper_torch.kernels.switch import compiled
 
 Array = NDArray[Any]
@@ -66,6 +66,7 @@ def register(
     patches, views, channels, height, width = radiance.shape
     fine_plane = levels[0, 0] * levels[0, 1]
     count = len(levels)
+    shares = shrinkage(levels)
     pixels = np.empty((height, width, 2), np.float64)
     wanted = np.empty((height, width), np.bool_)
     found = np.empty(channels, np.float32)
@@ -129,46 +130,32 @@ def register(
                         ):
                             level, rest = blended_level(area, count)
                             lost = np.float32(0)
-                            found[:] = 0
-                            for step in range(2):
-                                if step == 1 and rest == 0:
-                                    break
+                            for step in range(2 if rest > 0 else 1):
                                 weight = rest if step == 1 else np.float32(1) - rest
                                 here = level + step
-                                tall, wide, start = levels[here]
+                                tall, wide = levels[here, 0], levels[here, 1]
                                 at, aside, down, p, q = corners(
-                                    tall,
-                                    wide,
-                                    u * (wide / levels[0, 1]) - 0.5,
-                                    v * (tall / levels[0, 0]) - 0.5,
+                                    tall, wide, u * shares[here, 1] - 0.5, v * shares[here, 0] - 0.5
                                 )
-                                one = np.float32(1)
-                                w11 = weight * p * q
-                                w10 = weight * p * (one - q)
-                                w01 = weight * (one - p) * q
-                                w00 = weight * (one - p) * (one - q)
                                 if here == 0:
-                                    images, masks, start = finest, unusable_finest, 0
-                                    plane = fine_plane
-                                else:
-                                    images, masks = coarser, unusable_coarser
-                                    plane = tall * wide
-                                k = start + at
-                                lost += (
-                                    w00 * masks[view, k]
-                                    + w10 * masks[view, k + aside]
-                                    + w01 * masks[view, k + down]
-                                    + w11 * masks[view, k + down + aside]
-                                )
-                                k = channels * start + at
-                                for channel in range(channels):
-                                    found[channel] += (
-                                        w00 * images[view, k]
-                                        + w10 * images[view, k + aside]
-                                        + w01 * images[view, k + down]
-                                        + w11 * images[view, k + down + aside]
+                                    lost += weight * bilinear(
+                                        unusable_finest, view, at, aside, down, p, q
                                     )
-                                    k += plane
+                                    for channel in range(channels):
+                                        found[channel] = weight * bilinear(
+                                            finest, view, at, aside, down, p, q
+                                        )
+                                        at += fine_plane
+                                    continue
+                                start = levels[here, 2]
+                                lost += weight * bilinear(
+                                    unusable_coarser, view, start + at, aside, down, p, q
+                                )
+                                at += channels * start
+                                for channel in range(channels):
+                                    value = weight * bilinear(coarser, view, at, aside, down, p, q)
+                                    found[channel] = value if step == 0 else found[channel] + value
+                                    at += tall * wide
                             mean = np.float32(0)
                             for channel in range(channels):
                                 mean += found[channel]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.lookup import blended_level, corners
+from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrinkage
 from pimper_torch.kernels.switch import compiled
 
 Array = NDArray[Any]
@@ -17,17 +17,19 @@ Array = NDArray[Any]
 # As often the albedo that suits all views is found anew.
 ALBEDO_ROUNDS = 2
 
-# Factors of a product are taken together in one logarithm until it comes near the largest number.
-_FULL = 1e200
+# So many are multiplied before a logarithm is taken: no overflow up to residuals of 1e19 scales.
+_FACTORS = 8
 
 
 @compiled(
-    "float32(float32[:,::1], float32[:,::1], int64[:,::1], int64, int64, float32,float64, float64)"
+    "float32(float32[:,::1], float32[:,::1], int64[:,::1], float64[:,::1], int64, int64, float32,"
+    "float64, float64)"
 )
 def _gray(
     finest: Array,
     coarser: Array,
     levels: Array,
+    shares: Array,
     view: int,
     level: int,
     rest: float,
@@ -35,62 +37,75 @@ def _gray(
     v: float,
 ) -> float:
     """Blend the two levels that a sample lies between."""
-    total = np.float32(0)
-    for step in range(2):
-        if step == 1 and rest == 0:
-            break
-        tall, wide, start = levels[level + step]
-        at, aside, down, p, q = corners(
-            tall, wide, u * (wide / levels[0, 1]) - 0.5, v * (tall / levels[0, 0]) - 0.5
-        )
-        if level + step == 0:
-            pixels = finest[view]
-        else:
-            pixels, at = coarser[view], start + at
-        above = pixels[at] + p * (pixels[at + aside] - pixels[at])
-        at += down
-        below = pixels[at] + p * (pixels[at + aside] - pixels[at])
-        weight = rest if step == 1 else np.float32(1) - rest
-        total += weight * (above + q * (below - above))
-    return total
+    tall, wide = levels[level, 0], levels[level, 1]
+    place = corners(tall, wide, u * shares[level, 1] - 0.5, v * shares[level, 0] - 0.5)
+    at, right, below, across, down = place
+    if level == 0:
+        value = bilinear(finest, view, at, right, below, across, down)
+    else:
+        value = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
+    if rest > 0:
+        level += 1
+        tall, wide = levels[level, 0], levels[level, 1]
+        place = corners(tall, wide, u * shares[level, 1] - 0.5, v * shares[level, 0] - 0.5)
+        at, right, below, across, down = place
+        other = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
+        value += rest * (other - value)
+    return value
 
 
-@compiled("float32(float32[::1], int64)")
-def _lower_median(values: Array, count: int) -> float:
-    """Sort the first few values, and give the middle one, or the lower of two."""
+@compiled("float32(float32[::1], int64[::1], int64)")
+def _lower_median(values: Array, order: Array, count: int) -> float:
+    """Give the middle one of the first few values, or the lower of two.
+
+    ``order`` comes to sort them; if it nearly does already, that takes as many steps as values.
+    """
     for last in range(1, count):
-        value = values[last]
+        moved = order[last]
         place = last
-        while place > 0 and values[place - 1] > value:
-            values[place] = values[place - 1]
+        while place > 0 and values[order[place - 1]] > values[moved]:
+            order[place] = order[place - 1]
             place -= 1
-        values[place] = value
-    return values[(count - 1) // 2]
+        order[place] = moved
+    return values[order[(count - 1) // 2]]
 
 
-@compiled("float64(float32[::1], float32[::1], int64, float32, float32[::1])")
-def _inconsistency(radiance: Array, shading: Array, count: int, scale: float, said: Array) -> float:
+@compiled(
+    "float64(float32[:,::1], int64, float32[::1], float32[::1], int64, float32, float32[::1],"
+    "int64[::1])",
+    fast=True,
+)
+def _inconsistency(
+    radiance: Array,
+    step: int,
+    shading: Array,
+    per_shading: Array,
+    count: int,
+    per_scale: float,
+    said: Array,
+    order: Array,
+) -> float:
     """See :func:`~pimper_torch.sweep.consistency.inconsistency`: of one sample and height."""
     for view in range(count):
-        said[view] = radiance[view] / shading[view]
-    albedo = _lower_median(said, count)
-    one, per_scale = np.float32(1), np.float32(1) / scale
+        said[view] = radiance[step, view] * per_shading[view]
+    albedo = _lower_median(said, order, count)
+    one = np.float32(1)
     for _ in range(ALBEDO_ROUNDS):
         square, product = np.float32(0), np.float32(0)
         for view in range(count):
-            residual = (radiance[view] - albedo * shading[view]) * per_scale
+            residual = (radiance[step, view] - albedo * shading[view]) * per_scale
             lit = shading[view] / (one + residual * residual)
             square += lit * shading[view]
-            product += lit * radiance[view]
+            product += lit * radiance[step, view]
         albedo = product / square if square > 0 else product
-    cost, factors = 0.0, 1.0
-    for view in range(count):
-        residual = (radiance[view] - albedo * shading[view]) * per_scale
-        factors *= 1.0 + np.float64(residual) * np.float64(residual)
-        if factors > _FULL:
-            cost += math.log(factors)
-            factors = 1.0
-    return 0.5 * (cost + math.log(factors))
+    cost = 0.0
+    for first in range(0, count, _FACTORS):
+        factors = 1.0
+        for view in range(first, min(first + _FACTORS, count)):
+            residual = (radiance[step, view] - albedo * shading[view]) * per_scale
+            factors *= 1.0 + np.float64(residual) * np.float64(residual)
+        cost += math.log(factors)
+    return 0.5 * cost
 
 
 @compiled(
@@ -157,7 +172,10 @@ def costs(
     facings = np.empty(views, np.float64)
     footprints = np.empty(views, np.float64)
     lit = np.empty(limit, np.float32)
+    per_lit = np.empty(limit, np.float32)
     said = np.empty(limit, np.float32)
+    order = np.empty(limit, np.int64)
+    shares = shrinkage(levels)
     radiance = np.empty((heights, limit), np.float32)
     tiny = np.finfo(np.float32).eps
     for patch in range(patches):
@@ -214,6 +232,8 @@ def costs(
                 for slot in range(found):
                     view = chosen[slot]
                     lit[slot] = shading[view]
+                    per_lit[slot] = np.float32(1) / shading[view]
+                    order[slot] = slot
                     m = image_from_patch[patch * views + view]
                     u0 = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
                     v0 = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
@@ -232,6 +252,7 @@ def costs(
                             finest,
                             coarser,
                             levels,
+                            shares,
                             view,
                             level,
                             rest,
@@ -239,7 +260,8 @@ def costs(
                             near * (v0 + move * dv),
                         )
                 swept[patch, row, column] = 1
+                per_scale = np.float32(1) / scale[patch]
                 for step in range(heights):
                     cost[patch, step, row, column] = _inconsistency(
-                        radiance[step], lit, found, scale[patch], said
+                        radiance, step, lit, per_lit, found, per_scale, said, order
                     )
