@@ -97,14 +97,26 @@ class RayCaster:
         triangles = vertices.detach()[faces].to("cpu", torch.float32)
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles.numpy()))
+        # The first ray builds the tree, and threads must not do so together.
+        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
     def cast(
-        self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*batch 3"]
+        self,
+        origins: Float[Tensor, "*#batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+        reach: Float[Tensor, "*#batch"] | None = None,
     ) -> Hits:
-        """Find the first face each ray meets."""
+        """Find the first face each ray meets.
+
+        Args:
+            origins: World.
+            directions: Of the rays.
+            reach: How far each goes, in lengths of its direction; without, to infinity.
+        """
         shape = directions.shape[:-1]
         start, along = _as_rows(origins.expand_as(directions)), _as_rows(directions)
-        found = self._scene.run(start, along, output=1)
+        far = None if reach is None else _reaches(reach, shape)
+        found = self._scene.run(start, along, dists=far, output=1)
         face = torch.from_numpy(found["primID"].astype(np.int64))
         hit = face >= 0
         distance = torch.where(hit, torch.from_numpy(found["tfar"]), torch.inf)
@@ -151,10 +163,8 @@ class RayCaster:
         """
         shape = directions.shape[:-1]
         start, along = _as_rows(origins.expand_as(directions)), _as_rows(directions)
-        far = reach.detach().expand(shape).reshape(-1).to("cpu", torch.float32)
-        # embree's own word for infinity
-        far = far.clamp(0, 1e37).contiguous()
-        found = self._scene.run(start, along, dists=far.numpy(), query="OCCLUDED")
+        far = _reaches(reach, shape)
+        found = self._scene.run(start, along, dists=far, query="OCCLUDED")
         return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
 
 
@@ -193,6 +203,14 @@ def ambient_occlusion(
     start = (corners.mean(dim=1) + clearance * normals)[:, None]
     infinite = torch.full_like(fan[..., 0], torch.inf)
     return RayCaster(vertices, faces).blocked(start, fan, infinite).to(vertices).mean(dim=1)
+
+
+def _reaches(
+    reach: Float[Tensor, "*#batch"], shape: torch.Size
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    far = reach.detach().expand(shape).reshape(-1).to("cpu", torch.float32)
+    # embree's own word for infinity
+    return far.clamp(0, 1e37).contiguous().numpy()
 
 
 def _as_rows(

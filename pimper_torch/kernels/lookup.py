@@ -63,7 +63,8 @@ def bilinear(
     above = here + across * (beside - here)
     at += below
     here, beside = np.float32(pixels[view, at]), np.float32(pixels[view, at + right])
-    return above + down * (here + across * (beside - here) - above)
+    blended: float = above + down * (here + across * (beside - here) - above)
+    return blended
 
 
 @compiled("float64[:,::1](int64[:,::1])")

@@ -159,7 +159,9 @@ def register(
                             mean = np.float32(0)
                             for channel in range(channels):
                                 mean += found[channel]
-                            usable = lost < np.float32(25.5) and mean > channels * dark_level
+                            usable = bool(lost < np.float32(25.5)) and bool(
+                                mean > channels * dark_level
+                            )
                     valid[patch, view, row, column] = usable
                     for channel in range(channels):
                         radiance[patch, view, channel, row, column] = (

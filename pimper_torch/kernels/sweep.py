@@ -88,7 +88,7 @@ def _inconsistency(
     """See :func:`~pimper_torch.sweep.consistency.inconsistency`: of one sample and height."""
     for view in range(count):
         said[view] = radiance[step, view] * per_shading[view]
-    albedo = _lower_median(said, order, count)
+    albedo = np.float32(_lower_median(said, order, count))
     one = np.float32(1)
     for _ in range(ALBEDO_ROUNDS):
         square, product = np.float32(0), np.float32(0)

@@ -1,5 +1,7 @@
 """Templates that carry a surface: registration on what is known, not on the facet's plane."""
 
+from functools import partial
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -8,6 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.parallel import side_by_side
 from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
 
 # Normals are kept this far from the rim, so that all of them face the viewer.
@@ -31,7 +34,8 @@ def carry(patches: PatchSet, surface: Mesh) -> PatchSet:
     if normals is None:
         normals = vertex_normals(surface.vertices_world, surface.faces)
     caster = RayCaster(surface.vertices_world, surface.faces)
-    buckets = tuple(_carrying(templates, surface, normals, caster) for templates in patches.buckets)
+    one = partial(_carrying, surface, normals, caster)
+    buckets = tuple(side_by_side(one, patches.buckets, tracked=False))
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
 
 
@@ -71,22 +75,23 @@ def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3
 
 
 def _carrying(
-    templates: Templates,
     surface: Mesh,
     normals: Float[Tensor, "vertex 3"],
     caster: RayCaster,
+    templates: Templates,
 ) -> Templates:
     num, height, width = templates.depth.shape
     world_from_patch = invert_rigid(templates.patch_from_world)
     flat = templates.replace(depth=torch.zeros_like(templates.depth)).points_patch
     places = transform(world_from_patch, flat.reshape(num, -1, 3))
     inward = world_from_patch[:, None, :3, 2].expand_as(places)
-    hits, met = _nearest(caster, places, inward, surface)
+    reach = _REACH * templates.spacing * max(height, width)
+    # A little further, so that rounding does not decide.
+    hits, met = _nearest(caster, places, inward, surface, 1.01 * reach[:, None])
     hits = hits.refined(surface.vertices_world, surface.faces, places, inward)
     found = hits.interpolate(surface.vertices_world, surface.faces)
     depth = transform(templates.patch_from_world, found)[..., 2]
     turned = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
-    reach = _REACH * templates.spacing * max(height, width)
     met = met & (depth.abs() <= reach[:, None])
     raster = (num, height, width)
     return templates.replace(
@@ -103,12 +108,13 @@ def _nearest(
     places: Float[Tensor, "patch sample 3"],
     inward: Float[Tensor, "patch sample 3"],
     surface: Mesh,
+    reach: Float[Tensor, "patch 1"],
 ) -> tuple[Hits, Bool[Tensor, "patch sample"]]:
     """Cast to both sides, and take the nearer hit of a face that looks outward."""
     outward = torch.linalg.cross(
         *(surface.vertices_world.detach()[surface.faces].diff(dim=1).unbind(dim=1))
     )
-    below, above = caster.cast(places, inward), caster.cast(places, -inward)
+    below, above = caster.cast(places, inward, reach), caster.cast(places, -inward, reach)
 
     def looking_out(hits: Hits) -> Bool[Tensor, "patch sample"]:
         facing = (outward[hits.face.clamp_min(0)] * inward).sum(dim=-1) < 0

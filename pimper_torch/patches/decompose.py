@@ -27,19 +27,20 @@ class DecomposeConfig:
         overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
         max_samples: Of all facets in all views that they face: where there would be more, samples
             lie further apart. Bounds time and memory; infinite for no limit.
-        bucket_samples: Samples of all templates that are batched together; bounds memory.
+        bucket_entries: Samples times views of templates that are batched together: few enough
+            for a processor's cache.
     """
 
     samples_per_pixel: float = 1.0
     overlap_samples: float = 2.0
     max_samples: float = 4.5e7
-    bucket_samples: int = 100_000
+    bucket_entries: int = 300_000
 
     def __post_init__(self) -> None:
         require(self.samples_per_pixel > 0, "samples_per_pixel", self.samples_per_pixel, "above 0")
         require(self.overlap_samples >= 1, "overlap_samples", self.overlap_samples, "1 or more")
         require(self.max_samples >= 1, "max_samples", self.max_samples, "1 or more")
-        require(self.bucket_samples >= 1, "bucket_samples", self.bucket_samples, "1 or more")
+        require(self.bucket_entries >= 1, "bucket_entries", self.bucket_entries, "1 or more")
 
 
 class Decompose(nn.Module):
@@ -90,9 +91,10 @@ class Decompose(nn.Module):
         low = torch.maximum(enlarged.amin(dim=1), corners.amin(dim=1) - reach)
         high = torch.minimum(enlarged.amax(dim=1), corners.amax(dim=1) + reach)
         sides = ((high - low) / spacing).ceil().long() + 1
+        samples = self.config.bucket_entries // cameras.num_views
         buckets = tuple(
             _templates(facets, raster, patch_from_world, corners, enlarged, low, spacing)
-            for facets, raster in group_by_size(sides, self.config.bucket_samples)
+            for facets, raster in group_by_size(sides, max(1, samples))
         )
         patches = PatchSet(coarse=coarse, buckets=buckets)
         return patches if surface is None else carry(patches, surface.mesh)

@@ -46,7 +46,7 @@ class Pyramid(Record):
         """Give a view's levels, the finest first."""
         channels = self.finest.shape[1]
         areas = [channels * height * width for height, width in self.sizes[1:]]
-        rest = zip(self.coarser[view].split(areas), self.sizes[1:], strict=True)
+        rest = zip(torch.split(self.coarser[view], areas), self.sizes[1:], strict=True)
         return [self.finest[view], *(level.reshape(channels, *size) for level, size in rest)]
 
     @property

@@ -103,9 +103,16 @@ class Warp(nn.Module):
 
     def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Registered:
         images, config = sources.images.finest, self.config
-        asked = (images, cameras.cam_from_world, cameras.intrinsics, templates.depth)
-        asked = (*asked, templates.patch_from_world, templates.origin, templates.spacing)
-        if images.dtype != torch.float32 or not compiled_for(*asked):
+        fast = images.dtype == torch.float32 and compiled_for(
+            images,
+            cameras.cam_from_world,
+            cameras.intrinsics,
+            templates.depth,
+            templates.patch_from_world,
+            templates.origin,
+            templates.spacing,
+        )
+        if not fast:
             return self._reference(cameras, sources, templates)
         steepest = math.cos(math.radians(config.max_tilt_deg))
         found = resampled(cameras, sources, templates, steepest, config.dark_level)
@@ -171,9 +178,10 @@ class Warp(nn.Module):
         templates: Templates,
         points_world: Float[Tensor, "patch height width 3"],
         center: Float[Tensor, " 3"],
-        caster: RayCaster,
+        caster: RayCaster | None,
         asked: Bool[Tensor, "patch height width"],
     ) -> Bool[Tensor, "patch height width"]:
+        assert caster is not None  # forward sees to it
         stride = self.config.occlusion_stride
         sparse = points_world[:, stride // 2 :: stride, stride // 2 :: stride]
         if not asked.any() or sparse.numel() == 0:

@@ -156,11 +156,18 @@ class Sweep(nn.Module):
         templates, registered, photometry = bucket
         carried = carried_normals(coarse, templates)
         shown = registered.valid.flatten(2).any(dim=2).sum(dim=1)
-        images, given = sources.gray.finest, (templates.depth, templates.patch_from_world)
-        given = (*given, cameras.cam_from_world, cameras.intrinsics, carried)
-        given = (*given, photometry.normals_patch, photometry.lights_patch)
-        given = (images, *given, photometry.convergence.residual)
-        fast = images.dtype == torch.float32 and compiled_for(*given)
+        gray = sources.gray.finest
+        fast = gray.dtype == torch.float32 and compiled_for(
+            gray,
+            cameras.cam_from_world,
+            cameras.intrinsics,
+            templates.depth,
+            templates.patch_from_world,
+            carried,
+            photometry.normals_patch,
+            photometry.lights_patch,
+            photometry.convergence.residual,
+        )
         how = self._compiled_costs if fast else self._costs
         costs, swept = how(templates, registered, photometry, carried, cameras, sources)
         step = config.step_samples * templates.spacing

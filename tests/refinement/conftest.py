@@ -59,7 +59,7 @@ class Builder:
         depth = coarse.mesh.vertices_world[:, 2].median() + 4
         intrinsics[:, :2, :2] *= depth / 4
         cameras = cameras.replace(intrinsics=intrinsics.double())
-        config = DecomposeConfig(overlap_samples=overlap, bucket_samples=20_000)
+        config = DecomposeConfig(overlap_samples=overlap, bucket_entries=20_000)
         patches = Decompose(config)(coarse, cameras)
         photometric, depths = zip(
             *(_exact(templates, height) for templates in patches.buckets), strict=True

@@ -1,0 +1,119 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.kernels.switch import using
+from pimper_torch.patches.sources import prepare
+from pimper_torch.patches.warp import Warp, WarpConfig
+from pimper_torch.records import Mesh
+from pimper_torch.sweep.sweep import Sweep
+
+
+def relief(templates):
+    """A wave on the templates, whose neighbours' depths matter to the level of each sample."""
+    x, y = templates.points_patch[..., 0], templates.points_patch[..., 1]
+    return 0.5 * templates.spacing[:, None, None] * torch.sin(30 * x) * torch.cos(20 * y)
+
+
+def waved(patches):
+    """Templates that carry a surface, and a screen before a part of it."""
+    buckets = tuple(
+        bucket.replace(
+            depth=relief(bucket),
+            normals_patch=torch.nn.functional.normalize(
+                torch.stack([relief(bucket), 0 * relief(bucket), relief(bucket) * 0 - 1], dim=-1),
+                dim=-1,
+            ),
+        )
+        for bucket in patches.buckets
+    )
+    vertices, faces = patches.coarse.mesh.vertices_world, patches.coarse.mesh.faces
+    outward = face_normals(vertices, faces)[0]
+    screen = 0.5 * vertices + 0.3 * outward / outward.norm()
+    both = Mesh(
+        vertices_world=torch.cat([vertices, screen]),
+        faces=torch.cat([faces, faces + len(vertices)]),
+    )
+    return patches.replace(buckets=buckets, surface=both)
+
+
+@pytest.fixture
+def photographed(lift):
+    """Noisy photographs with a mask, of odd size, and templates on them."""
+    lifted = lift(0.4)
+    views = lifted.scene.views
+    drawn = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(7))
+    images = (views.images + 0.05 * drawn).float()
+    images[0, 1, 40, 50] = torch.nan
+    images[1, :, 30:40, 40:60] = 1.0
+    masks = views.inside.clone()
+    masks[2, :, :50] = False
+    views = views.replace(images=images[..., :89, :117].contiguous(), masks=masks[:, :89, :117])
+    views = views.replace(sizes_px=views.sizes_px.clamp_max(torch.tensor([117, 89])))
+    return views, lifted.scene.cameras.replace(sizes_px=views.sizes_px), lifted
+
+
+@pytest.mark.parametrize("finer", [1.0, 0.3])
+def test_views_are_resampled_as_in_torch(photographed, finer):
+    views, cameras, lifted = photographed
+    patches = waved(lifted.seen.patches)
+    wide = tuple(
+        bucket.replace(spacing=bucket.spacing / finer, origin=bucket.origin)
+        for bucket in patches.buckets
+    )
+    patches = patches.replace(buckets=wide)
+    warp = Warp(WarpConfig(max_tilt_deg=60.0, occlusion_stride=3))
+    with using("torch"):
+        wanted = warp(views, cameras, patches)
+    found = warp(views, cameras, patches)
+    hidden = warp(views, cameras, patches.replace(surface=None))
+    for one, other, free in zip(found.buckets, wanted.buckets, hidden.buckets, strict=True):
+        assert torch.equal(one.valid, other.valid)
+        assert one.valid.any()
+        assert not one.valid.all()
+        assert (free.valid & ~one.valid).any()  # the screen hides something
+        # Pixels are found in float64 there, and in what cameras have here; images are float32.
+        assert_close(one.radiance, other.radiance, rtol=0, atol=2e-6)
+
+
+def test_heights_are_swept_as_in_torch(photographed):
+    views, cameras, lifted = photographed
+    sources = prepare(views)
+    with using("torch"):
+        wanted = Sweep()(views, cameras, lifted.seen, lifted.photometric, sources)
+    found = Sweep()(views, cameras, lifted.seen, lifted.photometric, sources)
+    for one, other in zip(found.buckets, wanted.buckets, strict=True):
+        known = other.information > 0
+        assert torch.equal(one.information > 0, known)
+        assert known.any()
+        spacing = float(lifted.seen.patches.buckets[0].spacing[0])
+        assert_close(one.offset, other.offset, rtol=0, atol=1e-3 * spacing)
+        assert_close(one.information[known], other.information[known], rtol=1e-2, atol=0)
+        assert torch.equal(one.num_views, other.num_views)
+
+
+def test_buckets_by_themselves_give_what_all_give_together(photographed):
+    views, cameras, lifted = photographed
+    patches, warp, sweep = lifted.seen.patches, Warp(), Sweep()
+    sources = warp.prepare(views).hidden_by(patches.coarse.mesh)
+    together = warp(views, cameras, patches)
+    swept = sweep(views, cameras, lifted.seen, lifted.photometric)
+    for place, bucket in enumerate(patches.buckets):
+        part = patches.replace(buckets=(bucket,))
+        (seen,) = warp(views, cameras, part, sources).buckets
+        assert torch.equal(seen.radiance, together.buckets[place].radiance)
+        photometric = lifted.photometric.replace(
+            patches=part, buckets=(lifted.photometric.buckets[place],)
+        )
+        before = lifted.seen.replace(patches=part, buckets=(lifted.seen.buckets[place],))
+        (found,) = sweep(views, cameras, before, photometric, sources).buckets
+        assert torch.equal(found.offset, swept.buckets[place].offset)
+
+
+def test_the_photographs_are_not_copied(photographed):
+    views, _, _ = photographed
+    whole = views.replace(images=views.images.nan_to_num())
+    sources = prepare(whole)
+    assert sources.images.finest.data_ptr() == whole.images.data_ptr()
+    assert prepare(views).images.finest.isfinite().all()
