@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.photometry.bilinear import (
     Bilinear,
     Factors,
@@ -33,10 +34,10 @@ from pimper_torch.photometry.bilinear import (
     reweigh,
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
-from pimper_torch.photometry.manifolds import Free
+from pimper_torch.photometry.manifolds import Cone, Free
 from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
 from pimper_torch.photometry.robust import Squares
-from pimper_torch.records import Record, StopCause
+from pimper_torch.records import Convergence, Record, StopCause
 
 # The damping starts at this share of the mean curvature; it falls and rises by the factors below.
 # Of starts from 1e-4 to 1e-2 and factors from 3 to 10 these led most random starts to the best
@@ -94,6 +95,9 @@ def solve_variable_projection(
 
     Constant to autograd. Patches do not influence one another.
     """
+
+    if _has_kernel(problem):
+        return _solve_by_kernel(problem, max_iterations, tolerance, small_steps, curvature_samples)
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
         return _step(work, state, tolerance, small_steps, curvature_samples)
@@ -269,3 +273,46 @@ def _move(state: _State) -> Float[Tensor, "patch view rank"]:
 def _is_free(problem: Bilinear) -> bool:
     """Tell whether lights are free up to any invertible matrix."""
     return isinstance(problem.manifold, Free) and not bool((problem.pull > 0).any())
+
+
+def _has_kernel(problem: Bilinear) -> bool:
+    """Tell whether the compiled twin solves such problems: first-order light in float32."""
+    return (
+        compiled_for(problem.radiance)
+        and problem.radiance.dtype == torch.float32
+        and isinstance(problem.manifold, Cone)
+    )
+
+
+def _solve_by_kernel(
+    problem: Bilinear,
+    max_iterations: int,
+    tolerance: float,
+    small_steps: int,
+    curvature_samples: int | None,
+) -> Factors:
+    from pimper_torch.kernels.factorization import solve_on_cone
+
+    J, prior = problem.radiance, problem.prior
+    if prior is None:
+        prior = J.new_zeros(len(J), 10, J.shape[2])
+    lights, shading = (
+        each.detach().clone(memory_format=torch.contiguous_format)
+        for each in (problem.lights, problem.shading)
+    )
+    weight, residual = torch.zeros_like(J), J.new_zeros(len(J))
+    taken = torch.zeros(len(J), dtype=torch.int64)
+    cause = torch.zeros_like(taken)
+    known = [J, problem.weight, problem.anchor, problem.pull, prior]
+    solve_on_cone(
+        *(each.detach().contiguous().numpy() for each in known),
+        0.0 if isinstance(problem.loss, Squares) else problem.loss.scale,
+        problem.stride,
+        max_iterations,
+        tolerance,
+        small_steps,
+        curvature_samples or 0,
+        *(each.numpy() for each in (lights, shading, weight, taken, residual, cause)),
+    )
+    convergence = Convergence(iterations=taken, residual=residual, cause=cause)
+    return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)

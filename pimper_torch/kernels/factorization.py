@@ -1,0 +1,497 @@
+"""Damped variable projection on the cone, patch by patch.
+
+Twin of ``photometry.variable_projection.solve_variable_projection`` for first-order light. A patch
+is packed first: samples and views that show nothing of it cost nothing. What is left stays in the
+cache while it is iterated. Radiance, weights and shading are float32, as they are in the
+reference there; sums over samples are taken in eight or sixteen parts, and those over views in
+float64.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pimper_torch.kernels.cholesky import solve_damped
+from pimper_torch.kernels.cone import TILE, follow, whitening
+from pimper_torch.kernels.spread import robust_variance
+from pimper_torch.kernels.switch import compiled
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# As in the reference: damping, steps of the samples, roundings that are zero, least spread; and
+# the codes of StopCause.
+_FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 5.0
+_FOLLOWING = 2
+_ROUNDINGS = 30.0
+_EPS = float(np.finfo(np.float32).eps)
+_SMALLEST_SPREAD = 1e-4
+_CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
+
+# Row and column of each entry of a packed matrix.
+_ROWS = (0, 0, 0, 0, 1, 1, 1, 2, 2, 3)
+_COLUMNS = (0, 1, 2, 3, 1, 2, 3, 2, 3, 3)
+
+
+class Patch(NamedTuple):
+    """A packed patch: views that count, and samples, padded to whole tiles.
+
+    Attributes:
+        radiance: View by sample.
+        given: How much each entry counts; 0 in the padding.
+        weight: The same, robust weights included.
+        residual: Space.
+        prior: Packed entry by sample.
+        equations: The samples' normal equations: ten packed entries and the right-hand side.
+        anchor: View by 4.
+        pull: Of each view.
+        slack: Sum of the pulls on the views that are left out, times 4.
+        num_views: Those too.
+        told: So many samples, the first, tell the spread.
+        level: Least spread of residuals.
+        scale: Of Cauchy's loss, in spreads; 0 for squares.
+    """
+
+    radiance: Floats
+    given: Floats
+    weight: Floats
+    residual: Floats
+    prior: Floats
+    equations: Floats
+    anchor: Floats
+    pull: Floats
+    slack: float
+    num_views: int
+    told: int
+    level: float
+    scale: float
+
+
+@compiled()
+def _views_that_count(given: Floats, anchor: Floats, pull: Floats, lights: Floats) -> Integers:
+    """List the views that show something, or whose light is not where it is pulled to."""
+    found = np.empty(len(given), np.int64)
+    count = 0
+    for f in range(len(given)):
+        settled = pull[f] > 0
+        for i in range(4):
+            settled = settled and lights[f, i] == anchor[f, i]
+        if not settled or np.any(given[f] > 0):
+            found[count] = f
+            count += 1
+    return found[:count]
+
+
+@compiled()
+def _samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
+    """List the samples with weight, and how many tell the spread: these are the first."""
+    seen = np.zeros(given.shape[1], np.bool_)
+    for f in range(len(given)):
+        row = given[f]
+        for k in range(len(row)):
+            seen[k] |= row[k] > 0
+    found = np.empty(given.shape[1], np.int64)
+    count = 0
+    for k in range(0, len(seen), stride):
+        if seen[k]:
+            found[count] = k
+            count += 1
+    told = count
+    for k in range(len(seen)):
+        if seen[k] and k % stride > 0:
+            found[count] = k
+            count += 1
+    return found[:count], told
+
+
+@compiled()
+def _packed(
+    radiance: Floats,
+    given: Floats,
+    anchor: Floats,
+    pull: Floats,
+    prior: Floats,
+    views: Integers,
+    samples: Integers,
+    told: int,
+    scale: float,
+) -> Patch:
+    num_views, num_samples = len(views), len(samples)
+    padded = TILE * (-(-num_samples // TILE))
+    shape = (num_views, padded)
+    left, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    own_anchor, own_pull = np.empty((num_views, 4), np.float32), np.empty(num_views, np.float32)
+    size, count, slack = 0.0, 0.0, 0.0
+    for f in range(len(pull)):
+        slack += 4 * pull[f]
+    for f in range(num_views):
+        source, heavy = radiance[views[f]], given[views[f]]
+        for k in range(num_samples):
+            left[f, k], weight[f, k] = source[samples[k]], heavy[samples[k]]
+            size += abs(left[f, k])
+            count += weight[f, k]
+        own_anchor[f], own_pull[f] = anchor[views[f]], pull[views[f]]
+        slack -= 4 * own_pull[f]
+    known = np.zeros((10, padded), np.float32)
+    for i in range(10):
+        for k in range(num_samples):
+            known[i, k] = prior[i, samples[k]]
+    # The padding's equations can be solved, too.
+    for i in (0, 4, 7, 9):
+        known[i, num_samples:] = 1
+    return Patch(
+        radiance=left,
+        given=weight,
+        weight=weight.copy(),
+        residual=np.empty(shape, np.float32),
+        prior=known,
+        equations=np.empty((14, padded), np.float32),
+        anchor=own_anchor,
+        pull=own_pull,
+        slack=max(slack, 0.0),
+        num_views=len(pull),
+        told=told,
+        level=_SMALLEST_SPREAD * size / max(count, 1.0),
+        scale=scale,
+    )
+
+
+@compiled()
+def _solve(
+    patch: Patch, lights: Floats, shading: Floats, limits: tuple[int, float, int, int]
+) -> tuple[int, int]:
+    """Iterate one patch; lights and shading become the answer.
+
+    Returns:
+        The steps taken, and the code of the cause.
+    """
+    max_iterations, tolerance, small_steps, curvature_samples = limits
+    size = lights.size
+    slope, step = np.zeros((len(lights), 4)), np.zeros(size)
+    other_slope, other_lights, other = np.zeros_like(slope), lights.copy(), shading.copy()
+    curvature, factor = np.zeros((size, size)), np.empty((size, size))
+    spread = _reweigh(patch, lights, shading, 0.0)
+    energy = _energy(patch)
+    _equations(patch, lights)
+    follow(patch.equations, shading, _FOLLOWING)
+    cost = _evaluate(patch, lights, shading, slope)
+    _curvature(patch, lights, shading, curvature_samples, curvature)
+    damping, small = _FIRST_DAMPING, 0
+    for taken in range(1, max_iterations + 1):
+        for f in range(len(lights)):
+            for i in range(4):
+                step[4 * f + i] = slope[f, i]
+        mean = (np.trace(curvature) + patch.slack) / (4 * patch.num_views)
+        after = np.inf
+        if solve_damped(curvature, damping * max(mean, 1e-300), step, factor):
+            for f in range(len(lights)):
+                for i in range(4):
+                    other_lights[f, i] = lights[f, i] + step[4 * f + i]
+            other[:] = shading
+            _keep_scale(patch, lights, other_lights, other)
+            _equations(patch, other_lights)
+            follow(patch.equations, other, _FOLLOWING)
+            after = _evaluate(patch, other_lights, other, other_slope)
+        better = after < cost
+        exact = cost <= (_ROUNDINGS * _EPS) ** 2 * energy
+        if better:
+            small = small + 1 if (cost - after) / max(cost, 1e-38) < tolerance else 0
+        damping *= _LESS if better else _MORE
+        stalled = damping > 1 / _EPS and not exact
+        damping = max(damping, _EPS)
+        if better:
+            lights[:], shading[:], slope[:] = other_lights, other, other_slope
+            cost = after
+            if patch.scale > 0:
+                spread = _reweigh(patch, lights, shading, spread)
+                cost = _evaluate(patch, lights, shading, slope)
+        if exact or small >= small_steps:
+            return taken, _CONVERGED
+        if stalled:
+            return taken, _STALLED
+        if better:
+            _equations(patch, lights)
+            _curvature(patch, lights, shading, curvature_samples, curvature)
+    return max_iterations, _LIMIT
+
+
+@compiled(fast=True)
+def _reweigh(patch: Patch, lights: Floats, shading: Floats, guess: float) -> float:
+    """Let robust weights follow the residuals; give the scale that the next call starts from."""
+    if patch.scale == 0:
+        return 0.0
+    squares = np.empty(patch.radiance.shape[0] * patch.told, np.float32)
+    count = 0
+    for f in range(len(lights)):
+        _residual(patch, lights[f], shading, f)
+        rest, given = patch.residual[f], patch.given[f]
+        for k in range(patch.told):
+            squares[count] = rest[k] * rest[k]
+            count += given[k] > 0
+    variance, scale = robust_variance(squares[:count], guess)
+    width = patch.scale * max(math.sqrt(variance), patch.level)
+    one, inverse = np.float32(1), np.float32(1 / width if width > 0 else 0.0)
+    for f in range(len(lights)):
+        rest, given, weight = patch.residual[f], patch.given[f], patch.weight[f]
+        for k in range(len(rest)):
+            relative = rest[k] * inverse
+            weight[k] = given[k] / (one + relative * relative)
+    return scale
+
+
+@compiled(fast=True)
+def _residual(patch: Patch, light: Floats, shading: Floats, f: int) -> None:
+    radiance, rest = patch.radiance[f], patch.residual[f]
+    s, x, y, z = shading[0], shading[1], shading[2], shading[3]
+    for k in range(len(rest)):
+        rest[k] = radiance[k] - (
+            light[0] * s[k] + light[1] * x[k] + light[2] * y[k] + light[3] * z[k]
+        )
+
+
+@compiled(fast=True)
+def _energy(patch: Patch) -> float:
+    total = 0.0
+    for f in range(len(patch.radiance)):
+        radiance, weight = patch.radiance[f], patch.weight[f]
+        part = np.float32(0)
+        for k in range(len(radiance)):
+            part += weight[k] * radiance[k] * radiance[k]
+        total += part
+    return total
+
+
+@compiled(fast=True)
+def _equations(patch: Patch, lights: Floats) -> None:
+    """Assemble the samples' normal equations."""
+    for i in range(10):
+        total, known = patch.equations[i], patch.prior[i]
+        row, column = _ROWS[i], _COLUMNS[i]
+        total[:] = known
+        for f in range(len(lights)):
+            weight, factor = patch.weight[f], lights[f, row] * lights[f, column]
+            for k in range(len(total)):
+                total[k] += factor * weight[k]
+    for i in range(4):
+        total = patch.equations[10 + i]
+        total[:] = 0
+        for f in range(len(lights)):
+            weight, radiance, factor = patch.weight[f], patch.radiance[f], lights[f, i]
+            for k in range(len(total)):
+                total[k] += factor * (weight[k] * radiance[k])
+
+
+@compiled(fast=True)
+def _evaluate(patch: Patch, lights: Floats, shading: Floats, slope: Doubles) -> float:
+    """Give the objective; the slope becomes minus half its gradient by the lights."""
+    s, x, y, z = shading[0], shading[1], shading[2], shading[3]
+    zero = np.float32(0)
+    total = 0.0
+    for f in range(len(lights)):
+        radiance, weight, light = patch.radiance[f], patch.weight[f], lights[f]
+        cost, on_s, on_x, on_y, on_z = zero, zero, zero, zero, zero
+        for k in range(len(s)):
+            rest = radiance[k] - (
+                light[0] * s[k] + light[1] * x[k] + light[2] * y[k] + light[3] * z[k]
+            )
+            heavy = weight[k] * rest
+            cost += heavy * rest
+            on_s += heavy * s[k]
+            on_x += heavy * x[k]
+            on_y += heavy * y[k]
+            on_z += heavy * z[k]
+        total += cost
+        slope[f, 0], slope[f, 1], slope[f, 2], slope[f, 3] = on_s, on_x, on_y, on_z
+        for i in range(4):
+            apart = float(light[i]) - float(patch.anchor[f, i])
+            total += patch.pull[f] * apart * apart
+            slope[f, i] -= patch.pull[f] * apart
+    return total + _bent(patch.prior, s, x, y, z)
+
+
+@compiled(fast=True)
+def _bent(p: Floats, s: Floats, x: Floats, y: Floats, z: Floats) -> float:
+    a, b, c, d, e, f, g, h, i, j = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9]
+    total = np.float32(0)
+    two = np.float32(2)
+    for k in range(len(s)):
+        total += s[k] * (a[k] * s[k] + two * (b[k] * x[k] + c[k] * y[k] + d[k] * z[k]))
+        total += x[k] * (e[k] * x[k] + two * (f[k] * y[k] + g[k] * z[k]))
+        total += y[k] * (h[k] * y[k] + two * i[k] * z[k]) + j[k] * z[k] * z[k]
+    return total
+
+
+@compiled()
+def _keep_scale(patch: Patch, before: Floats, lights: Floats, shading: Floats) -> None:
+    """Hold the size of lights that nothing else holds, and shrink shading by as much."""
+    was, size = 0.0, 0.0
+    for f in range(len(lights)):
+        if patch.pull[f] > 0:
+            return
+        for i in range(4):
+            was += before[f, i] ** 2
+            size += lights[f, i] ** 2
+    if patch.slack > 0 or not (was > 0 and size > 0):
+        return
+    factor = np.float32(math.sqrt(was / size))
+    lights *= factor
+    shading /= factor
+
+
+@compiled(fast=True)
+def _curvature(
+    patch: Patch, lights: Floats, shading: Floats, samples: int, curvature: Doubles
+) -> None:
+    """Sum the Gauss-Newton matrix of the lights, its upper triangle; equations are those there."""
+    num_views, num_samples = patch.radiance.shape
+    whitener = np.empty((12, num_samples), np.float32)
+    whitening(patch.equations, shading, whitener)
+    stride = max(1, num_samples // samples) if samples > 0 else 1
+    some = -(-num_samples // stride)
+    white, pairs = np.empty((3, num_views, some), np.float32), np.empty((10, some), np.float32)
+    for i in range(10):
+        target, first, second = pairs[i], shading[_ROWS[i]], shading[_COLUMNS[i]]
+        for k in range(some):
+            target[k] = first[k * stride] * second[k * stride]
+    for j in range(3):
+        a, b, c, d = whitener[4 * j], whitener[4 * j + 1], whitener[4 * j + 2], whitener[4 * j + 3]
+        for f in range(num_views):
+            target, weight, light = white[j, f], patch.weight[f], lights[f]
+            for k in range(some):
+                at = k * stride
+                target[k] = weight[at] * (
+                    light[0] * a[at] + light[1] * b[at] + light[2] * c[at] + light[3] * d[at]
+                )
+    heavy = np.zeros(some, np.float32)
+    for f in range(num_views):
+        for k in range(some):
+            heavy[k] = patch.weight[f, k * stride]
+        for g in range(f, num_views):
+            _block(white, f, g, heavy, pairs, float(stride), curvature)
+            heavy[:] = 0
+        for i in range(4):
+            curvature[4 * f + i, 4 * f + i] += patch.pull[f]
+
+
+@compiled(fast=True)
+def _block(
+    white: Floats,
+    f: int,
+    g: int,
+    heavy: Floats,
+    pairs: Floats,
+    factor: float,
+    curvature: Doubles,
+) -> None:
+    """Sum the block of two views, ``n n^T`` times their weight less what samples explain."""
+    u, v, w = white[0, f], white[1, f], white[2, f]
+    x, y, z = white[0, g], white[1, g], white[2, g]
+    a, b, c, d, e = pairs[0], pairs[1], pairs[2], pairs[3], pairs[4]
+    i, j, l, m, n = pairs[5], pairs[6], pairs[7], pairs[8], pairs[9]
+    zero = np.float32(0)
+    sa, sb, sc, sd, se, si, sj, sl, sm, sn = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for k in range(len(heavy)):
+        share = heavy[k] - (u[k] * x[k] + v[k] * y[k] + w[k] * z[k])
+        sa += share * a[k]
+        sb += share * b[k]
+        sc += share * c[k]
+        sd += share * d[k]
+        se += share * e[k]
+        si += share * i[k]
+        sj += share * j[k]
+        sl += share * l[k]
+        sm += share * m[k]
+        sn += share * n[k]
+    sums = (sa, sb, sc, sd, se, si, sj, sl, sm, sn)
+    for place in range(10):
+        row, column = _ROWS[place], _COLUMNS[place]
+        curvature[4 * f + row, 4 * g + column] = factor * sums[place]
+        curvature[4 * f + column, 4 * g + row] = factor * sums[place]
+
+
+@compiled(fast=True)
+def _root_mean_square(patch: Patch, lights: Floats, shading: Floats) -> tuple[float, bool]:
+    total, count = 0.0, 0.0
+    for f in range(len(lights)):
+        _residual(patch, lights[f], shading, f)
+        rest, given = patch.residual[f], patch.given[f]
+        for k in range(len(rest)):
+            total += given[k] * rest[k] * rest[k]
+            count += given[k]
+    return (math.sqrt(total / count) if count > 0 else 0.0), count > 0
+
+
+@compiled(
+    "void(float32[:,:,::1], float32[:,:,::1], float32[:,:,::1], float32[:,::1], float32[:,:,::1],"
+    " float64, int64, int64, float64, int64, int64,"
+    " float32[:,:,::1], float32[:,:,::1], float32[:,:,::1],"
+    " int64[::1], float32[::1], int64[::1])"
+)
+def solve_on_cone(
+    radiance: Floats,
+    given: Floats,
+    anchor: Floats,
+    pull: Floats,
+    prior: Floats,
+    scale: float,
+    stride: int,
+    max_iterations: int,
+    tolerance: float,
+    small_steps: int,
+    curvature_samples: int,
+    lights: Floats,
+    shading: Floats,
+    weight: Floats,
+    iterations: Integers,
+    residual: Floats,
+    cause: Integers,
+) -> None:
+    """Factorize a batch of patches, one after the other.
+
+    Args:
+        radiance: Patch, view, sample; zero where missing.
+        given: The weights; 0 where missing.
+        anchor: What lights are pulled to.
+        pull: How strongly.
+        prior: Patch, packed, sample.
+        scale: Of Cauchy's loss, in standard deviations; 0 for squares.
+        stride: The spread is taken over every so many samples.
+        max_iterations: Steps at most.
+        tolerance: See the reference.
+        small_steps: See the reference.
+        curvature_samples: See the reference.
+        lights: The start, and then the answer.
+        shading: The start, and then the answer; what has no weight stays.
+        weight: Zero; becomes what each entry counted.
+        iterations: Becomes the steps taken.
+        residual: Becomes the root mean square.
+        cause: Becomes the code of the cause.
+    """
+    limits = (max_iterations, tolerance, small_steps, curvature_samples)
+    for p in range(len(radiance)):
+        views = _views_that_count(given[p], anchor[p], pull[p], lights[p])
+        samples, told = _samples_that_count(given[p], stride)
+        patch = _packed(
+            radiance[p], given[p], anchor[p], pull[p], prior[p], views, samples, told, scale
+        )
+        light = np.empty((len(views), 4), np.float32)
+        shade = np.zeros((4, patch.radiance.shape[1]), np.float32)
+        for f in range(len(views)):
+            light[f] = lights[p, views[f]]
+        for k in range(len(samples)):
+            for i in range(4):
+                shade[i, k] = shading[p, i, samples[k]]
+        iterations[p], cause[p] = _solve(patch, light, shade, limits)
+        residual[p], some = _root_mean_square(patch, light, shade)
+        if not some:
+            cause[p] = _EMPTY
+        for f in range(len(views)):
+            lights[p, views[f]] = light[f]
+            for k in range(len(samples)):
+                weight[p, views[f], samples[k]] = patch.weight[f, k]
+        for i in range(4):
+            for k in range(len(samples)):
+                shading[p, i, samples[k]] = shade[i, k]
