@@ -62,7 +62,9 @@ def _step(tile: Doubles) -> None:
         a, b, s = at(tile, k)
         image = apply(a, s)
         value = gain(s, image, b)
-        moved = step_along(a, (b[0] - image[0], b[1] - image[1], b[2] - image[2], b[3] - image[3]), s)
+        moved = step_along(
+            a, (b[0] - image[0], b[1] - image[1], b[2] - image[2], b[3] - image[3]), s
+        )
         after = gain(moved, apply(a, moved), b)
         better = after <= value + _ROUNDINGS * abs(value)
         tile[14 * TILE + k] = moved[0] if better else s[0]

@@ -118,8 +118,8 @@ class Factors(Record):
 Solver = Callable[[Bilinear, int, float], Factors]
 
 
-def select(record: AnyRecord, patches: Int[Tensor, " chosen"]) -> AnyRecord:
-    """Keep some patches of a record whose tensors all lead with the patch."""
+def select(record: AnyRecord, patches: Int[Tensor, " chosen"] | slice) -> AnyRecord:
+    """Keep some patches of a record whose tensors all lead with the patch; of a slice, views."""
     fields = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     chosen = {name: value[patches] for name, value in fields.items() if isinstance(value, Tensor)}
     return record.replace(**chosen)

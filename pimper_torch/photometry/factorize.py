@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.carry import carried_normals
 from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
@@ -31,7 +32,6 @@ from pimper_torch.photometry.shadows import cast_shadows_on_rasters
 from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.photometry.verdicts import judge_data, warn_of_verdicts
-from pimper_torch.progress import track
 from pimper_torch.records import (
     Convergence,
     PatchVerdict,
@@ -43,8 +43,9 @@ from pimper_torch.records import (
     Templates,
 )
 
-# A batch of patches has this many entries of J at most: about 300 MB in all while solving.
-CHUNK_ENTRIES = 4_000_000
+# Patches are factorized so many entries of J at a time, or one by one: what they need fits the
+# cache.
+PART_ENTRIES = 400_000
 
 # The pull on a light counts as if so many samples more were seen than there are.
 BORROWED_SAMPLES = 16.0
@@ -157,8 +158,21 @@ class FactorizeConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Chunk(Record):
-    """Some patches of a bucket."""
+class Illumination(Record):
+    """What falls on the scene, and what keeps it off.
+
+    Attributes:
+        field: Light of all views.
+        caster: What casts shadows; ``None`` where none are looked for.
+    """
+
+    field: LightField
+    caster: RayCaster | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Bucket(Record):
+    """Patches of like size, ready to be factorized."""
 
     templates: Templates
     registered: Registered
@@ -207,86 +221,81 @@ class Factorize(nn.Module):
         self.config = config or FactorizeConfig()
 
     def forward(self, seen: PatchViews) -> PhotometricPatches:
-        """Factorize all patches."""
-        config = self.config
-        coarse = [carried_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
-        field = light_of_mesh(seen, coarse, config.min_views, config.light)
-        lit = self._lit(seen, coarse, field)
-        chunks = [
-            [
-                _Chunk(
-                    templates=select(templates, some),
-                    registered=select(registered, some),
-                    normals=normals[some],
-                )
-                for some in _parts(templates, len(field.soft))
-            ]
-            for templates, registered, normals in zip(
-                seen.patches.buckets, lit, coarse, strict=True
+        """Factorize all patches: :meth:`light`, :meth:`solve` and :meth:`conclude` in turn."""
+        light = self.light(seen)
+        parts = [part for bucket in range(len(seen.buckets)) for part in _parts(seen, bucket)]
+        solved = list(side_by_side(lambda part: self.solve(part.seen, light), parts))
+        joined = [
+            _joined(
+                [
+                    one.buckets[0]
+                    for one, part in zip(solved, parts, strict=True)
+                    if part.bucket == bucket
+                ]
             )
+            for bucket in range(len(seen.buckets))
         ]
-        found = []
-        for chunk in track([chunk for bucket in chunks for chunk in bucket]):
-            posed = self._pose(chunk, field)
-            found.append(self._conclude(chunk, posed, *self._solve(posed)))
-        rest = iter(found)
-        buckets = [_joined([next(rest) for _ in bucket]) for bucket in chunks]
-        warn_of_verdicts(buckets, config.min_views, config.min_light_variation)
-        return PhotometricPatches(patches=seen.patches, buckets=_in_gauge(buckets))
+        return self.conclude(PhotometricPatches(patches=seen.patches, buckets=tuple(joined)))
 
-    def _lit(
-        self, seen: PatchViews, normals: list[Float[Tensor, "_ _ _ 3"]], field: LightField
-    ) -> list[Registered]:
-        """Leave out what lies in a cast shadow, or may."""
+    def light(self, seen: PatchViews) -> Illumination:
+        """Fit the light field.
+
+        Args:
+            seen: Of all patches; views on templates that are
+                :func:`~pimper_torch.photometry.mesh_light.thinned` are enough.
+        """
+        coarse = [carried_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
+        field = light_of_mesh(seen, coarse, self.config.min_views, self.config.light)
         if not self.config.shadows or not bool(field.lamp.any()):
-            return list(seen.buckets)
+            return Illumination(field=field, caster=None)
         mesh = seen.patches.surface or seen.patches.coarse.mesh
-        caster = RayCaster(mesh.vertices_world, mesh.faces)
-        found = []
-        for templates, registered, own in zip(
-            seen.patches.buckets, seen.buckets, normals, strict=True
-        ):
-            world_from_patch = invert_rigid(templates.patch_from_world)
-            raster = templates.points_patch.shape
-            places = transform(world_from_patch, templates.points_patch.flatten(1, 2))
-            shadows = cast_shadows_on_rasters(
-                field,
-                caster,
-                places.reshape(raster),
-                rotate(world_from_patch, own.flatten(1, 2)).reshape(raster),
-                templates.spacing,
-                tolerance=SHADOW_SAMPLES * templates.spacing.detach(),
-                guard=SHADOW_SAMPLES * float(templates.spacing[0].detach()),
-                asked=templates.inside,
-            )
-            reached = (shadows.lit & shadows.sure).movedim(-1, 1)
-            found.append(registered.replace(valid=registered.valid & reached))
-        return found
+        return Illumination(field=field, caster=RayCaster(mesh.vertices_world, mesh.faces))
 
-    def _pose(self, chunk: _Chunk, field: LightField) -> _Posed:
+    def solve(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
+        """Factorize some patches, which need nothing of others.
+
+        Returns:
+            Albedo and lights up to the factor of the scene, which :meth:`conclude` sets.
+        """
+        buckets = []
+        for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
+            normals = carried_normals(seen.patches.coarse, templates)
+            bucket = _Bucket(templates=templates, registered=registered, normals=normals)
+            lit = bucket.replace(registered=_lit(bucket, light))
+            posed = self._pose(lit, light.field)
+            buckets.append(self._conclude(lit, posed, *self._solve(posed)))
+        return PhotometricPatches(patches=seen.patches, buckets=tuple(buckets))
+
+    def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
+        """Set the scale of albedo over all patches, and say which ones light does not tell."""
         config = self.config
-        patch_from_world = chunk.templates.patch_from_world.to(chunk.normals)
+        warn_of_verdicts(solved.buckets, config.min_views, config.min_light_variation)
+        return in_gauge(solved)
+
+    def _pose(self, bucket: _Bucket, field: LightField) -> _Posed:
+        config = self.config
+        patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
         middle = invert_rigid(patch_from_world)[:, :3, 3]
         anchor = _of_rank(rotate_lights(patch_from_world, field.lights_at(middle)), config.rank)
         lamp = rotate(patch_from_world, field.lamp_at(middle))
-        rows = rows_of(chunk.templates, chunk.registered, chunk.normals)
+        rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
         rows = rows.replace(seen=rows.seen & faces_lamp(lamp, rows.normals))
         verdict = judge_data(
-            chunk.templates,
-            chunk.registered,
+            bucket.templates,
+            bucket.registered,
             rows.seen,
             anchor,
             config.min_views,
             config.min_light_variation,
         )
-        raster = chunk.normals.shape[1] * chunk.normals.shape[2]
+        raster = bucket.normals.shape[1] * bucket.normals.shape[2]
         problem = self._problem(rows, anchor, raster)
         return _Posed(rows=rows, anchor=anchor, verdict=verdict, problem=problem)
 
     def _conclude(
-        self, chunk: _Chunk, posed: _Posed, problem: Bilinear, factors: Factors
+        self, bucket: _Bucket, posed: _Posed, problem: Bilinear, factors: Factors
     ) -> Photometry:
-        rows, normals = posed.rows, chunk.normals
+        rows, normals = posed.rows, bucket.normals
         if torch.is_grad_enabled() and posed.problem.requires_grad:
             factors = differentiable(problem, factors)
         found = refine_on_manifold(problem, factors)
@@ -307,7 +316,7 @@ class Factorize(nn.Module):
         weight = torch.where(determined[:, None, None], factors.weight, problem.weight)
         basis = problem.manifold.join(torch.ones_like(chosen[..., 0]), chosen).mT
         albedo = fit_albedo(rows.radiance, weight.reshape(by_channel), lights, basis)
-        nothing = torch.zeros_like(chunk.registered.valid[:, 0])
+        nothing = torch.zeros_like(bucket.registered.valid[:, 0])
         blank = torch.zeros_like(normals[..., 0])
         black = blank[..., None].expand(-1, -1, -1, albedo.shape[1])
         return Photometry(
@@ -392,21 +401,57 @@ def _with_ambient(lights: Float[Tensor, "*batch rank"]) -> Float[Tensor, "..."]:
     return torch.cat([torch.zeros_like(lights[..., :1]), lights], dim=-1)
 
 
-def _parts(templates: Templates, num_views: int) -> list[Int[Tensor, " some"]]:
-    """Cut a bucket into batches of bounded size."""
-    count = len(templates.facet)
+def _lit(bucket: _Bucket, light: Illumination) -> Registered:
+    """Leave out what lies in a cast shadow, or may."""
+    registered, templates = bucket.registered, bucket.templates
+    if light.caster is None:
+        return registered
+    world_from_patch = invert_rigid(templates.patch_from_world)
+    raster = templates.points_patch.shape
+    places = transform(world_from_patch, templates.points_patch.flatten(1, 2))
+    shadows = cast_shadows_on_rasters(
+        light.field,
+        light.caster,
+        places.reshape(raster),
+        rotate(world_from_patch, bucket.normals.flatten(1, 2)).reshape(raster),
+        templates.spacing,
+        tolerance=SHADOW_SAMPLES * templates.spacing.detach(),
+        guard=SHADOW_SAMPLES * float(templates.spacing[0].detach()),
+        asked=templates.inside,
+    )
+    reached = (shadows.lit & shadows.sure).movedim(-1, 1)
+    return registered.replace(valid=registered.valid & reached)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Part(Record):
+    """Some patches of a bucket, in a record of their own."""
+
+    bucket: int
+    seen: PatchViews
+
+
+def _parts(seen: PatchViews, bucket: int) -> list[_Part]:
+    """Cut a bucket into batches of bounded size, as views of its memory."""
+    templates, registered = seen.patches.buckets[bucket], seen.buckets[bucket]
+    count, num_views = registered.valid.shape[:2]
     samples = max(int(templates.inside.sum(dim=(1, 2)).max()), 1) if count else 1
-    size = max(1, CHUNK_ENTRIES // (samples * max(num_views, 1)))
-    order = torch.arange(count, device=templates.facet.device)
-    return [order[first : first + size] for first in range(0, max(count, 1), size)]
+    size = max(1, PART_ENTRIES // (samples * max(num_views, 1)))
+    parts = []
+    for first in range(0, max(count, 1), size):
+        some = slice(first, first + size)
+        patches = seen.patches.replace(buckets=(select(templates, some),))
+        part = PatchViews(patches=patches, buckets=(select(registered, some),))
+        parts.append(_Part(bucket=bucket, seen=part))
+    return parts
 
 
-def _joined(chunks: list[Photometry]) -> Photometry:
-    if len(chunks) == 1:
-        return chunks[0]
-    return chunks[0].replace(
+def _joined(parts: list[Photometry]) -> Photometry:
+    if len(parts) == 1:
+        return parts[0]
+    return parts[0].replace(
         **{
-            name: torch.cat([getattr(chunk, name) for chunk in chunks])
+            name: torch.cat([getattr(part, name) for part in parts])
             for name in (
                 "normals_patch",
                 "albedo",
@@ -417,21 +462,22 @@ def _joined(chunks: list[Photometry]) -> Photometry:
             )
         },
         convergence=Convergence(
-            iterations=torch.cat([chunk.convergence.iterations for chunk in chunks]),
-            residual=torch.cat([chunk.convergence.residual for chunk in chunks]),
-            cause=torch.cat([chunk.convergence.cause for chunk in chunks]),
+            iterations=torch.cat([part.convergence.iterations for part in parts]),
+            residual=torch.cat([part.convergence.residual for part in parts]),
+            cause=torch.cat([part.convergence.cause for part in parts]),
         ),
     )
 
 
-def _in_gauge(buckets: list[Photometry]) -> tuple[Photometry, ...]:
+def in_gauge(solved: PhotometricPatches) -> PhotometricPatches:
     """Set the 99th percentile of gray albedo to 1."""
-    gray = torch.cat([bucket.albedo.mean(dim=-1)[bucket.valid] for bucket in buckets])
+    gray = torch.cat([bucket.albedo.mean(dim=-1)[bucket.valid] for bucket in solved.buckets])
     if len(gray) == 0:
-        return tuple(buckets)
+        return solved
     bright = gray.kthvalue(max(1, math.ceil(0.99 * len(gray)))).values
     factor = torch.where(bright > 0, bright, 1)
-    return tuple(
+    buckets = tuple(
         bucket.replace(albedo=bucket.albedo / factor, lights_patch=bucket.lights_patch * factor)
-        for bucket in buckets
+        for bucket in solved.buckets
     )
+    return solved.replace(buckets=buckets)
