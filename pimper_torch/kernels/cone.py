@@ -14,6 +14,10 @@ from pimper_torch.kernels.switch import compiled
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+Three = tuple[float, float, float]
+Four = tuple[float, float, float, float]
+Six = tuple[float, float, float, float, float, float]
+Ten = tuple[float, float, float, float, float, float, float, float, float, float]
 
 TILE = 32
 
@@ -74,7 +78,8 @@ def _step(tile: Doubles) -> None:
 
 
 @compiled(fast=True)
-def at(tile, k):
+def at(tile: Doubles, k: int) -> tuple[Ten, Four, Four]:
+    """Read a sample's ``A``, ``b`` and shading vector."""
     a = (
         tile[k],
         tile[TILE + k],
@@ -93,7 +98,7 @@ def at(tile, k):
 
 
 @compiled(fast=True)
-def apply(a, v):
+def apply(a: Ten, v: Four) -> Four:
     """Multiply a packed matrix with a vector."""
     return (
         a[0] * v[0] + a[1] * v[1] + a[2] * v[2] + a[3] * v[3],
@@ -104,7 +109,7 @@ def apply(a, v):
 
 
 @compiled(fast=True)
-def gain(s, image, b):
+def gain(s: Four, image: Four, b: Four) -> float:
     """Give ``s . (A s - 2 b)``."""
     return (
         s[0] * (image[0] - 2 * b[0])
@@ -115,7 +120,7 @@ def gain(s, image, b):
 
 
 @compiled(fast=True)
-def step_along(a, slope, s):
+def step_along(a: Ten, slope: Four, s: Four) -> Four:
     """Take the step ``(B^T A B)^-1 B^T slope`` along the cone, at most as long as it holds."""
     n, first, second = frame(s)
     m = raised(congruence(a, n, first, second))
@@ -145,7 +150,7 @@ def step_along(a, slope, s):
 
 
 @compiled(fast=True)
-def project(b, x, y, z):
+def project(b: float, x: float, y: float, z: float) -> Four:
     """Give the nearest vector of the cone; see ``photometry.cone.project_to_cone``."""
     square = x * x + y * y + z * z
     length = math.sqrt(square if square > 0 else 1.0)
@@ -156,7 +161,7 @@ def project(b, x, y, z):
 
 
 @compiled(fast=True)
-def frame(s):
+def frame(s: Four) -> tuple[Three, Three, Three]:
     """Give the normal, zero where there is none, and two tangents; see ``photometry.cone``."""
     square = s[1] * s[1] + s[2] * s[2] + s[3] * s[3]
     inverse = 1 / math.sqrt(square if square > 0 else 1.0)
@@ -172,7 +177,7 @@ def frame(s):
 
 
 @compiled(fast=True)
-def congruence(a, n, first, second):
+def congruence(a: Ten, n: Three, first: Three, second: Three) -> Six:
     """Give ``B^T A B``, packed, for the columns ``(1, n)``, ``(0, first)``, ``(0, second)``."""
     u = apply(a, (0.0, first[0], first[1], first[2]))
     v = apply(a, (0.0, second[0], second[1], second[2]))
@@ -188,14 +193,14 @@ def congruence(a, n, first, second):
 
 
 @compiled(fast=True)
-def raised(m):
+def raised(m: Six) -> Six:
     """Raise the diagonal a little, so that the matrix can be inverted."""
     more = 1e-9 * (m[0] + m[3] + m[5])
     return m[0] + more, m[1], m[2], m[3] + more, m[4], m[5] + more
 
 
 @compiled(fast=True)
-def inverse_factor(m):
+def inverse_factor(m: Six) -> Six:
     """Give ``C^-1`` row by row for ``m = C C^T``; see ``photometry.quadratics.PackedCholesky``."""
     floor = max(1e-12 * (m[0] + m[3] + m[5]), _TINY)
     c00 = 1 / math.sqrt(max(m[0], floor))

@@ -390,9 +390,9 @@ def _block(
     u, v, w = white[0, f], white[1, f], white[2, f]
     x, y, z = white[0, g], white[1, g], white[2, g]
     a, b, c, d, e = pairs[0], pairs[1], pairs[2], pairs[3], pairs[4]
-    i, j, l, m, n = pairs[5], pairs[6], pairs[7], pairs[8], pairs[9]
+    i, j, h, m, n = pairs[5], pairs[6], pairs[7], pairs[8], pairs[9]
     zero = np.float32(0)
-    sa, sb, sc, sd, se, si, sj, sl, sm, sn = (
+    sa, sb, sc, sd, se, si, sj, sh, sm, sn = (
         zero,
         zero,
         zero,
@@ -413,10 +413,10 @@ def _block(
         se += share * e[k]
         si += share * i[k]
         sj += share * j[k]
-        sl += share * l[k]
+        sh += share * h[k]
         sm += share * m[k]
         sn += share * n[k]
-    sums = (sa, sb, sc, sd, se, si, sj, sl, sm, sn)
+    sums = (sa, sb, sc, sd, se, si, sj, sh, sm, sn)
     for place in range(10):
         row, column = _ROWS[place], _COLUMNS[place]
         curvature[4 * f + row, 4 * g + column] = factor * sums[place]

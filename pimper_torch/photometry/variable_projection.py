@@ -95,7 +95,6 @@ def solve_variable_projection(
 
     Constant to autograd. Patches do not influence one another.
     """
-
     if _has_kernel(problem):
         return _solve_by_kernel(problem, max_iterations, tolerance, small_steps, curvature_samples)
 

@@ -1,0 +1,194 @@
+"""The compiled solver against the torch module that it stands in for."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.kernels.switch import using
+from pimper_torch.photometry.bilinear import select
+from pimper_torch.photometry.factorize import Factorize
+from pimper_torch.photometry.mesh_light import thinned
+from pimper_torch.photometry.robust import Cauchy, Squares
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.records import StopCause
+
+
+def solve(given, how, iterations=60, tolerance=1e-4, **settings):
+    with using(how):
+        return solve_variable_projection(given, iterations, tolerance, **settings)
+
+
+def noisy(problem, generator, **settings):
+    """Problems like those of photographs: noise, outliers, priors, and lights that are pulled."""
+    given, _, _ = problem(**settings)
+    draw = torch.randn(given.radiance.shape, generator=generator, dtype=torch.float64)
+    gross = torch.rand(given.radiance.shape, generator=generator) < 0.05
+    off = torch.where(gross, 0.5 * draw, 0.02 * draw)
+    _, normals = given.manifold.split(given.shading.mT)
+    return given.replace(
+        radiance=given.weight * (given.radiance + off),
+        pull=torch.full_like(given.pull, 5.0),
+        prior=0.3 * given.manifold.bend(normals.mT),
+        loss=Cauchy(),
+    ).to(torch.float32)
+
+
+@pytest.mark.parametrize("loss", [Squares(), Cauchy()])
+@pytest.mark.parametrize("missing", [0.0, 0.6])
+def test_solutions_are_those_of_the_reference(problem, generator, missing, loss):
+    given = noisy(problem, generator, patches=3, views=14, samples=90, missing=missing)
+    given = given.replace(loss=loss)
+    # After a small step the next gains are rounding.
+    found, expected = (solve(given, how, small_steps=1) for how in ("numba", "torch"))
+    assert_close(found.convergence.cause, expected.convergence.cause)
+    assert (found.convergence.iterations - expected.convergence.iterations).abs().max() <= 1
+    # Rounding of float32, and what a tolerance of 1e-4 leaves where one takes a step more.
+    assert_close(found.lights, expected.lights, rtol=0, atol=2e-3)
+    assert_close(found.shading, expected.shading, rtol=0, atol=2e-3)
+    assert_close(found.weight, expected.weight, rtol=0, atol=2e-2)
+    assert_close(found.convergence.residual, expected.convergence.residual, rtol=1e-3, atol=0)
+    assert (found.lights - given.lights).abs().max() > 0.02  # they moved
+
+
+def test_both_end_at_the_same_minimum(problem, generator):
+    given = noisy(problem, generator, patches=2, views=10, samples=70, missing=0.3)
+    found = solve(given, "numba", iterations=300, tolerance=1e-7, small_steps=3)
+    exact = solve(given.to(torch.float64), "torch", iterations=300, tolerance=1e-12)
+    assert_close(found.lights.double(), exact.lights, rtol=0, atol=2e-3)
+    assert_close(found.shading.double(), exact.shading, rtol=0, atol=2e-3)
+
+
+def test_exact_factors_are_recovered(problem):
+    given, _, _ = problem(patches=2, missing=0.5)
+    found = solve(given.to(torch.float32), "numba", iterations=300, tolerance=1e-7)
+    assert found.convergence.residual.max() < 1e-4  # of radiances about 1; the start is off by 0.1
+    assert_close(found.shading[:, 0], found.shading[:, 1:].norm(dim=1))
+
+
+def test_light_without_pull_keeps_its_size(problem):
+    given, _, _ = problem(patches=1, missing=0.3)
+    given = given.to(torch.float32)
+    found = solve(given, "numba")
+    assert_close(found.lights.norm(), given.lights.norm())
+
+
+@pytest.mark.parametrize("subset", [{"stride": 3}, {"curvature_samples": 40}])
+def test_a_part_of_the_samples_tells_spread_and_curvature(problem, generator, subset):
+    given = noisy(problem, generator, patches=2, views=12, samples=128, missing=0.3)
+    given = given.replace(stride=subset.get("stride", 1))
+    steer = {"curvature_samples": subset.get("curvature_samples")}
+    found, expected = (solve(given, how, **steer) for how in ("numba", "torch"))
+    assert_close(found.lights, expected.lights, rtol=0, atol=5e-3)
+    whole = solve(given.replace(stride=1), "numba")
+    assert (whole.weight - found.weight).abs().max() > 1e-5 or "stride" not in subset
+
+
+def test_views_and_samples_without_data_make_no_difference(problem, generator):
+    given = noisy(problem, generator, patches=1, views=12, samples=80, missing=0.2)
+    weight = given.weight.clone()
+    weight[:, 3] = 0
+    weight[:, :, 50:] = 0
+    given = given.replace(weight=weight, radiance=weight * given.radiance)
+    keep = torch.arange(12) != 3
+    small = given.replace(
+        **{name: getattr(given, name)[:, keep] for name in ("lights", "anchor", "pull")},
+        radiance=given.radiance[:, keep, :50].contiguous(),
+        weight=given.weight[:, keep, :50].contiguous(),
+        shading=given.shading[..., :50].contiguous(),
+        prior=given.prior[..., :50].contiguous(),
+    )
+    found = solve(given, "numba")
+    alone = solve(small, "torch")
+    assert_close(found.lights[:, keep], alone.lights, rtol=0, atol=2e-3)
+    assert_close(found.lights[:, 3], given.anchor[:, 3])
+    assert_close(found.shading[..., 50:], given.shading[..., 50:])
+    assert (found.weight[:, 3] == 0).all()
+
+
+def test_a_patch_is_solved_as_if_it_were_alone(problem, generator):
+    given = noisy(problem, generator, patches=3, views=10, samples=50)
+    there = torch.tensor([1.0, 0, 1])[:, None, None]
+    given = given.replace(weight=given.weight * there, radiance=given.radiance * there)
+    together = solve(given, "numba")
+    assert together.convergence.cause[1] == StopCause.EMPTY
+    assert_close(together.lights[1], given.lights[1])
+    for patch in (0, 2):
+        alone = solve(select(given, torch.tensor([patch])), "numba")
+        assert torch.equal(together.lights[patch], alone.lights[0])
+        assert torch.equal(together.shading[patch], alone.shading[0])
+
+
+def test_the_limit_of_iterations_is_kept_and_told(problem, generator):
+    given = noisy(problem, generator, patches=2, views=10, samples=50)
+    found, expected = (
+        solve(given, how, iterations=2, tolerance=1e-9) for how in ("numba", "torch")
+    )
+    assert found.convergence.cause.tolist() == [StopCause.LIMIT] * 2
+    assert_close(found.lights, expected.lights, rtol=0, atol=1e-4)
+
+
+def test_whole_factorizations_agree_and_nan_is_missing(scene):
+    seen = scene().seen.to(torch.float32)
+    first = seen.buckets[0]
+    radiance = first.radiance.clone()
+    radiance[2] = torch.nan
+    radiance[0, 3, :, 4:6] = torch.nan
+    seen = seen.replace(buckets=(first.replace(radiance=radiance), *seen.buckets[1:]))
+    results = []
+    for how in ("numba", "torch"):
+        with using(how), pytest.warns(PimperWarning, match="1 of 8"):
+            results.append(Factorize()(seen))
+    for one, other in zip(results[0].buckets, results[1].buckets, strict=True):
+        assert_close(one.verdict, other.verdict)
+        assert_close(one.valid, other.valid)
+        for name in ("normals_patch", "albedo", "lights_patch", "confidence"):
+            assert_close(getattr(one, name), getattr(other, name), rtol=0, atol=5e-3)
+
+
+def test_patches_can_be_factorized_one_by_one(scene):
+    seen = scene().seen
+    stage = Factorize()
+    whole = stage(seen)
+    light = stage.light(seen)
+    buckets = []
+    for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
+        patches = seen.patches.replace(buckets=(templates,))
+        part = seen.replace(patches=patches, buckets=(registered,))
+        buckets.extend(stage.solve(part, light).buckets)
+    again = stage.conclude(whole.replace(buckets=tuple(buckets)))
+    for one, other in zip(again.buckets, whole.buckets, strict=True):
+        assert_close(one.normals_patch, other.normals_patch)
+        assert_close(one.albedo, other.albedo)
+
+
+def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
+    true = scene(bumps=0.0)
+    monkeypatch.setattr("pimper_torch.photometry.mesh_light.LIGHT_SAMPLES", 30)
+    thin = thinned(true.seen.patches)
+    registered = []
+    for few, templates, each in zip(
+        thin.buckets, true.seen.patches.buckets, true.seen.buckets, strict=True
+    ):
+        height = templates.depth.shape[1]
+        rows = torch.arange(height)[(height > 14) :: 2][: few.depth.shape[1]]
+        step = round(float(few.spacing[0] / templates.spacing[0]))
+        assert step > 1
+        rows = torch.arange((step - 1) // 2, height, step)
+        assert_close(few.points_patch, templates.points_patch[:, rows][:, :, rows])
+        assert_close(few.inside, templates.inside[:, rows][:, :, rows])
+        radiance = each.radiance[..., rows, :][..., rows]
+        registered.append(
+            each.replace(radiance=radiance, valid=each.valid[..., rows, :][..., rows])
+        )
+    few = Factorize().light(true.seen.replace(patches=thin, buckets=tuple(registered)))
+    every = Factorize().light(true.seen)
+    middle = torch.zeros(1, 3, dtype=torch.float64)
+    # Exact data: both are the truth.
+    assert_close(few.field.lights_at(middle), every.field.lights_at(middle), rtol=0, atol=5e-3)
+
+
+def test_templates_with_few_samples_are_left_whole(scene):
+    patches = scene().seen.patches
+    for few, whole in zip(thinned(patches).buckets, patches.buckets, strict=True):
+        assert_close(few.points_patch, whole.points_patch)
