@@ -392,18 +392,7 @@ def _block(
     a, b, c, d, e = pairs[0], pairs[1], pairs[2], pairs[3], pairs[4]
     i, j, h, m, n = pairs[5], pairs[6], pairs[7], pairs[8], pairs[9]
     zero = np.float32(0)
-    sa, sb, sc, sd, se, si, sj, sh, sm, sn = (
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-        zero,
-    )
+    sa = sb = sc = sd = se = si = sj = sh = sm = sn = zero
     for k in range(len(heavy)):
         share = heavy[k] - (u[k] * x[k] + v[k] * y[k] + w[k] * z[k])
         sa += share * a[k]

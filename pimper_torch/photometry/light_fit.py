@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
+from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
-from pimper_torch.photometry.light_models import LightModel
+from pimper_torch.photometry.light_models import LEAST_DISTANCE, LightModel
 from pimper_torch.photometry.shown import Shown
 
 # A fit is done when a step lowers its cost by less than this share; and iterations and share where
@@ -54,9 +56,44 @@ def _asked(model: LightModel, shown: Shown) -> bool:
 
 
 def _fit(model: LightModel, shown: Shown, limit: int, least_gain: float) -> LightFit:
-    """Step on lights and albedo together: alternation crawls along valleys where both mimic."""
     lights, albedo = model.start(shown)
-    lights = model.admit(lights)
+    descend = _descend_by_kernel if compiled_for(shown.radiance) else _descend
+    lights, albedo = descend(model, shown, model.admit(lights), albedo, limit, least_gain)
+    residual = shown.residual(albedo, model.shade(lights))
+    relative = (residual.abs() / shown.level.clamp_min(1e-300))[shown.seen]
+    return LightFit(model=model, lights=lights, albedo=albedo, misfit=float(relative.median()))
+
+
+def _descend_by_kernel(
+    model: LightModel,
+    shown: Shown,
+    lights: Float[Tensor, "view parameter"],
+    albedo: Float[Tensor, " sample"],
+    limit: int,
+    least_gain: float,
+) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+    from pimper_torch.kernels.lights import TILE, fit
+
+    count = len(albedo)
+    lights = lights.clone(memory_format=torch.contiguous_format)
+    whole = (0, -count % TILE)
+    known = [torch.cat(model.known(), dim=1).mT, shown.radiance.mT, shown.seen.mT.to(albedo)]
+    rows = [pad(each.detach(), whole).contiguous().numpy() for each in known]
+    found = pad(albedo, whole)
+    bounds = (shown.level.detach().numpy(), 1 / LEAST_DISTANCE)
+    fit(*rows, *bounds, limit, least_gain, lights.numpy(), found.numpy())
+    return lights, found[:count]
+
+
+def _descend(
+    model: LightModel,
+    shown: Shown,
+    lights: Float[Tensor, "view parameter"],
+    albedo: Float[Tensor, " sample"],
+    limit: int,
+    least_gain: float,
+) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+    """Step on lights and albedo together: alternation crawls along valleys where both mimic."""
     shading = model.shade(lights)
     residual = shown.residual(albedo, shading)
     damping = 1e-3
@@ -84,8 +121,7 @@ def _fit(model: LightModel, shown: Shown, limit: int, least_gain: float) -> Ligh
                 break
         else:
             damping = min(damping * 10, 1e6)
-    relative = (residual.abs() / shown.level.clamp_min(1e-300))[shown.seen]
-    return LightFit(model=model, lights=lights, albedo=albedo, misfit=float(relative.median()))
+    return lights, albedo
 
 
 def with_gradients(found: LightFit, shown: Shown) -> LightFit:

@@ -2,12 +2,14 @@
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.kernels.switch import using
 from pimper_torch.photometry.bilinear import select
 from pimper_torch.photometry.factorize import Factorize
+from pimper_torch.photometry.lights import fit_light_field
 from pimper_torch.photometry.mesh_light import thinned
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
@@ -192,3 +194,33 @@ def test_templates_with_few_samples_are_left_whole(scene):
     patches = scene().seen.patches
     for few, whole in zip(thinned(patches).buckets, patches.buckets, strict=True):
         assert_close(few.points_patch, whole.points_patch)
+
+
+@pytest.mark.parametrize("model", ["soft", "lamp"])
+def test_lights_fitted_to_known_normals_are_those_of_the_reference(generator, model):
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    n = normalize(normal(700, 3), dim=1)
+    x = n + 0.1 * normal(700, 3)
+    albedo = 0.3 + torch.rand(700, generator=generator, dtype=torch.float64)
+    lamp = 4 * normalize(normal(9, 3), dim=1)
+    away = lamp - x[:, None]
+    facing = (n[:, None] * away).sum(dim=2).clamp_min(0) / away.norm(dim=2) ** 3
+    radiance = albedo[:, None] * (0.02 + 10 * facing) + 0.003 * normal(700, 9)
+    gross = torch.rand(radiance.shape, generator=generator) < 0.05
+    radiance = torch.where(gross, radiance + 0.5, radiance)
+    seen = torch.rand(radiance.shape, generator=generator) < 0.7
+    seen[:, 4] = False  # a view without data
+    fields = []
+    for how in ("numba", "torch"):
+        with using(how):
+            fields.append(fit_light_field(radiance, seen, n, x, model=model, iterations=100))
+    found, expected = fields
+    # Both end where a step gains less than 1e-7 of the loss.
+    assert_close(found.lights_at(x), expected.lights_at(x), rtol=0, atol=2e-3)
+    if model == "lamp":
+        told = torch.arange(9) != 4
+        off = torch.cosine_similarity(found.lamp_at(x)[:, told], away[:, told], dim=2)
+        assert torch.rad2deg(torch.acos(off.clamp(-1, 1))).median() < 1
+        assert (found.lamp[4] == 0).all()
