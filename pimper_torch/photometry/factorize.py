@@ -279,10 +279,12 @@ class Factorize(nn.Module):
         anchor = _of_rank(rotate_lights(patch_from_world, field.lights_at(middle)), config.rank)
         lamp = rotate(patch_from_world, field.lamp_at(middle))
         rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
+        shown = bucket.registered.valid & bucket.templates.inside[:, None]
+        finite = rows.seen.flatten(1).any(dim=1)
         rows = rows.replace(seen=rows.seen & faces_lamp(lamp, rows.normals))
         verdict = judge_data(
-            bucket.templates,
-            bucket.registered,
+            shown.flatten(1).any(dim=1),
+            finite,
             rows.seen,
             anchor,
             config.min_views,
@@ -418,6 +420,7 @@ def _lit(bucket: _Bucket, light: Illumination) -> Registered:
         tolerance=SHADOW_SAMPLES * templates.spacing.detach(),
         guard=SHADOW_SAMPLES * float(templates.spacing[0].detach()),
         asked=templates.inside,
+        seen=registered.valid,
     )
     reached = (shadows.lit & shadows.sure).movedim(-1, 1)
     return registered.replace(valid=registered.valid & reached)

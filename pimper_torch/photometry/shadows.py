@@ -40,6 +40,7 @@ def cast_shadows(
     normals: Float[Tensor, "*batch 3"],
     tolerance: float | Float[Tensor, "*#batch"],
     guard: float | Float[Tensor, "*#batch"] = 0.0,
+    asked: Bool[Tensor, "*batch view"] | None = None,
 ) -> Shadows:
     """Cast a ray from every sample to the lamp of every view.
 
@@ -55,6 +56,7 @@ def cast_shadows(
             predicted; scene units. Above 0, six rays more are cast round each lit or shadowed
             sample that faces the lamp, and one that disagrees makes it unsure: no straight
             edge that near is missed.
+        asked: Where an answer is wanted; elsewhere everything is lit and sure.
 
     Returns:
         A sample that can be trusted to be lit is ``lit & sure``. What faces away from the lamp
@@ -70,28 +72,22 @@ def cast_shadows(
     views = len(field.lamp)
     lit = torch.ones(len(flat), views, dtype=torch.bool, device=like.device)
     sure = torch.ones_like(lit)
-    rows = max(1, _RAYS_AT_ONCE // (1 if ring is None else 1 + _RING))
-    for view in range(views):
-        if not bool(field.lamp[view].norm() > 0):
-            continue
-        for some in torch.split(torch.arange(len(flat), device=like.device), rows):
-            towards, _ = _way_to_lamp(field, view, flat[some])
-            facing = (towards * up[some]).sum(dim=-1) > 0
-            asked = some[facing]
-            lit[some[~facing], view] = False
-            free = _free(field, view, caster, flat[asked], up[asked], slack[asked])
-            lit[asked, view] = free
-            if ring is not None:
-                around = flat[asked, None] + ring[asked]
-                same = _free(
-                    field,
-                    view,
-                    caster,
-                    around,
-                    up[asked, None].expand_as(around),
-                    slack[asked, None],
-                )
-                sure[asked, view] = (same == free[:, None]).all(dim=1)
+    shines = field.lamp.norm(dim=1) > 0
+    wanted = lit & shines if asked is None else asked.reshape(-1, views) & shines
+    at_once = max(1, _RAYS_AT_ONCE // (1 if ring is None else 1 + _RING))
+    for some in torch.split(wanted.mT.nonzero(), at_once):
+        view, sample = some.unbind(dim=1)
+        towards, _ = _way_to_lamp(field, view, flat[sample])
+        facing = (towards * up[sample]).sum(dim=-1) > 0
+        lit[sample, view] = facing
+        view, sample = view[facing], sample[facing]
+        free = _free(field, view, caster, flat[sample], up[sample], slack[sample])
+        lit[sample, view] = free
+        if ring is not None:
+            around = flat[sample, None] + ring[sample]
+            outward = up[sample, None].expand_as(around)
+            same = _free(field, view[:, None], caster, around, outward, slack[sample, None])
+            sure[sample, view] = (same == free[:, None]).all(dim=1)
     return Shadows(lit=lit.reshape(*shape, views), sure=sure.reshape(*shape, views))
 
 
@@ -106,6 +102,7 @@ def cast_shadows_on_rasters(
     guard: float = 0.0,
     stride: int = 4,
     asked: Bool[Tensor, "patch height width"] | None = None,
+    seen: Bool[Tensor, "patch view height width"] | None = None,
 ) -> Shadows:
     """Predict shadows on templates from a sparse raster of rays.
 
@@ -122,6 +119,7 @@ def cast_shadows_on_rasters(
         guard: Scene units.
         stride: Samples between rays.
         asked: Where an answer is wanted; elsewhere everything is lit and sure.
+        seen: In which views; no answer is wanted in others.
 
     Returns:
         Of shape ``patch height width view``.
@@ -129,12 +127,15 @@ def cast_shadows_on_rasters(
     height, width = points.shape[1:3]
     rows, columns = _ray_places(height, stride, points), _ray_places(width, stride, points)
     wanted = points.new_ones(points.shape[:3], dtype=torch.bool) if asked is None else asked
-    chosen = max_pool2d(wanted[:, None].float(), stride, ceil_mode=True)[:, 0] > 0
+    chosen = _in_blocks(wanted[:, None], stride)[:, 0]
+    views = None if seen is None else _in_blocks(seen, stride).movedim(1, -1)[chosen]
     patch, row, column = chosen.nonzero(as_tuple=True)
     place = patch, rows[row], columns[column]
     slack = torch.as_tensor(tolerance).to(points).expand(len(points))
     margin = guard + 2**0.5 * (stride // 2) * spacing if guard > 0 else torch.zeros_like(spacing)
-    found = cast_shadows(field, caster, points[place], normals[place], slack[patch], margin[patch])
+    found = cast_shadows(
+        field, caster, points[place], normals[place], slack[patch], margin[patch], views
+    )
 
     def spread_out(sparse: Bool[Tensor, "ray view"]) -> Bool[Tensor, "patch height width view"]:
         blocks = torch.ones(*chosen.shape, sparse.shape[1], dtype=torch.bool, device=sparse.device)
@@ -145,6 +146,13 @@ def cast_shadows_on_rasters(
     return Shadows(lit=spread_out(found.lit), sure=spread_out(found.sure))
 
 
+def _in_blocks(
+    some: Bool[Tensor, "patch view height width"], stride: int
+) -> Bool[Tensor, "patch view rows columns"]:
+    """Tell which blocks of ``stride`` samples have any of some."""
+    return max_pool2d(some.float(), stride, ceil_mode=True) > 0
+
+
 def _ray_places(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tensor, " ray"]:
     """Give the sample in each block of ``stride`` that the ray is cast from."""
     first = torch.arange(0, size, stride, device=like.device)
@@ -152,12 +160,12 @@ def _ray_places(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tenso
 
 
 def _way_to_lamp(
-    field: LightField, view: int, points: Float[Tensor, "*batch 3"]
+    field: LightField, view: Int[Tensor, "*#batch"], points: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
     """Give the unit direction to the lamp and its distance, infinite for one far away."""
-    direction = normalize(field.lamp[view], dim=0).to(points)
-    closeness = field.closeness[view].to(points)
-    away = direction - closeness * (points - field.origin.to(points))
+    direction = normalize(field.lamp, dim=1).to(points)[view]
+    closeness = field.closeness.to(points)[view]
+    away = direction - closeness[..., None] * (points - field.origin.to(points))
     length = away.norm(dim=-1)
     far = torch.where(closeness > 0, length / closeness.clamp_min(1e-30), torch.inf)
     return away / length.clamp_min(1e-30)[..., None], far
@@ -165,7 +173,7 @@ def _way_to_lamp(
 
 def _free(
     field: LightField,
-    view: int,
+    view: Int[Tensor, "*#batch"],
     caster: RayCaster,
     points: Float[Tensor, "*batch 3"],
     normals: Float[Tensor, "*batch 3"],

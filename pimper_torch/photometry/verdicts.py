@@ -9,12 +9,12 @@ from torch import Tensor
 
 from pimper_torch.errors import caution
 from pimper_torch.photometry.certainty import light_varies
-from pimper_torch.records import PatchVerdict, Photometry, Registered, Templates
+from pimper_torch.records import PatchVerdict, Photometry
 
 
 def judge_data(
-    templates: Templates,
-    registered: Registered,
+    shown: Bool[Tensor, " patch"],
+    finite: Bool[Tensor, " patch"],
     seen: Bool[Tensor, "patch view sample"],
     lights: Float[Tensor, "patch view rank"],
     min_views: int,
@@ -23,9 +23,9 @@ def judge_data(
     """Tell which patches can be factorized.
 
     Args:
-        templates: Of the patches.
-        registered: What the views have there.
-        seen: What is left of it: finite, and facing the lamp.
+        shown: Whether a view has a sample there at all.
+        finite: Whether one of them is finite.
+        seen: Samples that are finite, and face the lamp.
         lights: The field's.
         min_views: Views a sample must be lit in.
         min_light_variation: See :func:`~pimper_torch.photometry.certainty.light_varies`.
@@ -39,10 +39,8 @@ def judge_data(
     varies = light_varies(lights, share, min_light_variation)
     verdict[~varies] = int(PatchVerdict.CONSTANT_LIGHT)
     verdict[~(seen.sum(dim=1) >= min_views).any(dim=1)] = int(PatchVerdict.FEW_VIEWS)
-    valid = registered.valid & templates.inside[:, None]
-    finite = valid & registered.radiance.isfinite().all(dim=2)
-    verdict[~finite.flatten(1).any(dim=1)] = int(PatchVerdict.NOT_FINITE)
-    verdict[~valid.flatten(1).any(dim=1)] = int(PatchVerdict.UNSEEN)
+    verdict[~finite] = int(PatchVerdict.NOT_FINITE)
+    verdict[~shown] = int(PatchVerdict.UNSEEN)
     return verdict
 
 

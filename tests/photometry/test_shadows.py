@@ -150,3 +150,21 @@ def test_rays_are_cast_only_where_asked(ball_over_plane, plane):
     assert (found.lit == whole.lit)[asked].all()
     assert not found.lit[asked].all()
     assert found.lit[0, :80].all()
+
+
+def test_rays_are_cast_only_in_views_that_show_the_sample(ball_over_plane, plane):
+    points, normals = plane
+    field = lamps([(0, 0, 3.0), (0.5, 0, 3.0)])
+    spacing = torch.tensor([0.02]).double()
+    seen = torch.zeros(1, 2, *points.shape[:2], dtype=torch.bool)
+    seen[:, 0, 90:110] = True
+    seen[:, 1, :, 100:] = True
+    settings = {"tolerance": 1e-4, "stride": 4, "guard": 0.01}
+    raster = points[None], normals[None], spacing
+    found = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings, seen=seen)
+    whole = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings)
+    there = seen.movedim(1, -1)
+    assert (found.lit == whole.lit)[there].all()
+    assert (found.sure == whole.sure)[there].all()
+    assert not found.lit[there].all()
+    assert found.lit[0, :80, :, 0].all()
