@@ -1,6 +1,6 @@
 """The chain: photographs in, surface out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -37,6 +37,7 @@ from pimper_torch.reporting import Observer, Silent, recorded
 from pimper_torch.rims.constraints import Rim, Rims
 from pimper_torch.rims.contours import RimConfig
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.streaming import photometry_and_heights
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
 
@@ -176,18 +177,18 @@ class Pimper(nn.Module):
         views, cameras = scene.views, scene.cameras
         rims = self.rim(outlines, cameras)
         coarse = self._coarse(scene, outlines, rims, mesh)
+        sources = self.warp.prepare(views)
         swept: SweptPatches | None = None
         surface: Surface | None = None
-        cautions: Sequence[str] = ()
         last = len(self.config.rounds.scales)
         for number, scale in enumerate(self.config.rounds.scales, start=1):
             with held() as cautions:
                 if surface is not None:
                     coarse = self.adapt(swept, surface, rims)
                 patches = self.decompose(coarse, cameras, surface, scale)
-                seen = self.warp(views, cameras, patches)
-                photometric = self.factorize(seen)
-                swept = self.sweep(views, cameras, seen, photometric)
+                swept = photometry_and_heights(
+                    self.warp, self.factorize, self.sweep, views, cameras, patches, sources
+                )
                 surface = self.mend(self.fuse(swept, rims, expected=number == last))
         for message in cautions:
             caution(message, stacklevel=3)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import singledispatch
 from typing import Protocol, runtime_checkable
 
@@ -56,8 +57,27 @@ class Silent:
         """Do nothing."""
 
 
-# The reports of the call that this thread is in. Hooks belong to a module, which threads share.
-_recording: ContextVar[list[StageReport] | None] = ContextVar("recording", default=None)
+@dataclass(frozen=True, slots=True)
+class _Recording:
+    """The reports of a call, and who hears of them."""
+
+    reports: list[StageReport]
+    observer: Observer
+
+    def finish(self, name: str, began: float, told: dict[str, int | float]) -> None:
+        """Report that a stage ended."""
+        report = StageReport(
+            name=name,
+            seconds=time.perf_counter() - began,
+            peak_memory_mb=peak_memory_mb(),
+            figures=told,
+        )
+        self.reports.append(report)
+        self.observer.finished(report)
+
+
+# Of the call that this thread is in. Hooks belong to a module, which threads share.
+_recording: ContextVar[_Recording | None] = ContextVar("recording", default=None)
 
 
 @contextmanager
@@ -69,38 +89,51 @@ def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]
     Yields:
         The list that a report is appended to whenever a submodule has run.
     """
-    reports: list[StageReport] = []
-    began: dict[str, int | float] = {}
+    recording = _Recording([], observer)
+    began: dict[str, float] = {}
     hooks = []
-    for name, stage in chain.named_children():
+    for name, module in chain.named_children():
 
         def before(_: nn.Module, __: tuple[object, ...], name: str = name) -> None:
-            if _recording.get() is reports:
+            if _recording.get() is recording:
                 began[name] = time.perf_counter()
                 observer.started(name)
 
         def after(_: nn.Module, __: tuple[object, ...], output: object, name: str = name) -> None:
-            if _recording.get() is not reports:
-                return
-            reports.append(
-                StageReport(
-                    name=name,
-                    seconds=time.perf_counter() - began[name],
-                    peak_memory_mb=peak_memory_mb(),
-                    figures=figures(output),
-                )
-            )
-            observer.finished(reports[-1])
+            if _recording.get() is recording:
+                recording.finish(name, began[name], figures(output))
 
-        hooks += [stage.register_forward_pre_hook(before), stage.register_forward_hook(after)]
-    token = _recording.set(reports)
+        hooks += [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
+    token = _recording.set(recording)
     try:
         with listening(observer.progressed):
-            yield reports
+            yield recording.reports
     finally:
         _recording.reset(token)
         for hook in hooks:
             hook.remove()
+
+
+@contextmanager
+def stage(name: str) -> Iterator[dict[str, int | float]]:
+    """Report what the ``with`` block does as one stage, and nothing of the stages it calls.
+
+    Yields:
+        The figures to be told, empty at first.
+    """
+    told: dict[str, int | float] = {}
+    recording = _recording.get()
+    if recording is None:
+        yield told
+        return
+    began = time.perf_counter()
+    recording.observer.started(name)
+    token = _recording.set(None)
+    try:
+        yield told
+    finally:
+        _recording.reset(token)
+    recording.finish(name, began, told)
 
 
 def peak_memory_mb() -> float:

@@ -40,6 +40,7 @@ ROOMS = [
     "refinement",
     "meshing",
     "reporting",
+    "streaming",
     "pipeline",
     "viz",
     "io",

@@ -1,0 +1,149 @@
+"""Warp, factorization and sweep of all patches, a few at a time.
+
+A patch needs nothing of others but the light field, which is fitted first, to few samples of all
+patches, and the scale of albedo, which is set last. So the matrices J exist for as many buckets as
+are worked on side by side, and no more.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import Protocol, runtime_checkable
+
+from torch import nn
+
+from pimper_torch.parallel import side_by_side
+from pimper_torch.patches.sources import Sources
+from pimper_torch.photometry.factorize import Illumination
+from pimper_torch.photometry.mesh_light import thinned
+from pimper_torch.records import (
+    Cameras,
+    Heights,
+    PatchSet,
+    PatchViews,
+    PhotometricPatches,
+    Photometry,
+    Record,
+    SweptPatches,
+    Templates,
+    Views,
+)
+from pimper_torch.reporting import figures, stage
+
+
+@runtime_checkable
+class InParts(Protocol):
+    """A factorization that can be called with some of the patches."""
+
+    def light(self, seen: PatchViews) -> Illumination:
+        """Fit the light of every view to views on templates that may be thinned."""
+
+    def solve(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
+        """Factorize some of the patches."""
+
+    def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
+        """Do what needs all patches."""
+
+
+Warping = Callable[[Views, Cameras, PatchSet, Sources], PatchViews]
+Sweeping = Callable[[Views, Cameras, PatchViews, PhotometricPatches, Sources], SweptPatches]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Bucket(Record):
+    """What is kept of a bucket."""
+
+    photometry: Photometry
+    heights: Heights
+    averaged: float
+    num_valid: int
+
+
+def photometry_and_heights(
+    warp: Warping,
+    factorize: nn.Module,
+    sweep: Sweeping,
+    views: Views,
+    cameras: Cameras,
+    patches: PatchSet,
+    sources: Sources,
+) -> SweptPatches:
+    """Give normals, albedo, light and swept heights of all patches.
+
+    What the three stages give one after the other, called with all patches, but for the samples
+    that light is fitted to; a factorization that is not :class:`InParts` is called so.
+
+    Args:
+        warp: Resamples views on some buckets.
+        factorize: Separates albedo, normals and light.
+        sweep: Finds heights under that light.
+        views: Photographs.
+        cameras: Of all views.
+        patches: The decomposition.
+        sources: The photographs as ``Warp`` prepares them.
+
+    Differentiable as the stages are.
+    """
+    mesh = patches.surface or patches.coarse.mesh
+    sources = sources.hidden_by(mesh)
+    if not isinstance(factorize, InParts):
+        seen = warp(views, cameras, patches, sources)
+        photometric: PhotometricPatches = factorize(seen)
+        return sweep(views, cameras, seen, photometric, sources)
+    with stage("photometry") as told:
+        clock = _Clock()
+        light = factorize.light(warp(views, cameras, thinned(patches), sources))
+
+        def one(templates: Templates) -> _Bucket:
+            part = patches.replace(buckets=(templates,))
+            with clock("warp"):
+                seen = warp(views, cameras, part, sources)
+            with clock("factorize"):
+                solved = factorize.solve(seen, light)
+            with clock("sweep"):
+                swept = sweep(views, cameras, seen, solved, sources)
+            return _Bucket(
+                photometry=solved.buckets[0],
+                heights=swept.buckets[0],
+                averaged=swept.averaged,
+                num_valid=int(seen.buckets[0].valid.sum()),
+            )
+
+        found = list(side_by_side(one, patches.buckets))
+        solved = PhotometricPatches(
+            patches=patches, buckets=tuple(bucket.photometry for bucket in found)
+        )
+        photometric = factorize.conclude(solved)
+        samples = cameras.num_views * sum(int(each.inside.sum()) for each in patches.buckets)
+        told["samples"] = samples
+        told["missing_share"] = 1 - sum(bucket.num_valid for bucket in found) / max(1, samples)
+        told.update(figures(photometric))
+        told.update(clock.shares())
+    return SweptPatches(
+        photometric=photometric,
+        buckets=tuple(bucket.heights for bucket in found),
+        averaged=found[0].averaged,
+    )
+
+
+@dataclass(slots=True)
+class _Clock:
+    """Adds up what parts of the work take, whichever thread does them."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    lock: Lock = field(default_factory=Lock)
+
+    @contextmanager
+    def __call__(self, part: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        took = time.perf_counter() - began
+        with self.lock:
+            self.seconds[part] = self.seconds.get(part, 0.0) + took
+
+    def shares(self) -> dict[str, float]:
+        """Give each part's share of the whole."""
+        whole = sum(self.seconds.values()) or 1.0
+        return {f"{part}_share": took / whole for part, took in self.seconds.items()}
