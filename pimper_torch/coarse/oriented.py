@@ -13,7 +13,7 @@ from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.kernels.switch import compiled_for
-from pimper_torch.parallel import num_workers, side_by_side
+from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record, SparseScene
 
 # Radius of the windows that planes are fitted in, pixels.
@@ -317,14 +317,15 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
     wall do not count; where the rest lie on no plane, their normals are averaged. Points whose
     neighbours face anywhere are no surface and are left out.
     """
-    points = cloud.points_world.detach().cpu().numpy()
+    points = cloud.points_world.detach().cpu()
     if len(points) < 3:
         return cloud
-    nearest = cKDTree(points).query(points, min(_COMMON, len(points)), workers=num_workers())[1]
+    tree, count = cKDTree(points.numpy()), min(_COMMON, len(points))
     normals, places = cloud.normals_world.double().cpu(), cloud.points_world.double().cpu()
     weight = 1 / cloud.noise.double().cpu().clamp_min(1e-12).square()
 
-    def common(around: Int[Tensor, "some near"]) -> tuple[Tensor, Tensor]:
+    def common(some: Float[Tensor, "some 3"]) -> tuple[Tensor, Tensor]:
+        around = torch.from_numpy(tree.query(some.numpy(), count)[1])
         share = weight[around] / weight[around].sum(dim=1, keepdim=True)
         mean = (share[..., None] * normals[around]).sum(dim=1)
         alike = (normals[around] * mean[:, None]).sum(dim=-1) > 0
@@ -337,7 +338,7 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
         flat = width[:, 0] < _FLAT**2 * width[:, 1]
         return torch.where(flat[:, None], across, normalize(mean, dim=-1)), mean.norm(dim=-1)
 
-    parts = torch.split(torch.from_numpy(nearest), _AT_ONCE)
+    parts = torch.split(points, _AT_ONCE)
     found, agreement = zip(*side_by_side(common, parts, tracked=False), strict=True)
     alike = torch.cat(agreement).to(cloud.normals_world) > _LEAST_AGREEMENT
     return cloud.replace(normals_world=torch.cat(found).to(cloud.normals_world)).take(alike)
