@@ -102,6 +102,23 @@ def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
     return model
 
 
+def longest_tracks(model: SparseModel, most: int) -> SparseModel:
+    """Keep of every view the points that most views see, and with them all who sees them.
+
+    Args:
+        model: Any.
+        most: Points a view; more where they are among another view's.
+    """
+    length = torch.bincount(model.observation_point)[model.observation_point]
+    order = torch.argsort(length, descending=True, stable=True)
+    order = order[torch.argsort(model.observation_view[order], stable=True)]
+    view = model.observation_view[order]
+    rank = torch.arange(len(order)) - torch.searchsorted(view, view)
+    wanted = torch.zeros(len(model.points_world), dtype=torch.bool)
+    wanted[model.observation_point[order[rank < most]]] = True
+    return model.without(~wanted[model.observation_point])
+
+
 def match_names(model: SparseModel, names: Sequence[str], folder: Path) -> SparseModel:
     """Find the photographs in a model by file name and put it in their order.
 

@@ -10,7 +10,7 @@ from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
-from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.reprojection import observation_errors
 from pimper_torch.sfm.sightings import Sightings, SightingSettings, log_pictures, sight
 from pimper_torch.sfm.tangents import tangents
@@ -30,6 +30,12 @@ _FIRST_TOLERANCE = 1e-4
 
 # Median length of a two-dimensional Gaussian's draws, in standard deviations.
 _MEDIAN_LENGTH = 1.1774
+
+# Points a view in the rounds before the last, whose cameras are where the next one looks from. On
+# 20 photographs of 640x480 with 8,900 points both rounds take 21 in place of 35 CPU s, and cameras
+# put places 0.009 % of the diagonal off (0.013 % with all points); with 128 points 0.024 %. In the
+# last round the number tells: 128 points a view there, 0.13 %.
+_PILOTS = 256
 
 # Scales beyond which an observation is an outlier, and pixels in which features are none.
 _OUTLIER_SCALES, _FEATURE_PX = 10.0, 2.0
@@ -58,6 +64,7 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
     Features are found in each photograph by itself, off by half a pixel; patches are aligned
     with one another, off by less than a tenth, and in views whose features did not match. A
     point that is not found again in three views keeps its features, which then weigh little.
+    Rounds before the last find a part of the points, for cameras alone.
 
     Args:
         views: The photographs, in the model's order.
@@ -67,12 +74,22 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
     Returns:
         The same views. Points that nothing agrees about are left out.
     """
-    for _ in range(settings.rounds):
-        found, cameras = _sighted(views, model, settings.sightings)
-        renewed, aligned = _renewed(model, found, cameras, settings.fewest_points)
+    for left in reversed(range(settings.rounds)):
+        some = longest_tracks(model, _PILOTS) if left else model
+        found, cameras = _sighted(views, some, settings.sightings)
+        renewed, aligned = _renewed(some, found, cameras, settings.fewest_points)
         if not bool(aligned.any()):
             return model
-        model = _adjusted(renewed, aligned, settings)
+        tied, scale = _cameras_adjusted(renewed, aligned, settings)
+        model = model if left else renewed  # all points of the last round, with its sightings
+        model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
+        model = bundle(
+            model, _FIRST_SCALE_PX, settings.threads, cameras=False, tolerance=_FIRST_TOLERANCE
+        )
+    if settings.rounds:
+        model = bundle(model, scale, settings.threads, cameras=False)
+        limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
+        model = model.without(observation_errors(model) > limit)
     return model
 
 
@@ -131,22 +148,15 @@ def _photographed(
     return found
 
 
-def _adjusted(
+def _cameras_adjusted(
     model: SparseModel, aligned: Bool[Tensor, " observation"], settings: TrackSettings
-) -> SparseModel:
-    """Adjust cameras to what was aligned, then the points that only features know."""
+) -> tuple[SparseModel, float]:
+    """Adjust cameras to what was aligned; tell the scale of the residuals, too."""
     tied, leading = _leading(model, aligned, settings.fewest_points)
     tied = bundle(tied, _FIRST_SCALE_PX, settings.threads, tolerance=_FIRST_TOLERANCE)
     spread = float(observation_errors(tied)[leading].median()) / _MEDIAN_LENGTH
     scale = min(max(spread, _SCALES_PX[0]), _SCALES_PX[1])
-    tied = bundle(tied, scale, settings.threads)
-    model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
-    model = bundle(
-        model, _FIRST_SCALE_PX, settings.threads, cameras=False, tolerance=_FIRST_TOLERANCE
-    )
-    model = bundle(model, scale, settings.threads, cameras=False)
-    limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
-    return model.without(observation_errors(model) > limit)
+    return bundle(tied, scale, settings.threads), scale
 
 
 def _leading(

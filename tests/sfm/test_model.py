@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.sfm.model import drop_weak_views, select_views
+from pimper_torch.sfm.model import drop_weak_views, longest_tracks, select_views
 
 
 def test_a_point_that_only_one_kept_view_sees_goes(model):
@@ -35,3 +35,18 @@ def test_a_view_that_loses_its_points_with_a_weak_one_goes_too(model):
     assert len(left.points_world) == 20
     assert drop_weak_views(left, 20).names == left.names
     assert drop_weak_views(left, 21).num_views == 0
+
+
+def test_every_view_keeps_the_points_that_most_views_see(model):
+    seen = model.observed
+    length = seen.sum(dim=1)
+    wanted = torch.zeros(40, dtype=torch.bool)
+    for view in range(5):
+        (mine,) = torch.nonzero(seen[:, view], as_tuple=True)
+        wanted[mine[torch.argsort(length[mine], descending=True, stable=True)][:3]] = True
+    wanted &= length >= 2
+    assert 3 <= wanted.sum() < 16
+    kept = longest_tracks(model, 3)
+    assert torch.equal(kept.points_world, model.points_world[wanted])
+    assert torch.equal(kept.observed, seen[wanted])
+    assert len(longest_tracks(model, 40).points_world) == int((length >= 2).sum())
