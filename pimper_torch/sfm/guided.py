@@ -198,7 +198,7 @@ def compiled_likeness(first: Features, second: Features, near: Near) -> tuple[Al
     """Do what :func:`likeness` does, by a compiled kernel."""
     from pimper_torch.kernels.line_matches import most_alike
 
-    found = tuple(
+    one, other = (
         Alike(
             products=torch.full((len(each.pixels), 2), -1.0),
             best=torch.full((len(each.pixels),), -1),
@@ -206,15 +206,19 @@ def compiled_likeness(first: Features, second: Features, near: Near) -> tuple[Al
         for each in (first, second)
     )
     most_alike(
-        *(each.pixels.contiguous().numpy() for each in (first, second)),
-        *(each.descriptors.contiguous().numpy() for each in (first, second)),
+        first.pixels.contiguous().numpy(),
+        second.pixels.contiguous().numpy(),
+        first.descriptors.contiguous().numpy(),
+        second.descriptors.contiguous().numpy(),
         near.matrix.contiguous().numpy(),
         near.planar,
         near.max_error_px,
-        *(each.products.numpy() for each in found),
-        *(each.best.numpy() for each in found),
+        one.products.numpy(),
+        other.products.numpy(),
+        one.best.numpy(),
+        other.best.numpy(),
     )
-    return found[0], found[1]
+    return one, other
 
 
 def _alike(

@@ -303,11 +303,16 @@ def _compiled_alignment(
         log.numpy(),
         homographies.contiguous().numpy(),
         chosen.contiguous().numpy(),
-        *(each.contiguous().numpy() for each in (templates.values, templates.slopes)),
+        templates.values.contiguous().numpy(),
+        templates.slopes.contiguous().numpy(),
         templates.inverse.contiguous().numpy(),
-        *(each.contiguous().numpy() for each in (window.places, window.root, window.light)),
+        window.places.contiguous().numpy(),
+        window.root.contiguous().numpy(),
+        window.light.contiguous().numpy(),
         np.array(limits, dtype=np.float64),
-        *(each.numpy() for each in (found.shift, found.deviation, found.correlation)),
+        found.shift.numpy(),
+        found.deviation.numpy(),
+        found.correlation.numpy(),
     )
     return found
 
