@@ -42,7 +42,9 @@ def compiled_for(*tensors: Tensor) -> bool:
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
-def compiled(*signatures: str, fast: bool = False) -> Callable[[Function], Function]:
+def compiled(
+    *signatures: str, fast: bool = False, inline: bool = False
+) -> Callable[[Function], Function]:
     """Compile a function for the given types when its module is imported.
 
     Once an installation: the machine code is kept on disk. It holds no lock of the interpreter.
@@ -50,6 +52,7 @@ def compiled(*signatures: str, fast: bool = False) -> Callable[[Function], Funct
     Args:
         signatures: Without any, the function is a part of other kernels, and compiled with them.
         fast: Whether sums may be taken in any order, as several lanes at once do.
+        inline: Whether it becomes a part of each loop that calls it, which several lanes need.
     """
     import numba
 
@@ -58,6 +61,7 @@ def compiled(*signatures: str, fast: bool = False) -> Callable[[Function], Funct
         cache=True,
         nogil=True,
         error_model="numpy",
+        forceinline=inline,
         fastmath=_FAST if fast else False,
     )
     # Checkers of shapes wrap what they check; Python inside them cannot be compiled.
