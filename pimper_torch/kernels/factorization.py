@@ -260,7 +260,7 @@ def _energy(patch: Patch) -> float:
         part = np.float32(0)
         for k in range(len(radiance)):
             part += weight[k] * radiance[k] * radiance[k]
-        total += part
+        total += float(part)
     return total
 
 
@@ -303,7 +303,7 @@ def _evaluate(patch: Patch, lights: Floats, shading: Floats, slope: Doubles) -> 
             on_x += heavy * x[k]
             on_y += heavy * y[k]
             on_z += heavy * z[k]
-        total += cost
+        total += float(cost)
         slope[f, 0], slope[f, 1], slope[f, 2], slope[f, 3] = on_s, on_x, on_y, on_z
         for i in range(4):
             apart = float(light[i]) - float(patch.anchor[f, i])
@@ -321,7 +321,7 @@ def _bent(p: Floats, s: Floats, x: Floats, y: Floats, z: Floats) -> float:
         total += s[k] * (a[k] * s[k] + two * (b[k] * x[k] + c[k] * y[k] + d[k] * z[k]))
         total += x[k] * (e[k] * x[k] + two * (f[k] * y[k] + g[k] * z[k]))
         total += y[k] * (h[k] * y[k] + two * i[k] * z[k]) + j[k] * z[k] * z[k]
-    return total
+    return float(total)
 
 
 @compiled()

@@ -47,7 +47,7 @@ def robust_variance(squares: Floats, guess: float) -> tuple[float, float]:
 
 
 @compiled(fast=True)
-def _shares(squares: Floats, inverse: float) -> tuple[float, float]:
+def _shares(squares: Floats, inverse: np.float32) -> tuple[float, float]:
     """Sum ``r^4 / (r^4 + t^4)``, and its derivative by the logarithm of ``t^2``, negated."""
     one, most = np.float32(1), np.float32(1e9)
     share, square = np.float32(0), np.float32(0)

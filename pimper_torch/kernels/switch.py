@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib import import_module
 from inspect import unwrap
+from pathlib import Path
 from pkgutil import iter_modules
 from typing import Literal, TypeVar
 
@@ -36,6 +37,17 @@ def compiled_for(*tensors: Tensor) -> bool:
     on_cpu = all(each.device.type == "cpu" for each in tensors)
     return _chosen.get() == "numba" and on_cpu and not asked
 
+
+def forget_stale() -> None:
+    """Delete machine code older than any kernel's source: kernels are parts of one another."""
+    folder = Path(pimper_torch.kernels.__path__[0])
+    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
+    for kept in folder.glob("__pycache__/*.nb[ci]"):
+        if kept.exists() and kept.stat().st_mtime < newest:
+            kept.unlink(missing_ok=True)
+
+
+forget_stale()
 
 # What compiled sums may do besides IEEE's arithmetic: add in another order, in several lanes at
 # once. NaN and infinity keep their meaning.

@@ -77,11 +77,22 @@ def _descend_by_kernel(
     count = len(albedo)
     lights = lights.clone(memory_format=torch.contiguous_format)
     whole = (0, -count % TILE)
-    known = [torch.cat(model.known(), dim=1).mT, shown.radiance.mT, shown.seen.mT.to(albedo)]
-    rows = [pad(each.detach(), whole).contiguous().numpy() for each in known]
-    found = pad(albedo, whole)
-    bounds = (shown.level.detach().numpy(), 1 / LEAST_DISTANCE)
-    fit(*rows, *bounds, limit, least_gain, lights.numpy(), found.numpy())
+    known, radiance, seen = (
+        pad(each.detach().mT.to(albedo), whole).contiguous().numpy()
+        for each in (torch.cat(model.known(), dim=1), shown.radiance, shown.seen)
+    )
+    found, level = pad(albedo, whole), shown.level.detach()
+    fit(
+        known,
+        radiance,
+        seen,
+        level.numpy(),
+        1 / LEAST_DISTANCE,
+        limit,
+        least_gain,
+        lights.numpy(),
+        found.numpy(),
+    )
     return lights, found[:count]
 
 

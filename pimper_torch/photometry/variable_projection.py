@@ -17,6 +17,7 @@ Fitzgibbon, ICCV 2015. That it runs on the tangents of the cone is ours.
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -302,16 +303,28 @@ def _solve_by_kernel(
     weight, residual = torch.zeros_like(J), J.new_zeros(len(J))
     taken = torch.zeros(len(J), dtype=torch.int64)
     cause = torch.zeros_like(taken)
-    known = [J, problem.weight, problem.anchor, problem.pull, prior]
     solve_on_cone(
-        *(each.detach().contiguous().numpy() for each in known),
+        _array(J),
+        _array(problem.weight),
+        _array(problem.anchor),
+        _array(problem.pull),
+        _array(prior),
         0.0 if isinstance(problem.loss, Squares) else problem.loss.scale,
         problem.stride,
         max_iterations,
         tolerance,
         small_steps,
         curvature_samples or 0,
-        *(each.numpy() for each in (lights, shading, weight, taken, residual, cause)),
+        lights.numpy(),
+        shading.numpy(),
+        weight.numpy(),
+        taken.numpy(),
+        residual.numpy(),
+        cause.numpy(),
     )
     convergence = Convergence(iterations=taken, residual=residual, cause=cause)
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
+
+
+def _array(tensor: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    return tensor.detach().contiguous().numpy()
