@@ -9,10 +9,11 @@ from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.colour import ColourFactors, solve_in_colour
 from pimper_torch.photometry.descent import solve_descent
-from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.photometry.factorize import Factorize, FactorizeConfig, Illumination
 from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.low_rank import low_rank_problem, random_left, singular_left
 from pimper_torch.photometry.manifolds import Cone, Free, SecondOrder
+from pimper_torch.photometry.mesh_light import thinned
 from pimper_torch.photometry.restarts import Restarted, factorize_from_many
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
@@ -26,6 +27,7 @@ __all__ = [
     "FactorizeConfig",
     "Factors",
     "Free",
+    "Illumination",
     "Restarted",
     "SecondOrder",
     "Solver",
@@ -40,4 +42,5 @@ __all__ = [
     "solve_descent",
     "solve_in_colour",
     "solve_variable_projection",
+    "thinned",
 ]

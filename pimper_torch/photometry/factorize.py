@@ -17,7 +17,7 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.carry import carried_normals
 from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
-from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver, select
+from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold
 from pimper_torch.photometry.colour import solve_in_colour, split_colours
 from pimper_torch.photometry.descent import solve_descent
@@ -26,6 +26,7 @@ from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.light_field import LightField, faces_lamp
 from pimper_torch.photometry.manifolds import Cone, Free, Manifold, SecondOrder
 from pimper_torch.photometry.mesh_light import light_of_mesh
+from pimper_torch.photometry.parts import joined_parts, parts_of
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, on_raster, rows_of
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
@@ -33,7 +34,6 @@ from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.photometry.verdicts import judge_data, warn_of_verdicts
 from pimper_torch.records import (
-    Convergence,
     PatchVerdict,
     PatchViews,
     PhotometricPatches,
@@ -42,10 +42,6 @@ from pimper_torch.records import (
     Registered,
     Templates,
 )
-
-# Patches are factorized so many entries of J at a time, or one by one: what they need fits the
-# cache.
-PART_ENTRIES = 400_000
 
 # The pull on a light counts as if so many samples more were seen than there are.
 BORROWED_SAMPLES = 16.0
@@ -197,6 +193,9 @@ class Factorize(nn.Module):
     what the field has there by ``light_pull``; samples that face away from the lamp are
     missing. The last step of each sample is exact, and albedo is fitted to every channel.
 
+    In parts, for patches that are never all there at once: :meth:`light` from thinned templates,
+    :meth:`solve` for some patches at a time, and :meth:`conclude` for all that were solved.
+
     Gauge: albedo and light share one free factor for the whole scene; it is set so that the
     99th percentile of gray albedo is 1. With nothing that holds lights and ``start="svd"`` each
     patch has, besides, its own Lorentz ambiguity, fixed by the mesh's lights as well as a
@@ -223,10 +222,10 @@ class Factorize(nn.Module):
     def forward(self, seen: PatchViews) -> PhotometricPatches:
         """Factorize all patches: :meth:`light`, :meth:`solve` and :meth:`conclude` in turn."""
         light = self.light(seen)
-        parts = [part for bucket in range(len(seen.buckets)) for part in _parts(seen, bucket)]
+        parts = [part for bucket in range(len(seen.buckets)) for part in parts_of(seen, bucket)]
         solved = list(side_by_side(lambda part: self.solve(part.seen, light), parts))
         joined = [
-            _joined(
+            joined_parts(
                 [
                     one.buckets[0]
                     for one, part in zip(solved, parts, strict=True)
@@ -424,52 +423,6 @@ def _lit(bucket: _Bucket, light: Illumination) -> Registered:
     )
     reached = (shadows.lit & shadows.sure).movedim(-1, 1)
     return registered.replace(valid=registered.valid & reached)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Part(Record):
-    """Some patches of a bucket, in a record of their own."""
-
-    bucket: int
-    seen: PatchViews
-
-
-def _parts(seen: PatchViews, bucket: int) -> list[_Part]:
-    """Cut a bucket into batches of bounded size, as views of its memory."""
-    templates, registered = seen.patches.buckets[bucket], seen.buckets[bucket]
-    count, num_views = registered.valid.shape[:2]
-    samples = max(int(templates.inside.sum(dim=(1, 2)).max()), 1) if count else 1
-    size = max(1, PART_ENTRIES // (samples * max(num_views, 1)))
-    parts = []
-    for first in range(0, max(count, 1), size):
-        some = slice(first, first + size)
-        patches = seen.patches.replace(buckets=(select(templates, some),))
-        part = PatchViews(patches=patches, buckets=(select(registered, some),))
-        parts.append(_Part(bucket=bucket, seen=part))
-    return parts
-
-
-def _joined(parts: list[Photometry]) -> Photometry:
-    if len(parts) == 1:
-        return parts[0]
-    return parts[0].replace(
-        **{
-            name: torch.cat([getattr(part, name) for part in parts])
-            for name in (
-                "normals_patch",
-                "albedo",
-                "lights_patch",
-                "valid",
-                "confidence",
-                "verdict",
-            )
-        },
-        convergence=Convergence(
-            iterations=torch.cat([part.convergence.iterations for part in parts]),
-            residual=torch.cat([part.convergence.residual for part in parts]),
-            cause=torch.cat([part.convergence.cause for part in parts]),
-        ),
-    )
 
 
 def in_gauge(solved: PhotometricPatches) -> PhotometricPatches:

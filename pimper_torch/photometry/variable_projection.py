@@ -94,7 +94,9 @@ def solve_variable_projection(
         A minimum, which may be a bad one: start well, or from several places. Without pull
         low-rank lights are orthonormal, and others keep their size.
 
-    Constant to autograd. Patches do not influence one another.
+    Constant to autograd. Patches do not influence one another. First-order light in float32 is
+    solved by a compiled kernel (:mod:`pimper_torch.kernels.factorization`), which gives the same
+    up to rounding; there, samples without weight keep their start.
     """
     if _has_kernel(problem):
         return _solve_by_kernel(problem, max_iterations, tolerance, small_steps, curvature_samples)

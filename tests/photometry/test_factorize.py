@@ -218,7 +218,7 @@ def test_nothing_seen_at_all_is_told_not_raised(scene):
 def test_parts_make_no_difference(scene, monkeypatch):
     true = scene()
     whole = Factorize()(true.seen)
-    monkeypatch.setattr("pimper_torch.photometry.factorize.PART_ENTRIES", 1)
+    monkeypatch.setattr("pimper_torch.photometry.parts.PART_ENTRIES", 1)
     single = Factorize()(true.seen)
     for one, other in zip(whole.buckets, single.buckets, strict=True):
         assert_close(one.normals_patch, other.normals_patch, rtol=0, atol=1e-8)
