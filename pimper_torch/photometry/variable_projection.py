@@ -17,11 +17,11 @@ Fitzgibbon, ICCV 2015. That it runs on the tangents of the cone is ours.
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.photometry.bilinear import (
     Bilinear,
@@ -306,11 +306,11 @@ def _solve_by_kernel(
     taken = torch.zeros(len(J), dtype=torch.int64)
     cause = torch.zeros_like(taken)
     solve_on_cone(
-        _array(J),
-        _array(problem.weight),
-        _array(problem.anchor),
-        _array(problem.pull),
-        _array(prior),
+        as_array(J),
+        as_array(problem.weight),
+        as_array(problem.anchor),
+        as_array(problem.pull),
+        as_array(prior),
         0.0 if isinstance(problem.loss, Squares) else problem.loss.scale,
         problem.stride,
         max_iterations,
@@ -326,7 +326,3 @@ def _solve_by_kernel(
     )
     convergence = Convergence(iterations=taken, residual=residual, cause=cause)
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
-
-
-def _array(tensor: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    return tensor.detach().contiguous().numpy()
