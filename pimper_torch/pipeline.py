@@ -37,7 +37,7 @@ from pimper_torch.reporting import Observer, Silent, recorded
 from pimper_torch.rims.constraints import Rim, Rims
 from pimper_torch.rims.contours import RimConfig
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
-from pimper_torch.streaming import photometry_and_heights
+from pimper_torch.streaming import Prepares, photometry_and_heights
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
 
@@ -91,7 +91,8 @@ class Pimper(nn.Module):
     """Piecewise reconstruction of an object from many viewpoints under many unknown lights.
 
     To swap a stage, assign another module that takes and gives the same records:
-    ``pimper.factorize = MyFactorize()``.
+    ``pimper.factorize = MyFactorize()``. In rounds, patches come a few at a time to a factorization
+    that can be called so (:class:`~pimper_torch.streaming.InParts`), and all at once to others.
 
     Gradients run from photographs, cameras and coarse mesh through every stage after it. Structure
     from motion, how the coarse mesh is found, and what is chosen (views, samples, faces, splits)
@@ -177,7 +178,7 @@ class Pimper(nn.Module):
         views, cameras = scene.views, scene.cameras
         rims = self.rim(outlines, cameras)
         coarse = self._coarse(scene, outlines, rims, mesh)
-        sources = self.warp.prepare(views)
+        sources = self.warp.prepare(views) if isinstance(self.warp, Prepares) else None
         swept: SweptPatches | None = None
         surface: Surface | None = None
         last = len(self.config.rounds.scales)

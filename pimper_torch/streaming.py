@@ -47,8 +47,16 @@ class InParts(Protocol):
         """Do what needs all patches."""
 
 
-Warping = Callable[[Views, Cameras, PatchSet, Sources], PatchViews]
-Sweeping = Callable[[Views, Cameras, PatchViews, PhotometricPatches, Sources], SweptPatches]
+@runtime_checkable
+class Prepares(Protocol):
+    """A warp that prepares photographs for any number of calls."""
+
+    def prepare(self, views: Views) -> Sources:
+        """Prepare them."""
+
+
+Warping = Callable[[Views, Cameras, PatchSet, Sources | None], PatchViews]
+Sweeping = Callable[[Views, Cameras, PatchViews, PhotometricPatches, Sources | None], SweptPatches]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -68,7 +76,7 @@ def photometry_and_heights(
     views: Views,
     cameras: Cameras,
     patches: PatchSet,
-    sources: Sources,
+    sources: Sources | None,
 ) -> SweptPatches:
     """Give normals, albedo, light and swept heights of all patches.
 
@@ -82,12 +90,12 @@ def photometry_and_heights(
         views: Photographs.
         cameras: Of all views.
         patches: The decomposition.
-        sources: The photographs as ``Warp`` prepares them.
+        sources: The photographs as the warp prepares them, if it does.
 
     Differentiable as the stages are.
     """
-    mesh = patches.surface or patches.coarse.mesh
-    sources = sources.hidden_by(mesh)
+    if sources is not None:
+        sources = sources.hidden_by(patches.surface or patches.coarse.mesh)
     if not isinstance(factorize, InParts):
         seen = warp(views, cameras, patches, sources)
         photometric: PhotometricPatches = factorize(seen)

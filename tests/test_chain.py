@@ -145,8 +145,8 @@ class Dragging(nn.Module):
         self.fuse = fuse
         self.sound: list[Surface] = []
 
-    def forward(self, swept: SweptPatches, rims: Rims | None) -> Surface:
-        surface: Surface = self.fuse(swept, rims)
+    def forward(self, swept: SweptPatches, rims: Rims | None, expected: bool = True) -> Surface:
+        surface: Surface = self.fuse(swept, rims, expected)
         self.sound.append(surface)
         vertices = surface.vertices_world.clone()
         vertices[self.dragged(surface), 0] += 0.3

@@ -240,7 +240,7 @@ def _rays_near(
     close = (barycentric > -(1 + _SLACK_BANDS) * bands[patch]).all(dim=-1)
     near = facing & close
     counts = torch.bincount(patch[near], minlength=len(templates.facet))
-    listed = pad_sequence(vertex[near].split(counts.tolist()), batch_first=True)
+    listed = pad_sequence(list(torch.split(vertex[near], counts.tolist())), batch_first=True)
     return listed, torch.arange(listed.shape[1], device=listed.device) < counts[:, None]
 
 

@@ -63,7 +63,7 @@ def bilinear(
     above = here + across * (beside - here)
     at += below
     here, beside = np.float32(pixels[view, at]), np.float32(pixels[view, at + right])
-    blended: Any = above  # float32 + down * (here + across * (beside - here) - above)
+    blended: Any = above + down * (here + across * (beside - here) - above)
     return blended
 
 
