@@ -101,6 +101,18 @@ class Given(nn.Module):
         return self.record
 
 
+class Whole(nn.Module):
+    """A stage that is called with all patches at once."""
+
+    def __init__(self, stage: nn.Module) -> None:
+        super().__init__()
+        self.stage = stage
+
+    def forward(self, *given: object) -> object:
+        """Call it."""
+        return self.stage(*given)
+
+
 def probes(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> dict[str, Probe]:
     """Run the chain once, and make a probe of every stage that took part, and of the whole.
 
@@ -152,6 +164,7 @@ def _calls(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> dict[str, 
         return lambda _, handed: calls.update({name: handed})
 
     _place(pimper, scene, coarse)
+    pimper.factorize = Whole(pimper.factorize)
     hooks = [stage.register_forward_pre_hook(keep(name)) for name, stage in pimper.named_children()]
     pimper(scene.views)
     for hook in hooks:
@@ -193,7 +206,13 @@ def _per_pixel(cameras: Cameras) -> float:
     return 1 / float(cameras.intrinsics[:, 0, 0].median())
 
 
-def _warp(stage: nn.Module, views: Views, cameras: Cameras, patches: Any) -> Probe:  # noqa: ANN401
+def _warp(
+    stage: nn.Module,
+    views: Views,
+    cameras: Cameras,
+    patches: Any,  # noqa: ANN401
+    _sources: object = None,  # which the stage makes itself, of photographs that vary
+) -> Probe:
     def function(x: Tensors) -> Tensors:
         carrying = patches.replace(buckets=_replaced(patches.buckets, depth=x["depth"]))
         moved = moved_cameras(cameras, x["cameras"])
@@ -289,6 +308,7 @@ def _sweep(
     cameras: Cameras,
     seen: Any,  # noqa: ANN401
     photometric: Any,  # noqa: ANN401
+    _sources: object = None,
 ) -> Probe:
     spacing = _spacing(seen.patches)
 

@@ -5,6 +5,7 @@ from pimper_torch.baselines.global_stereo import GlobalStereo, GlobalStereoConfi
 from pimper_torch.baselines.one_matrix import as_problem, solve_whole
 from pimper_torch.baselines.template import Matrix
 from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.kernels.switch import using
 from pimper_torch.photometry.balm import solve_balm
 
 HALF = GlobalStereoConfig(samples_per_pixel=0.5)
@@ -52,7 +53,9 @@ def test_one_matrix_recovers_a_sphere_where_the_model_holds(photographed, compar
 
 def test_one_matrix_sees_relief_that_the_facets_do_not(photographed, compared, bumps):
     truth, scene, coarse = photographed(bumps)
-    ours = compared(GlobalStereo(HALF)(scene, coarse).mesh, truth, coarse)
+    # Lights that start a rounding elsewhere end up to 9 degrees elsewhere: torch's own path.
+    with using("torch"):
+        ours = compared(GlobalStereo(HALF)(scene, coarse).mesh, truth, coarse)
     facets = compared(coarse.mesh, truth, coarse)
     assert ours.mean_angle_deg < 0.4 * facets.mean_angle_deg  # measured 4.0 against 15.8
     assert ours.relative_error < 0.6 * facets.relative_error  # measured 1.8 against 4.5
