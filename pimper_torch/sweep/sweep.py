@@ -319,7 +319,7 @@ class Sweep(nn.Module):
             level = level[:, None].expand(-1, moves.shape[1]).flatten()
             radiance = look_up(sources.gray.levels(view), pixels, level)
             found = found.index_copy(0, slot, radiance.reshape(len(slot), -1).to(found))
-        return found.reshape(*rows.chosen.shape, -1)
+        return found.reshape(*rows.chosen.shape, moves.shape[1])
 
 
 def _spread_out(
