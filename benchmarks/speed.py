@@ -8,6 +8,7 @@ lower it. ``of floor`` is the time over what cannot be avoided, measured in the 
 
 - ``warp``, ``sweep``: one pass over all radiance that is looked up, as fast as memory is copied.
 - ``factorize``: one Gauss-Newton pass over it, as fast as batched products are.
+- ``photometry``: these three, which run bucket by bucket; each on one thread.
 - ``fuse``: one multigrid cycle on each round's finest system.
 - ``reconstruct``, with ``--colmap``: structure from motion with COLMAP's own settings.
 
@@ -282,6 +283,7 @@ def with_floors(
     a_pass = _ENTRY_BYTES / (floors["copy_gb_per_s"] * 1e9)
     a_step = _ENTRY_FLOPS / (floors["batched_product_gflop_per_s"] * 1e9)
     an_entry = {"warp": a_pass, "factorize": a_step, "sweep": a_pass}
+    an_entry["photometry"] = sum(an_entry.values())
     found, rounds = [], dict.fromkeys(an_entry, 0)
     for cost in costs:
         if cost.stage in an_entry and rounds[cost.stage] < len(entries):

@@ -14,6 +14,7 @@ from pimper_torch.config import build, find_config, overlay, read_mapping, requi
 from pimper_torch.errors import caution, held
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
+from pimper_torch.kernels.switch import Kernels, compile_all, using
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.mend import Mend, MendConfig
 from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
@@ -33,7 +34,7 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.refinement.refine import Refine, RefineConfig
-from pimper_torch.reporting import Observer, Silent, recorded
+from pimper_torch.reporting import Observer, Silent, recorded, stage
 from pimper_torch.rims.constraints import Rim, Rims
 from pimper_torch.rims.contours import RimConfig
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
@@ -65,8 +66,13 @@ class PimperConfig:
     """The settings of every stage, in the order they run.
 
     ``photographs`` is what :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
+
+    Attributes:
+        kernels: Whether compiled kernels stand in for torch on the CPU, where no gradients are
+            asked for (numba), or nowhere (torch).
     """
 
+    kernels: Kernels = "numba"
     photographs: Encoding = field(default_factory=Encoding)
     rounds: RoundsConfig = field(default_factory=RoundsConfig)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
@@ -144,7 +150,10 @@ class Pimper(nn.Module):
         Raises:
             PimperError: What was found at which stage, what was needed, what to do.
         """
-        with recorded(self, self.observer) as report:
+        with using(self.config.kernels), recorded(self, self.observer) as report:
+            if self.config.kernels == "numba":
+                with stage("compile"):  # next to nothing but for the first run of an installation
+                    compile_all()
             scene = self.reconstruct(views, sparse_model)
             outlines = self.outline(scene)
             scene = masked(scene, outlines, self.config.outline.margin)

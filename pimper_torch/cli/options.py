@@ -31,8 +31,8 @@ class CommonOptions:
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         overwrite: Replace a former result in OUT.
         full_mesh: Write every vertex that was found. Without it mesh.ply and mesh.glb have fewer
-            where the surface is smooth: those left out are within a tenth of a sample's spacing
-            of it, their normals within two degrees.
+            where the surface is smooth: those left out are within a twentieth of a sample's spacing
+            of it, their normals within 1.5 degrees.
         cache: Folder where structure from motion is kept from run to run, so that a change of a
             later stage costs only the later stages; none unless given.
     """

@@ -69,9 +69,9 @@ def write_result(
     `overview.png`   contact sheet, every photograph with its outline below
     ===============  ==============================================================
 
-    The mesh is simplified, unless ``full_mesh``: every vertex of ``result.mesh`` is within a tenth
-    of a sample's spacing of it, its normal within two degrees, and its colour, confidence and
-    expected error within :func:`~pimper_torch.io.meshes.written_channels` of what is blended
+    The mesh is simplified, unless ``full_mesh``: every vertex of ``result.mesh`` is within a
+    twentieth of a sample's spacing of it, its normal within 1.5 degrees, and its colour, confidence
+    and expected error within :func:`~pimper_torch.io.meshes.written_channels` of what is blended
     there (``summary.json`` tells how far off they are). The pictures show what is written.
 
     It is there whole or not at all; see :func:`pimper_torch.io.folders.written_whole`.
