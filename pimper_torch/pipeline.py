@@ -199,6 +199,8 @@ class Pimper(nn.Module):
                 swept = photometry_and_heights(
                     self.warp, self.factorize, self.sweep, views, cameras, patches, sources
                 )
+                if number == last:
+                    sources = None  # as much memory as the photographs themselves
                 surface = self.mend(self.fuse(swept, rims, expected=number == last))
         for message in cautions:
             caution(message, stacklevel=3)

@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.geometry.lattice import Lattice
-from pimper_torch.linalg.equations import normal_equations
 from pimper_torch.linalg.systems import prepare
 
 # Weight that a corner is held to zero by, beside 1 for every vertex of the lattice: it decides
@@ -32,21 +31,22 @@ class CoarsePart:
 
     def __init__(self, lattice: Lattice, facets: Int[Tensor, "facet 3"]) -> None:
         self._lattice, self._facets = lattice, facets
-        self._corner, self._share = facets[lattice.facet], lattice.barycentric.double()
         self._size = int(facets.max()) + 1
-        row, col, entry, _ = normal_equations(
-            self._corner,
-            self._share,
-            torch.zeros_like(self._share[:, 0]),
-            torch.ones_like(self._share[:, 0]),
-            self._size,
-        )
+        share = lattice.barycentric.double()
+        rows, cols, entries = [], [], []
+        for one in range(3):
+            for other in range(3):
+                rows.append(facets[:, one])
+                cols.append(facets[:, other])
+                product = share[:, one] * share[:, other]
+                sums = product.new_zeros(len(facets)).index_add(0, lattice.facet, product)
+                entries.append(sums)
         each = torch.arange(self._size, device=facets.device)
-        held = torch.full_like(each, _HOLD, dtype=entry.dtype)
+        held = torch.full_like(each, _HOLD, dtype=share.dtype)
         self._normal = prepare(
-            torch.cat([each, row]),
-            torch.cat([each, col]),
-            torch.cat([held, entry]),
+            torch.cat([each, *rows]),
+            torch.cat([each, *cols]),
+            torch.cat([held, *entries]),
             self._size,
             "the fusion's coarse shape",
         )
@@ -54,8 +54,9 @@ class CoarsePart:
     def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
         """Give it at the lattice's vertices, in one column or several. Differentiable."""
         columns = values.double().reshape(len(values), -1)
-        told = self._share[..., None] * columns[:, None]
-        side = told.new_zeros(self._size, columns.shape[1])
-        side = side.index_add(0, self._corner.flatten(), told.flatten(0, 1))
+        side = columns.new_zeros(self._size, columns.shape[1])
+        for corner in range(3):
+            share = self._lattice.barycentric[:, corner, None].double()
+            side = side.index_add(0, self._facets[self._lattice.facet, corner], share * columns)
         at = self._normal.solve(side)
         return self._lattice.interpolate(at, self._facets).to(values).reshape(values.shape)

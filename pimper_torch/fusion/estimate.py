@@ -27,6 +27,9 @@ from pimper_torch.records import Record
 # spacing, with 1e-3 by 1.6e-3; to judge noise by, that is enough. Gradients ask for more.
 _ACCURATE, _JUDGING, _EXACT = 1e-6, 1e-4, 1e-8
 
+# Equations of a kind that tell its noise at least, where there are so many.
+_JUDGES = 500_000
+
 # No source is more than twice too modest: where one kind is followed blindly its residuals
 # vanish, and would make it surer still.
 _LEAST_FACTOR = 0.25
@@ -97,13 +100,10 @@ def fuse_evidence(
         for place, kind in enumerate(kinds):
             if not kind.judged or len(kind.targets) == 0:
                 continue
-            square = kind.information.double() * kind.residual(heights).square()
-            square = square * kind.correlated
-            weight = weights[place] * kind.information / found[place]
-            used = (weight * _sum(kind, probe) * _sum(kind, answer)).sum()
-            left = 1 - used / weights[place].sum()
+            square, used = _judged(kind, weights[place], heights, probe, answer)
+            left = 1 - used / found[place] / weights[place].sum()
             square = square / left.clamp_min(_LEAST_LEFT)
-            found[place] = noise_factor(square)
+            found[place] = noise_factor(square[:: max(1, len(square) // _JUDGES)])
             weights[place] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[place]))
     (heights,) = _solved(kinds, weights, found, start, hold, guess=heights, tolerance=_ACCURATE)
     return Fused(
@@ -141,6 +141,38 @@ def _solved(
     sides = torch.stack([rhs, *more], dim=1)
     found = solve_compressed(matrix, sides, what="the fusion", tolerance=tolerance, start=near)
     return found.unbind(dim=1)
+
+
+def _judged(
+    kind: Evidence,
+    weight: Float[Tensor, " equation"],
+    heights: Float[Tensor, " vertex"],
+    probe: Float[Tensor, " vertex"],
+    answer: Float[Tensor, " vertex"],
+) -> tuple[Float[Tensor, " equation"], Float[Tensor, ""]]:
+    """Give squared residuals in units of what is claimed, and how much of them is used up.
+
+    Args:
+        kind: Of evidence.
+        weight: Of its equations.
+        heights: Of the surface.
+        probe: Random signs.
+        answer: The solution to these.
+    """
+    parts = kind.coefficients, kind.targets, kind.information, kind.correlated
+    if compiled_for(*parts, weight, heights, answer):
+        from pimper_torch.kernels import equations as kernels
+
+        square = torch.empty_like(weight)
+        real = torch.promote_types(kind.coefficients.dtype, kind.targets.dtype)
+        parts = tuple(part.detach().to(real) for part in parts)
+        arrays = [part.contiguous().numpy() for part in (kind.unknowns, *parts, weight)]
+        at = [vector.contiguous().numpy() for vector in (heights, probe, answer)]
+        used = kernels.judge(*arrays, *at, square.numpy())
+        return square, torch.tensor(used, dtype=torch.float64)
+    square = kind.information.double() * kind.residual(heights).square() * kind.correlated
+    used = (weight * kind.information * _sum(kind, probe) * _sum(kind, answer)).sum()
+    return square, used
 
 
 def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:

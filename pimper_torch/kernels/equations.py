@@ -61,6 +61,39 @@ def add_sides(
             side[unknowns[equation, term]] += coefficients[equation, term] * asked
 
 
+@compiled(
+    *(
+        f"float64(int64[:,::1], {real}[:,::1], {real}[::1], {real}[::1], {real}[::1], "
+        "float64[::1], float64[::1], float64[::1], float64[::1], float64[::1])"
+        for real in _REALS
+    )
+)
+def judge(
+    unknowns: Array,
+    coefficients: Array,
+    targets: Array,
+    information: Array,
+    correlated: Array,
+    weights: Array,
+    heights: Array,
+    probe: Array,
+    answer: Array,
+    square: Array,
+) -> float:
+    """Write squared residuals in units of what is claimed; give what a probe sees used up."""
+    used = 0.0
+    for equation in range(len(unknowns)):
+        left, asked, told = float(targets[equation]), 0.0, 0.0
+        for term in range(unknowns.shape[1]):
+            at, coefficient = unknowns[equation, term], coefficients[equation, term]
+            left -= coefficient * heights[at]
+            asked += coefficient * probe[at]
+            told += coefficient * answer[at]
+        square[equation] = information[equation] * left * left * correlated[equation]
+        used += weights[equation] * information[equation] * asked * told
+    return used
+
+
 @compiled(f"{_FOUND}(int32[::1], int32[::1], int32[::1], float64[::1])")
 def merged(
     starts: Array, ends: Array, columns: Array, entries: Array

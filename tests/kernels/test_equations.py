@@ -2,6 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.fusion.estimate import _judged
+from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
 
 
@@ -27,3 +30,26 @@ def test_compressed_rows_are_those_of_the_entries(real):
     assert_close(found, side)
     assert matrix.has_sorted_indices
     assert matrix.has_canonical_format  # each entry once
+
+
+@pytest.mark.parametrize("real", [torch.float32, torch.float64])
+def test_evidence_is_judged_as_in_torch(real):
+    generator = torch.Generator().manual_seed(5)
+
+    def draw(*shape, dtype=real):
+        return torch.rand(*shape, generator=generator, dtype=dtype) + 0.1
+
+    kind = Evidence(
+        unknowns=torch.randint(0, 30, (200, 2), generator=generator),
+        coefficients=draw(200, 2) - 0.6,
+        targets=draw(200),
+        information=draw(200),
+        correlated=draw(200),
+    )
+    weight = draw(200, dtype=torch.float64)
+    heights, probe, answer = (draw(30, dtype=torch.float64) - 0.6 for _ in range(3))
+    square, used = _judged(kind, weight, heights, probe, answer)
+    with using("torch"):
+        expected, told = _judged(kind, weight, heights, probe, answer)
+    assert_close(square, expected.double(), rtol=1e-5, atol=1e-6)
+    assert_close(used, told.double(), rtol=1e-5, atol=1e-6)
