@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
@@ -111,14 +111,12 @@ def _nearest(
     reach: Float[Tensor, "patch 1"],
 ) -> tuple[Hits, Bool[Tensor, "patch sample"]]:
     """Cast to both sides, and take the nearer hit of a face that looks outward."""
-    outward = torch.linalg.cross(
-        *(surface.vertices_world.detach()[surface.faces].diff(dim=1).unbind(dim=1))
-    )
     below, above = caster.cast(places, inward, reach), caster.cast(places, -inward, reach)
 
     def looking_out(hits: Hits) -> Bool[Tensor, "patch sample"]:
-        facing = (outward[hits.face.clamp_min(0)] * inward).sum(dim=-1) < 0
-        return (hits.face >= 0) & facing
+        met = surface.faces[hits.face.clamp_min(0).flatten()]
+        outward = face_normals(surface.vertices_world.detach(), met).reshape(inward.shape)
+        return (hits.face >= 0) & ((outward * inward).sum(dim=-1) < 0)
 
     one, other = looking_out(below), looking_out(above)
     first = one & (~other | (below.distance <= above.distance))
