@@ -107,7 +107,7 @@ def subdivide(
 
 def transferred(
     values: Float[Tensor, " vertex"], source: Lattice, target: Lattice
-) -> Float[Tensor, " vertex"]:
+) -> Float[Tensor, " asked"]:
     """Give values known on one lattice at the vertices of another over the same facets.
 
     They are blended from the three nearest vertices, by the inverse of the distance. For what is

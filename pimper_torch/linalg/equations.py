@@ -45,12 +45,8 @@ def normal_equations(
     return rows.flatten(), cols.flatten(), blocks.flatten(), rhs
 
 
-Terms = tuple[
-    Int[Tensor, "equation term"],
-    Float[Tensor, "equation term"],
-    Float[Tensor, " equation"],
-    Float[Tensor, " equation"],
-]
+# Of some equations: unknowns, coefficients, targets and weights.
+Terms = tuple[Int[Tensor, "_ _"], Float[Tensor, "_ _"], Float[Tensor, " _"], Float[Tensor, " _"]]
 
 
 def compressed_equations(
