@@ -15,6 +15,7 @@ from pimper_torch.errors import caution, held
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
 from pimper_torch.kernels.switch import Kernels, compile_all, using
+from pimper_torch.memory import release_memory
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.mend import Mend, MendConfig
 from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
@@ -201,6 +202,7 @@ class Pimper(nn.Module):
                 )
                 if number == last:
                     sources = None  # as much memory as the photographs themselves
+                release_memory()
                 surface = self.mend(self.fuse(swept, rims, expected=number == last))
         for message in cautions:
             caution(message, stacklevel=3)

@@ -21,6 +21,7 @@ ROOMS = [
     "errors",
     "config",
     "progress",
+    "memory",
     "parallel",
     "kernels",
     "radiometry",

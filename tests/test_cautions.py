@@ -28,7 +28,7 @@ def rounds(messages):
             caution(message)
 
     pimper.factorize = Stub(factorize)
-    return pimper._in_rounds(small_scene(num_views=3, width=40, num_points=6)[0], None, None)
+    return pimper._in_rounds(small_scene()[0], None, None)
 
 
 def test_the_last_rounds_figures_are_said_once():

@@ -11,6 +11,7 @@ the factors; Hutchinson, A stochastic estimator of the trace, 1989, for the trac
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -165,14 +166,13 @@ def _judged(
 
         square = torch.empty_like(weight)
         real = torch.promote_types(kind.coefficients.dtype, kind.targets.dtype)
-        parts = tuple(part.detach().to(real) for part in parts)
-        arrays = [part.contiguous().numpy() for part in (kind.unknowns, *parts, weight)]
-        at = [vector.contiguous().numpy() for vector in (heights, probe, answer)]
-        used = kernels.judge(*arrays, *at, square.numpy())
-        return square, torch.tensor(used, dtype=torch.float64)
+        told = kind.unknowns, *(part.to(real) for part in parts), weight, heights, probe, answer
+        arrays = [each.detach().contiguous().numpy() for each in told]
+        judge: Any = kernels.judge
+        return square, torch.tensor(judge(*arrays, square.numpy()), dtype=torch.float64)
     square = kind.information.double() * kind.residual(heights).square() * kind.correlated
-    used = (weight * kind.information * _sum(kind, probe) * _sum(kind, answer)).sum()
-    return square, used
+    used = weight * kind.information * _sum(kind, probe) * _sum(kind, answer)
+    return square, used.sum()
 
 
 def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:

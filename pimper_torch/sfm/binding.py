@@ -1,12 +1,11 @@
 """The one place that loads pycolmap: when a function needs it, so that imports stay light."""
 
-import ctypes
 import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -36,13 +35,3 @@ def quiet() -> Iterator[None]:
 def thread_count(threads: int) -> int:
     """Tell how many threads COLMAP runs: as many as given, or with -1 one a core."""
     return threads if threads > 0 else (os.cpu_count() or 1)
-
-
-def release_memory() -> None:
-    """Give memory that threads have freed back to the system, where glibc can.
-
-    With 30 photographs of 1600x1200 those that write them leave 400 MB, COLMAP's as much again,
-    which would add to what comes after.
-    """
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL("libc.so.6").malloc_trim(0)

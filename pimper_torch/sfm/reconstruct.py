@@ -11,8 +11,9 @@ from torch import nn
 
 from pimper_torch.config import require
 from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
+from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.binding import release_memory, thread_count
+from pimper_torch.sfm.binding import thread_count
 from pimper_torch.sfm.cache import KeptModel, ModelCache, model_key
 from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component

@@ -8,10 +8,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
+from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.binding import release_memory
 from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_pixels
 
 _MOST_ZOOM = 1.25

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from pimper_torch.memory import release_memory
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
-from pimper_torch.sfm.binding import release_memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
