@@ -1,7 +1,78 @@
-"""Memory that is free in the process, but not in the system."""
+"""How much memory a run takes, and giving back what is free."""
 
 import ctypes
+import re
 from contextlib import suppress
+from pathlib import Path
+
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.records import PatchSet
+
+# Bytes that the fusion's last round takes for each vertex, on top of what the process holds when
+# the first round begins. Measured with benchmarks/speed.py: demo, and a jar of 2.8 million.
+_BYTES_PER_VERTEX = 1000
+
+# Vertices of the surface for each sample inside the templates of the last round, which overlap.
+_VERTICES_PER_SAMPLE = 0.85
+
+_UNITS = {"MB": 10**6, "GB": 10**9}
+
+
+def bytes_of(size: str, field: str = "max_memory") -> float:
+    """Read a size such as ``4GB`` or ``800 MB``; infinite where nothing is said.
+
+    Raises:
+        ConfigError: It is none.
+
+    >>> bytes_of("1.5 GB")
+    1500000000.0
+    """
+    if not size:
+        return float("inf")
+    found = re.fullmatch(r"\s*(\d+\.?\d*)\s*([MG]B)\s*", size, re.IGNORECASE)
+    require(found is not None, field, size, "a size such as 4GB or 800MB")
+    assert found is not None
+    return float(found[1]) * _UNITS[found[2].upper()]
+
+
+def require_memory(limit: float, patches: PatchSet, scale: float, last: float) -> None:
+    """Refuse a run whose last round would take more memory than it may.
+
+    Args:
+        limit: Bytes that the process may hold.
+        patches: Of the first round.
+        scale: Of the photographs in that round.
+        last: Of the photographs in the last one.
+
+    Raises:
+        ReconstructionError: Says what would be needed, and what to do.
+    """
+    samples = sum(int(bucket.inside.sum()) for bucket in patches.buckets)
+    vertices = _VERTICES_PER_SAMPLE * samples * (last / scale) ** 2
+    held = resident_bytes()
+    needed = held + _BYTES_PER_VERTEX * vertices
+    if needed > limit:
+        room = max(limit - held, 0.0) / (_BYTES_PER_VERTEX * vertices)
+        advice = (
+            f"Shrink the photographs (`--max-size-px`) or take fewer samples "
+            f"(`decompose.samples_per_pixel`) by a factor of {room**0.5:.2f} a side."
+            if room > 0
+            else "The photographs alone take that: shrink them (`--max-size-px`)."
+        )
+        raise ReconstructionError(
+            f"max_memory is {limit / 1e9:.1f} GB, but the surface will have about "
+            f"{vertices / 1e6:.1f} million vertices, and its fusion takes about "
+            f"{needed / 1e9:.1f} GB in all, {held / 1e9:.1f} of which are held now. {advice}"
+        )
+
+
+def resident_bytes() -> float:
+    """Give what the process holds now; 0 where the system does not tell."""
+    with suppress(OSError, IndexError, ValueError):
+        fields = Path("/proc/self/status").read_text(encoding="ascii")
+        return 1024.0 * float(fields.split("VmRSS:")[1].split()[0])
+    return 0.0
 
 
 def release_memory() -> None:

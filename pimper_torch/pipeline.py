@@ -15,7 +15,7 @@ from pimper_torch.errors import caution, held
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.integration.integrate import Integrate, IntegrateConfig
 from pimper_torch.kernels.switch import Kernels, compile_all, using
-from pimper_torch.memory import release_memory
+from pimper_torch.memory import bytes_of, release_memory, require_memory
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.mend import Mend, MendConfig
 from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
@@ -71,9 +71,12 @@ class PimperConfig:
     Attributes:
         kernels: Whether compiled kernels stand in for torch on the CPU, where no gradients are
             asked for (numba), or nowhere (torch).
+        max_memory: That the process may hold, such as 4GB. A run whose last round would take more
+            is refused in its first, with what would be needed; nothing is no limit.
     """
 
     kernels: Kernels = "numba"
+    max_memory: str = ""
     photographs: Encoding = field(default_factory=Encoding)
     rounds: RoundsConfig = field(default_factory=RoundsConfig)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
@@ -92,6 +95,9 @@ class PimperConfig:
     mend: MendConfig = field(default_factory=MendConfig)
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
+
+    def __post_init__(self) -> None:
+        bytes_of(self.max_memory)
 
 
 class Pimper(nn.Module):
@@ -197,6 +203,9 @@ class Pimper(nn.Module):
                 if surface is not None:
                     coarse = self.adapt(swept, surface, rims)
                 patches = self.decompose(coarse, cameras, surface, scale)
+                if number == 1:
+                    scales = self.config.rounds.scales
+                    require_memory(bytes_of(self.config.max_memory), patches, scale, scales[-1])
                 swept = photometry_and_heights(
                     self.warp, self.factorize, self.sweep, views, cameras, patches, sources
                 )
