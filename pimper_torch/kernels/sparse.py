@@ -14,26 +14,34 @@ _MATRIX = "int32[::1], int32[::1], float64[::1]"
 _VECTORS = "float64[:,::1]"
 
 
-@compiled(f"void({_MATRIX}, {_VECTORS}, {_VECTORS}, float64, float64, int64, int64)")
+@compiled(f"void({_MATRIX}, {_VECTORS}, {_VECTORS}, {_VECTORS}, float64, float64, int64, int64)")
 def product(
     starts: Array,
     columns: Array,
     entries: Array,
     vectors: Array,
+    start: Array,
     found: Array,
     keep: float,
     gain: float,
     first: int,
     last: int,
 ) -> None:
-    """Write ``keep * found + gain * A @ vectors`` to ``found``."""
+    """Write ``keep * start + gain * A @ vectors`` to ``found``, which may be ``start``.
+
+    Where ``keep`` is 0, the start is not read.
+    """
+    if keep == 0:
+        for row in range(first, last):
+            found[row] = 0.0
+        start, keep = found, 1.0
     width = vectors.shape[1]
     if width == 1:
         for row in range(first, last):
             one = 0.0
             for place in range(starts[row], starts[row + 1]):
                 one += entries[place] * vectors[columns[place], 0]
-            found[row, 0] = keep * found[row, 0] + gain * one
+            found[row, 0] = keep * start[row, 0] + gain * one
     elif width == 2:
         for row in range(first, last):
             one, two = 0.0, 0.0
@@ -41,12 +49,12 @@ def product(
                 column, entry = columns[place], entries[place]
                 one += entry * vectors[column, 0]
                 two += entry * vectors[column, 1]
-            found[row, 0] = keep * found[row, 0] + gain * one
-            found[row, 1] = keep * found[row, 1] + gain * two
+            found[row, 0] = keep * start[row, 0] + gain * one
+            found[row, 1] = keep * start[row, 1] + gain * two
     else:
         for row in range(first, last):
             for side in range(width):
-                found[row, side] *= keep
+                found[row, side] = keep * start[row, side]
             for place in range(starts[row], starts[row + 1]):
                 column, entry = columns[place], gain * entries[place]
                 for side in range(width):

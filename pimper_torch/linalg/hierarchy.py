@@ -106,7 +106,7 @@ class CompiledLevel(Level):
         self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
     ) -> Float[Tensor, "unknown ..."]:
         """Do the same in one pass."""
-        return add_product(self.matrix, found, residual.clone(), keep=1.0, gain=-1.0)
+        return with_product(self.matrix, found, residual, keep=1.0, gain=-1.0)
 
 
 class Hierarchy:
@@ -203,25 +203,23 @@ def sparse_product(matrix: csr_array, device: torch.device) -> Product:
     if device.type != "cpu":
         return torch_product(matrix, device)
     if compiled_for():
-        return lambda vectors: add_product(
-            matrix, vectors, vectors.new_zeros(matrix.shape[0], *vectors.shape[1:]), 0.0, 1.0
-        )
+        return lambda vectors: with_product(matrix, vectors)
     return lambda vectors: torch.from_numpy(matrix @ vectors.numpy())
 
 
-def add_product(
+def with_product(
     matrix: csr_array,
     vectors: Float[Tensor, "column ..."],
-    found: Float[Tensor, "row ..."],
-    keep: float,
-    gain: float,
+    start: Float[Tensor, "row ..."] | None = None,
+    keep: float = 0.0,
+    gain: float = 1.0,
 ) -> Float[Tensor, "row ..."]:
-    """Give ``keep * found + gain * matrix @ vectors`` by compiled kernels, in ``found``'s place."""
+    """Give ``keep * start + gain * matrix @ vectors`` by compiled kernels."""
     from pimper_torch.kernels import sparse
 
-    over_rows(
-        sparse.product, len(found), *_parts(matrix), _columns(vectors), _columns(found), keep, gain
-    )
+    found = vectors.new_empty(matrix.shape[0], *vectors.shape[1:])
+    columns = [_columns(each) for each in (vectors, found if start is None else start, found)]
+    over_rows(sparse.product, len(found), *_parts(matrix), *columns, keep, gain)
     return found
 
 
@@ -257,8 +255,10 @@ def _smooth(
     step = level.scaled(left).div_(center)
     # Of the three-term recurrence of Chebyshev's polynomials, its second member.
     gain = 1 / (2 * center / radius - radius / center)
-    before = torch.zeros_like(step) if start is None else start
-    return level.corrected(before, left, step, 1 + gain * radius / center, 2 * gain / radius)
+    of_step, of_rest = 1 + gain * radius / center, 2 * gain / radius
+    if start is None:  # the step itself is where to begin
+        return level.corrected(step, left, step, of_step - 1, of_rest)
+    return level.corrected(start, left, step, of_step, of_rest)
 
 
 def _parts(matrix: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
