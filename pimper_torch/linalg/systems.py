@@ -18,6 +18,10 @@ from pimper_torch.linalg.sparse import SparseCholesky
 # is exact, and half a second is soon earned back by the three coordinates of a surface.
 _CHOLESKY_UNKNOWNS = 50_000
 
+# Compiled, a hierarchy is the quicker from here on: the fusion of the demo's second round, 34,000
+# and 137,000 unknowns, takes 6.1 s in place of 7.3.
+_COMPILED_CHOLESKY_UNKNOWNS = 10_000
+
 # Multigrid is made for matrices whose entries off the diagonal are negative but for this share.
 _POSITIVE_SHARE = 0.1
 
@@ -117,7 +121,7 @@ def solve_compressed(
     """
     rows = np.repeat(np.arange(len(sides)), np.diff(matrix.indptr))
     off = torch.from_numpy(matrix.data)[torch.from_numpy(rows != matrix.indices)]
-    if len(sides) > _CHOLESKY_UNKNOWNS and _mostly_negative(off):
+    if len(sides) > _COMPILED_CHOLESKY_UNKNOWNS and _mostly_negative(off):
         diagonal = torch.from_numpy(matrix.diagonal())
         refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
         product = sparse_product(matrix, sides.device)
