@@ -1,20 +1,24 @@
 """How much memory a run takes, and giving back what is free."""
 
 import ctypes
+import math
 import re
 from contextlib import suppress
 from pathlib import Path
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import PatchSet
 
 # Bytes that the fusion's last round takes for each vertex, on top of what the process holds when
-# the first round begins. Measured with benchmarks/speed.py: demo, and a jar of 2.8 million.
-_BYTES_PER_VERTEX = 1000
+# the first round begins: 0.8 kB in the demo and for a jar of 0.7 million vertices, 1.2 for one of
+# 3.0 million (benchmarks/speed.py).
+_BYTES_PER_VERTEX = 1200
 
-# Vertices of the surface for each sample inside the templates of the last round, which overlap.
-_VERTICES_PER_SAMPLE = 0.85
+# Vertices of the surface for each square of their spacing: 1.6 in the demo. Equilateral triangles
+# have 1.15, but an edge is cut as the finer of its facets asks for.
+_PER_SQUARE = 1.6
 
 _UNITS = {"MB": 10**6, "GB": 10**9}
 
@@ -29,7 +33,7 @@ def bytes_of(size: str, field: str = "max_memory") -> float:
     1500000000.0
     """
     if not size:
-        return float("inf")
+        return math.inf
     found = re.fullmatch(r"\s*(\d+\.?\d*)\s*([MG]B)\s*", size, re.IGNORECASE)
     require(found is not None, field, size, "a size such as 4GB or 800MB")
     assert found is not None
@@ -48,8 +52,11 @@ def require_memory(limit: float, patches: PatchSet, scale: float, last: float) -
     Raises:
         ReconstructionError: Says what would be needed, and what to do.
     """
-    samples = sum(int(bucket.inside.sum()) for bucket in patches.buckets)
-    vertices = _VERTICES_PER_SAMPLE * samples * (last / scale) ** 2
+    if math.isinf(limit):
+        return
+    mesh, spacing = patches.coarse.mesh, float(patches.buckets[0].spacing[0].detach())
+    area = float(face_normals(mesh.vertices_world.detach(), mesh.faces).norm(dim=1).sum()) / 2
+    vertices = _PER_SQUARE * area / (spacing * scale / last) ** 2
     held = resident_bytes()
     needed = held + _BYTES_PER_VERTEX * vertices
     if needed > limit:
