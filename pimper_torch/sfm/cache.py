@@ -121,7 +121,7 @@ def model_key(views: Views, settings: Any) -> str:  # noqa: ANN401 - any datacla
 def _code() -> dict[str, str]:
     """Hash the rooms that find a model, and tell the versions of what they run on."""
     files, package = hashlib.sha256(), Path(__file__).parents[1]
-    for room in ("geometry", "radiometry", "records", "sfm"):
+    for room in ("geometry", "kernels", "radiometry", "records", "sfm"):
         for path in sorted((package / room).glob("*.py")):
             files.update(path.read_bytes())
     return {"rooms": files.hexdigest()} | {name: _version(name) for name in ("pycolmap", "torch")}
