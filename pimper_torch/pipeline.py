@@ -71,8 +71,9 @@ class PimperConfig:
     Attributes:
         kernels: Whether compiled kernels stand in for torch on the CPU, where no gradients are
             asked for (numba), or nowhere (torch).
-        max_memory: That the process may hold, such as 4GB. A run whose last round would take more
-            is refused in its first, with what would be needed; nothing is no limit.
+        max_memory: That the process may hold, such as 4GB. A run in rounds whose last one would
+            take more is refused in its first, with what would be needed; the published chain has
+            no such check. Nothing is no limit.
     """
 
     kernels: Kernels = "numba"

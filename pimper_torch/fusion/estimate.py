@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
 from pimper_torch.linalg.systems import solutions, solve_compressed
@@ -166,10 +167,10 @@ def _judged(
 
         square = torch.empty_like(weight)
         real = torch.promote_types(kind.coefficients.dtype, kind.targets.dtype)
-        told = kind.unknowns, *(part.to(real) for part in parts), weight, heights, probe, answer
-        arrays = [each.detach().contiguous().numpy() for each in told]
+        arrays = [as_array(kind.unknowns), *(as_array(part, real) for part in parts)]
+        arrays += [as_array(each) for each in (weight, heights, probe, answer, square)]
         judge: Any = kernels.judge
-        return square, torch.tensor(judge(*arrays, square.numpy()), dtype=torch.float64)
+        return square, torch.tensor(judge(*arrays), dtype=torch.float64)
     square = kind.information.double() * kind.residual(heights).square() * kind.correlated
     used = weight * kind.information * _sum(kind, probe) * _sum(kind, answer)
     return square, used.sum()

@@ -78,7 +78,8 @@ class FuseConfig:
             all swept heights of a facet are off by, are estimated, and the tilt taken out; 0
             trusts both at all wavelengths.
         noise_rounds: Solves in which the noise of each kind of evidence is estimated and
-            outliers lose weight, for each estimate of the tilt and twice after them.
+            outliers lose weight: for each estimate of the tilt and twice after them on a coarser
+            lattice, and twice at full size.
         outlier_samples: How far, in samples, a patch may lie from the others before they
             outvote it, where three or more meet.
         error_draws: Of noise, for the expected error of every vertex; the more, the less it is

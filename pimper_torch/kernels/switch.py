@@ -1,7 +1,7 @@
 """Whether a compiled kernel stands in for torch, and how kernels are compiled."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib import import_module
 from inspect import unwrap
@@ -39,12 +39,16 @@ def compiled_for(*tensors: Tensor) -> bool:
 
 
 def forget_stale() -> None:
-    """Delete machine code older than any kernel's source: kernels are parts of one another."""
+    """Delete machine code older than any kernel's source: kernels are parts of one another.
+
+    Where the installation may not be written to, numba keeps it elsewhere, and nothing is deleted.
+    """
     folder = Path(pimper_torch.kernels.__path__[0])
     newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
     for kept in folder.glob("__pycache__/*.nb[ci]"):
-        if kept.exists() and kept.stat().st_mtime < newest:
-            kept.unlink(missing_ok=True)
+        with suppress(FileNotFoundError, PermissionError):  # another process was first, or may not
+            if kept.stat().st_mtime < newest:
+                kept.unlink()
 
 
 forget_stale()
@@ -81,7 +85,7 @@ def compiled(
 
 
 def compile_all() -> None:
-    """Compile every kernel that is not kept on disk yet; half a minute, once an installation."""
+    """Compile every kernel that is not kept on disk yet; 50 s, once an installation."""
     names = [found.name for found in iter_modules(pimper_torch.kernels.__path__)]
     for name in track(names):
         import_module(f"{pimper_torch.kernels.__name__}.{name}")

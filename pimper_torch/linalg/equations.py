@@ -8,6 +8,8 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from pimper_torch.kernels.arrays import as_array
+
 
 def normal_equations(
     unknowns: Int[Tensor, "equation term"],
@@ -93,5 +95,9 @@ def _arrays(
     weights: Float[Tensor, " equation"],
 ) -> tuple[np.ndarray, ...]:
     real = torch.promote_types(coefficients.dtype, targets.dtype)
-    kept = unknowns, coefficients.to(real), targets.to(real), weights.double()
-    return tuple(each.detach().contiguous().numpy() for each in kept)
+    return (
+        as_array(unknowns),
+        as_array(coefficients, real),
+        as_array(targets, real),
+        as_array(weights, torch.float64),
+    )

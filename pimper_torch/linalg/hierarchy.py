@@ -19,6 +19,7 @@ from jaxtyping import Float
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.aggregation import dominant_diagonal, prolongation
 from pimper_torch.parallel import over_rows
@@ -267,7 +268,7 @@ def _parts(matrix: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _columns(vectors: Float[Tensor, "unknown ..."]) -> np.ndarray:
     """Give vectors as the kernels want them: one column a right-hand side."""
-    array: np.ndarray = vectors.contiguous().numpy()
+    array = as_array(vectors)
     return array.reshape(len(array), -1)
 
 
