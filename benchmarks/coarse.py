@@ -95,7 +95,7 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
     cloud, maps, pixel = matched_cloud(part, inside, config.densify, config.outlined.point_px)
     away = config.outlined.tolerance_px * pixel
     cloud = cloud.take(hull.depth_of(cloud.points_world) > -away)
-    vertices, faces, rim = closed_surface(cloud, rims, pixel, config.outlined, config.threads)
+    vertices, faces, rim = closed_surface(cloud, rims, pixel, config.outlined)
     joined = joined_points(cloud, _oriented(rim))
 
     def given(masked: bool) -> Surface:
@@ -118,7 +118,6 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
             faces,
             num_faces=config.num_facets,
             boundary_weight=config.boundary_weight,
-            threads=config.threads,
         )
 
     def both() -> Surface:
@@ -131,12 +130,12 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
             normals_world=normalize(normals[unknown], dim=1),
             noise=torch.zeros(int(unknown.sum())),
         )
-        return poisson(joined_points(joined, filled), pixel, config.outlined, config.threads)
+        return poisson(joined_points(joined, filled), pixel, config.outlined)
 
     return {
         "no outlines": lambda: given(False),
         "no outlines, photographs masked": lambda: given(True),
-        "Poisson of points": lambda: facets(poisson(cloud, pixel, config.outlined, config.threads)),
+        "Poisson of points": lambda: facets(poisson(cloud, pixel, config.outlined)),
         "min-cut of points": lambda: facets(cut_surface(cloud, maps, hull)),
         "min-cut of points and rims": lambda: facets(cut_surface(cloud, maps, hull, rim)),
         "Poisson of points, rims, and the cut between": lambda: facets(both()),

@@ -212,7 +212,7 @@ def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
     save_masks(truth.foreground, truth.views.names, tmp_path / "masks")
     views = pt.load_views(tmp_path / "photos", masks=tmp_path / "masks")
     placed = sparse_scene(truth, 600, torch.Generator().manual_seed(17))
-    pimper = pt.Pimper(pt.load_config("default", {"enclose": {"num_facets": 400, "threads": 1}}))
+    pimper = pt.Pimper(pt.load_config("default", {"enclose": {"num_facets": 400}}))
     pimper.reconstruct = Given(placed.replace(views=views))
     result = pimper(views)
     facets = compared(result.coarse.mesh, result, truth)

@@ -63,7 +63,6 @@ class EncloseConfig:
         boundary_weight: Of rims against the surface, in simplification.
         max_distance_px: From its facet that a point of the sparse cloud may have.
         smoothing_rounds: Of the vertex normals, over the mesh.
-        threads: Of the surface's reconstruction; -1 for all cores.
     """
 
     reference: str = ""
@@ -85,7 +84,6 @@ class EncloseConfig:
     boundary_weight: float = 10.0
     max_distance_px: float = 4.0
     smoothing_rounds: int = 1
-    threads: int = -1
 
     def __post_init__(self) -> None:
         require(self.num_facets >= 4, "num_facets", self.num_facets, "4 or more")
@@ -148,9 +146,7 @@ class Enclose(nn.Module):
             pixel = pixel_size(scene, trusted) if len(trusted) else float("inf")
         elif outlines is not None and rims is not None:
             trusted = trusted[rims.hull.depth_of(scene.points_world[trusted]) > 0]
-            fine = outlined_surface(
-                scene, trusted, outlines, rims, config.densify, config.outlined, config.threads
-            )
+            fine = outlined_surface(scene, trusted, outlines, rims, config.densify, config.outlined)
             vertices, faces, pixel = fine.vertices_world, fine.faces, fine.pixel
         else:
             vertices, faces, pixel = self.surface(scene, trusted)
@@ -223,7 +219,6 @@ class Enclose(nn.Module):
             cloud.normals_world,
             depth=depth,
             point_weight=self.config.point_weight,
-            threads=self.config.threads,
         )
         return vertices.to(points) + middle, faces.to(points.device)
 
@@ -295,7 +290,6 @@ def _few(
         faces,
         num_faces=config.num_facets,
         boundary_weight=config.boundary_weight,
-        threads=config.threads,
     )
     return _used(fewer.to(vertices) + middle, left.to(faces.device))
 

@@ -123,7 +123,6 @@ def outlined_surface(
     rims: Rims,
     densify: DensifyConfig,
     config: OutlinedConfig,
-    threads: int,
 ) -> FineSurface:
     """Put a surface through matched points and rims, smooth where there are neither.
 
@@ -134,7 +133,6 @@ def outlined_surface(
         rims: What they say about the surface.
         densify: How photographs are matched.
         config: Settings.
-        threads: Of the reconstruction; -1 for all cores.
 
     Returns:
         What a view sees of the closed surface. It is closed except where nothing was
@@ -153,7 +151,7 @@ def outlined_surface(
     else:
         factor = densify.factors(max(part.views.images.shape[-2:]))[-1]
         pixel, level = factor * pixel_size_at(middle, scene.cameras), level_of(part, factor)
-    vertices, faces, rim = closed_surface(cloud, rims, pixel, config, threads)
+    vertices, faces, rim = closed_surface(cloud, rims, pixel, config)
     said = evidence(vertices, faces, level, maps)
     middles = vertices[faces].mean(dim=1)
     support = supports(middles, cloud, rim, said, config.reach_px * pixel)
@@ -171,7 +169,7 @@ def outlined_surface(
 
 
 def closed_surface(
-    cloud: OrientedPoints, rims: Rims, pixel: float, config: OutlinedConfig, threads: int
+    cloud: OrientedPoints, rims: Rims, pixel: float, config: OutlinedConfig
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"], RimPoints]:
     """Put a closed surface through points, tangent to the rays through the outlines.
 
@@ -184,7 +182,6 @@ def closed_surface(
         rims: Rays and visual hull of the same outlines.
         pixel: Size of one, scene units.
         config: Settings.
-        threads: Of the reconstruction; -1 for all cores.
 
     Returns:
         Vertices, faces, and the rim points that the surface goes through.
@@ -206,7 +203,7 @@ def closed_surface(
                 f"and {len(touched.ray)} rays touch the surface there; some hundreds are needed. "
                 "Look at the masks, or bring a mesh of your own."
             )
-        vertices, faces = poisson(joined_points(cloud, rim), pixel, config, threads)
+        vertices, faces = poisson(joined_points(cloud, rim), pixel, config)
         normals = vertex_normals(vertices, faces)
         front = shown(vertices, faces, normals, rims.cameras, config.cell_px * pixel)
         places, normals = vertices[front], normals[front]
@@ -238,7 +235,7 @@ def shown(
 
 
 def poisson(
-    cloud: OrientedPoints, pixel: float, config: OutlinedConfig, threads: int
+    cloud: OrientedPoints, pixel: float, config: OutlinedConfig
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """Put a closed surface through points; the arguments are those of :func:`closed_surface`."""
     points = cloud.points_world
@@ -248,7 +245,7 @@ def poisson(
     cells = extent / (config.cell_px * pixel)
     depth = min(config.max_depth, max(4, round(math.log2(cells))))
     vertices, faces = poisson_surface(
-        points - middle, cloud.normals_world, depth=depth, point_weight=1.0, threads=threads
+        points - middle, cloud.normals_world, depth=depth, point_weight=1.0
     )
     return vertices.to(points) + middle, faces.to(points.device)
 

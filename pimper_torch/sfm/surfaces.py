@@ -1,4 +1,7 @@
-"""COLMAP's surfaces: screened Poisson reconstruction, and simplification."""
+"""COLMAP's surfaces: screened Poisson reconstruction, and simplification.
+
+Both run on one thread: on several, sums in another order give another surface in each run.
+"""
 
 import tempfile
 from collections.abc import Callable
@@ -18,7 +21,6 @@ def poisson_surface(
     *,
     depth: int,
     point_weight: float,
-    threads: int,
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """Put a closed surface through oriented points by screened Poisson reconstruction.
 
@@ -28,7 +30,6 @@ def poisson_surface(
         depth: Of the octree: the longest side of the points' box is at most ``2 ** depth``
             cells.
         point_weight: Of the points against the smoothness.
-        threads: -1 for all cores.
 
     Returns:
         Vertices and faces, counter-clockwise from outside; without faces if there is no
@@ -44,7 +45,7 @@ def poisson_surface(
 
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.point_weight = depth, point_weight
-    options.trim, options.color, options.num_threads = 0.0, False, threads
+    options.trim, options.color, options.num_threads = 0.0, False, 1
     with tempfile.TemporaryDirectory() as folder:
         cloud, surface = Path(folder) / "cloud.ply", Path(folder) / "surface.ply"
         write_cloud(points, normals, cloud)
@@ -57,7 +58,6 @@ def simplified(
     *,
     num_faces: int,
     boundary_weight: float,
-    threads: int,
 ) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
     """Merge vertices of a mesh where that changes its planes least, until few faces are left.
 
@@ -66,7 +66,6 @@ def simplified(
         faces: More than ``num_faces``.
         num_faces: About so many are left.
         boundary_weight: How much more rims count than the surface.
-        threads: -1 for all cores.
 
     Raises:
         ReconstructionError: COLMAP cannot simplify the mesh.
@@ -78,7 +77,7 @@ def simplified(
 
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio = num_faces / max(1, len(faces))
-    options.boundary_weight, options.num_threads = boundary_weight, threads
+    options.boundary_weight, options.num_threads = boundary_weight, 1
     options.interpolate_colors = False
     with tempfile.TemporaryDirectory() as folder:
         before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"

@@ -123,9 +123,9 @@ def test_noisy_points_share_larger_cells_and_sides_stay_apart():
 
 def test_poisson_puts_a_ball_through_points_of_a_ball_and_simplification_keeps_it():
     vertices, _ = icosphere(4)
-    found, faces = poisson_surface(vertices, vertices, depth=6, point_weight=1.0, threads=1)
+    found, faces = poisson_surface(vertices, vertices, depth=6, point_weight=1.0)
     assert (found.norm(dim=1) - 1).abs().max() < 0.02
-    few, left = simplified(found, faces, num_faces=200, boundary_weight=10.0, threads=1)
+    few, left = simplified(found, faces, num_faces=200, boundary_weight=10.0)
     assert 150 <= len(left) <= 200
     assert (few.norm(dim=1) - 1).abs().max() < 0.06
     a, b, c = few[left].unbind(dim=1)

@@ -173,7 +173,7 @@ def test_too_few_points_and_rims_are_refused(round_about):
     rims = Rim()(outlines_of(round_about.cameras), round_about.cameras)
     rims = rims.replace(rays=rims.rays.take(torch.arange(5)))
     with pytest.raises(ReconstructionError, match="0 points were matched inside the outlines"):
-        closed_surface(no_points(round_about.points_world), rims, 0.02, OutlinedConfig(), 1)
+        closed_surface(no_points(round_about.points_world), rims, 0.02, OutlinedConfig())
 
 
 def test_settings_out_of_range_are_refused():
