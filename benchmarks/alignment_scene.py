@@ -15,6 +15,8 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.alignment.align import Align, AlignConfig
+from pimper_torch.chains.published import Published, PublishedConfig
+from pimper_torch.config import build
 from pimper_torch.datasets import read_rendered
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.surfaces import vertex_normals
@@ -22,7 +24,6 @@ from pimper_torch.io.photographs import load_views
 from pimper_torch.meshing.extract import Extract
 from pimper_torch.metrics import pair_views, similarity_between_cameras
 from pimper_torch.metrics.relative import angles_deg, meet_in_view
-from pimper_torch.pipeline import Pimper, load_config
 from pimper_torch.records import Capture, DepthPatches, Mesh, SparseScene
 from pimper_torch.refinement.refine import Refine, RefineConfig
 
@@ -53,7 +54,7 @@ def main() -> None:
     truth = read_rendered(options.folder, photographs=False)
     masks = options.folder / "masks"
     views = load_views(options.folder / "photos", masks=masks if masks.exists() else None)
-    pimper = Pimper(load_config(changes=SETTINGS))
+    pimper = Published(build(PublishedConfig, SETTINGS, __file__))
     scene = pimper.reconstruct(views)
     patches = pimper.decompose(pimper.triangulate(scene), scene.cameras)
     seen = pimper.warp(scene.views, scene.cameras, patches)

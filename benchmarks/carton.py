@@ -22,17 +22,19 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from scipy.spatial import cKDTree
 from sides import drawn, far_apart, square_round
-from torch import Tensor, nn
+from torch import Tensor
 
+from pimper_torch.chains.presets import load_chain, load_config
+from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.datasets import read_llff, write_colmap
 from pimper_torch.datasets.pictures import file_names
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.metrics.planarity import dihedrals, planar_faces
-from pimper_torch.pipeline import Pimper, load_config
-from pimper_torch.records import Cameras, Capture, Lens, Mesh, SparseScene, Views
+from pimper_torch.records import Cameras, Capture, Lens, Mesh, SparseScene
 from pimper_torch.sfm.scene import write_model
+from pimper_torch.stage import Given
 from pimper_torch.viz.render import crop
 
 # Share of the views whose masks a point must lie in to be the object's: masks were drawn for
@@ -82,11 +84,10 @@ def main() -> None:
         write_colmap_model(carton_scene(options.data, capture), options.model)
         return
     named = {"reference": options.reference}
-    changes = {
-        "triangulate": named | {"num_points": options.num_points},
-        "enclose": named,
-    }
-    pimper = Pimper(load_config(options.preset, changes))
+    changes: dict[str, object] = {"enclose": named}
+    if isinstance(load_config(options.preset), PublishedConfig):
+        changes["triangulate"] = named | {"num_points": options.num_points}
+    pimper = load_chain(options.preset, changes)
     views = capture.views
     if not options.sfm:
         scene = carton_scene(options.data, capture, options.reference, options.views)
@@ -117,18 +118,6 @@ def draw(mesh: Mesh, cameras: Cameras, path: Path, sides: int = 6, width: int = 
         camera = cameras.take([view])
         row.append(drawn(mesh, crop(camera, *square_round(vertices, camera), width)))
     Image.fromarray(np.concatenate(row, axis=1)).save(path, quality=85)
-
-
-class Given(nn.Module):
-    """Stands in for structure from motion where cameras and cloud are known."""
-
-    def __init__(self, scene: SparseScene) -> None:
-        super().__init__()
-        self.scene = scene
-
-    def forward(self, views: Views, sparse_model: Path | None = None) -> SparseScene:
-        """Give the scene."""
-        return self.scene
 
 
 def report(mesh: Mesh, band: float) -> None:

@@ -21,7 +21,7 @@ def main() -> None:
     """Read the command line, check, print a row for each pair of input and output."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--config", default="default", help="preset or YAML file")
-    parser.add_argument("--scales", nargs="*", type=float, help="of the rounds")
+    parser.add_argument("--scales", nargs="*", type=float, help="of the photographs")
     parser.add_argument("--only", nargs="*", default=[], help="stages, or chain")
     parser.add_argument("--directions", type=int, default=3, help="random ones of each input")
     parser.add_argument("--weights", type=int, default=2, help="random sums of each output")
@@ -29,13 +29,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=5, help="of directions and sums")
     options = parser.parse_args()
     warnings.simplefilter("ignore", PimperWarning)
-    changes: dict[str, object] = {"rounds": {"all_round": False}}
-    if options.scales is not None:
-        changes = {"rounds": {"all_round": False, "scales": options.scales}}
-    pimper = pt.Pimper(pt.load_config(options.config, changes))
+    changes = {} if options.scales is None else {"scales": options.scales}
+    chain = pt.load_chain(options.config, changes)
     say("| stage | by | of | ratio | median | farthest from 1 | directions | jump or bend, % |")
     say("|---|---|---|--:|--:|--:|--:|--:|")
-    for stage, probe in probes(pimper, *small_scene()).items():
+    for stage, probe in probes(chain, *small_scene()).items():
         if options.only and stage not in options.only:
             continue
         found = probe.check(

@@ -38,10 +38,10 @@ from PIL import Image
 
 from pimper_torch.bench.machine import this_machine
 from pimper_torch.bench.memory import peak_memory
+from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, parse
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import write_result
-from pimper_torch.pipeline import Pimper
 from pimper_torch.records import StageReport, Views
 from pimper_torch.scenes.config import SceneConfig
 from pimper_torch.scenes.write import render_scene
@@ -240,7 +240,7 @@ def measured(job: Job, colmap: bool) -> dict[str, Any]:
         max_size_px=job.common.max_size_px,
     ).to(job.common.device)
     meter.ended("read")
-    result = Pimper(job.config, meter, job.common.cache)(views, job.inputs.sparse)
+    result = make_chain(job.config, meter, job.common.cache)(views, job.inputs.sparse)
     meter.started("write")
     write_result(result, job.config, job.out, about={})
     meter.ended("write")

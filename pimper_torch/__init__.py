@@ -2,7 +2,7 @@
 
 >>> import pimper_torch as pt
 >>> views = pt.load_views("photos/")  # doctest: +SKIP
->>> surface = pt.Pimper(pt.load_config("default"))(views)  # doctest: +SKIP
+>>> result = pt.load_chain("default")(views)  # doctest: +SKIP
 """
 
 from importlib import import_module
@@ -19,25 +19,36 @@ from pimper_torch.errors import (
 
 if TYPE_CHECKING:
     __version__: str
+    from pimper_torch.chains.chain import Chain, Step
+    from pimper_torch.chains.coarse_to_fine import CoarseToFine, CoarseToFineConfig
+    from pimper_torch.chains.presets import load_chain, load_config, make_chain
+    from pimper_torch.chains.published import Published, PublishedConfig
     from pimper_torch.io.photographs import load_views
     from pimper_torch.io.results import write_result
-    from pimper_torch.pipeline import Pimper, PimperConfig, load_config
     from pimper_torch.radiometry import Encoding
     from pimper_torch.sfm.cache import user_cache
+    from pimper_torch.stage import Stage
 
 __all__ = [
+    "Chain",
+    "CoarseToFine",
+    "CoarseToFineConfig",
     "ConfigError",
     "Encoding",
     "InputError",
     "OutputError",
-    "Pimper",
-    "PimperConfig",
     "PimperError",
     "PimperWarning",
+    "Published",
+    "PublishedConfig",
     "ReconstructionError",
+    "Stage",
+    "Step",
     "__version__",
+    "load_chain",
     "load_config",
     "load_views",
+    "make_chain",
     "user_cache",
     "write_result",
 ]
@@ -45,9 +56,16 @@ __all__ = [
 # What needs torch is imported when it is asked for, so that the command line answers at once.
 _HOMES = {
     "Encoding": "pimper_torch.radiometry",
-    "Pimper": "pimper_torch.pipeline",
-    "PimperConfig": "pimper_torch.pipeline",
-    "load_config": "pimper_torch.pipeline",
+    "Chain": "pimper_torch.chains.chain",
+    "Step": "pimper_torch.chains.chain",
+    "CoarseToFine": "pimper_torch.chains.coarse_to_fine",
+    "CoarseToFineConfig": "pimper_torch.chains.coarse_to_fine",
+    "Published": "pimper_torch.chains.published",
+    "PublishedConfig": "pimper_torch.chains.published",
+    "Stage": "pimper_torch.stage",
+    "load_chain": "pimper_torch.chains.presets",
+    "load_config": "pimper_torch.chains.presets",
+    "make_chain": "pimper_torch.chains.presets",
     "load_views": "pimper_torch.io.photographs",
     "user_cache": "pimper_torch.sfm.cache",
     "write_result": "pimper_torch.io.results",

@@ -53,9 +53,13 @@ def build(cls: type[Config], mapping: Mapping[str, object], where: str) -> Confi
 
 
 def to_mapping(config: object) -> dict[str, object]:
-    """Turn a config into plain mappings, lists, numbers and strings, ready for YAML."""
+    """Turn a config into plain mappings, lists, numbers and strings, ready for YAML.
+
+    Class variables come first: they tell configs of several kinds apart.
+    """
     assert dataclasses.is_dataclass(config), f"{config!r} is no dataclass"
-    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    names = (*_kind_names(type(config)), *(field.name for field in dataclasses.fields(config)))
+    return {name: _plain(getattr(config, name)) for name in names}
 
 
 def to_yaml(config: object) -> str:
@@ -161,7 +165,11 @@ def _build(
             f"needed: a section with some of {', '.join(_names(cls))}."
         )
     hints, values = typing.get_type_hints(cls), {}
+    kinds = _kind_names(cls)
     for key, value in mapping.items():
+        if key in kinds:
+            require(value == getattr(cls, key), f"{where}: {key}", value, repr(getattr(cls, key)))
+            continue
         if key not in _names(cls):
             raise ConfigError(_unknown(key, cls, where, section, root))
         values[key] = _convert(hints[key], value, where, _join(section, key), root)
@@ -261,6 +269,12 @@ def _nearest(key: str, valid: tuple[str, ...]) -> str:
 def _names(cls: type[object]) -> tuple[str, ...]:
     assert dataclasses.is_dataclass(cls), f"{cls!r} is no dataclass"
     return tuple(field.name for field in dataclasses.fields(cls) if field.init)
+
+
+def _kind_names(cls: type[object]) -> tuple[str, ...]:
+    """Name the class variables of a config, which say of what kind it is."""
+    hints = typing.get_type_hints(cls)
+    return tuple(name for name in hints if typing.get_origin(hints[name]) is typing.ClassVar)
 
 
 def _required(cls: type[object]) -> Iterator[str]:

@@ -25,6 +25,7 @@ ROOMS = [
     "kernels",
     "radiometry",
     "records",
+    "stage",
     "geometry",
     "memory",
     "linalg",
@@ -41,8 +42,7 @@ ROOMS = [
     "refinement",
     "meshing",
     "reporting",
-    "streaming",
-    "pipeline",
+    "chains",
     "viz",
     "io",
     "photometric_stereo",
@@ -138,7 +138,7 @@ def loaded_by(statement: str) -> set[str]:
 
 
 def test_importing_the_package_loads_neither_colmap_nor_matplotlib():
-    loaded = loaded_by("import pimper_torch; pimper_torch.Pimper, pimper_torch.load_views")
+    loaded = loaded_by("import pimper_torch; pimper_torch.load_chain, pimper_torch.load_views")
     assert "torch" in loaded  # or this test saw nothing
     assert not loaded & {"pycolmap", "matplotlib", "tyro", "rich"}
 

@@ -4,8 +4,9 @@ import pytest
 from torch import nn
 
 from pimper_torch.bench.gradients import small_scene
+from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.errors import PimperWarning, caution, held
-from pimper_torch.pipeline import Pimper, PimperConfig
+from pimper_torch.stage import Given
 
 
 class Stub(nn.Module):
@@ -19,16 +20,17 @@ class Stub(nn.Module):
 
 def rounds(messages):
     """A chain whose factorization warns of something else in every round."""
-    pimper, left = Pimper(PimperConfig()), list(messages)
-    for name, _ in list(pimper.named_children()):
-        setattr(pimper, name, Stub(object))
+    chain, left = CoarseToFine(), list(messages)
+    for name, _ in list(chain.named_children()):
+        setattr(chain, name, Stub(object))
 
     def factorize():
         for message in left.pop(0):
             caution(message)
 
-    pimper.factorize = Stub(factorize)
-    return pimper._in_rounds(small_scene()[0], None, None)
+    chain.reconstruct, chain.outline = Given(small_scene()[0]), Given(None)
+    chain.factorize = Stub(factorize)
+    return list(chain.passes(None, None, None))
 
 
 def test_the_last_rounds_figures_are_said_once():

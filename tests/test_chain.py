@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 import pimper_torch as pt
-from pimper_torch.coarse.triangulate import Triangulate
+from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.metrics import compare_in_view, pair_views, similarity_between_cameras
@@ -20,7 +20,6 @@ from pimper_torch.records import (
     SparseScene,
     Surface,
     SweptPatches,
-    Views,
 )
 from pimper_torch.rims.constraints import Rims
 from pimper_torch.scenes import (
@@ -35,6 +34,7 @@ from pimper_torch.scenes.lights import wandering_lights
 from pimper_torch.scenes.noise import random_speckle
 from pimper_torch.scenes.shapes import Plane, Shape, Sphere
 from pimper_torch.scenes.sparse import sparse_scene
+from pimper_torch.stage import Given
 
 log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figures
 
@@ -44,22 +44,21 @@ PRESETS = ("paper", "default")
 SMALL = {
     "paper": {"triangulate": {"num_points": 20}},
     "default": {
-        "triangulate": {"num_points": 20},
-        "rounds": {"all_round": False, "scales": [0.5, 1.0]},
+        "scales": [0.5, 1.0],
         "extract": {"max_hole": 0.2},  # beyond the cloud's hull facets lie where they may
     },
 }
 
 
-class Given(nn.Module):
-    """Stands in for structure from motion where cameras and cloud are known."""
+class OneSide(pt.Stage):
+    """Facets of the cloud as one view sees it, in the place of a closed surface."""
 
-    def __init__(self, scene: SparseScene) -> None:
+    def __init__(self, num_points: int) -> None:
         super().__init__()
-        self.scene = scene
+        self.triangulate = Triangulate(TriangulateConfig(num_points=num_points))
 
-    def forward(self, views: Views, sparse_model: object = None) -> SparseScene:
-        return self.scene
+    def forward(self, scene: SparseScene, *_: object) -> CoarseMesh:
+        return self.triangulate(scene)
 
 
 def photographed(shape: Shape, seed: int, **settings: object) -> RenderedScene:
@@ -74,11 +73,16 @@ def photographed(shape: Shape, seed: int, **settings: object) -> RenderedScene:
     return render_shape(shape, cameras, lamps.harmonics_world(), texture)
 
 
+def small_chain(preset: str, scene: SparseScene) -> pt.Chain:
+    chain = pt.load_chain(preset, SMALL[preset], reconstruct=Given(scene))
+    if preset == "default":
+        chain.enclose = OneSide(num_points=20)
+    return chain
+
+
 def surface_of(scene: RenderedScene, preset: str, num_points: int = 150) -> Reconstruction:
     generator = torch.Generator().manual_seed(17)
-    pimper = pt.Pimper(pt.load_config(preset, SMALL[preset]))
-    pimper.reconstruct = Given(sparse_scene(scene, num_points, generator))
-    return pimper(scene.views)
+    return small_chain(preset, sparse_scene(scene, num_points, generator))(scene.views)
 
 
 def sample_spacing(result: Reconstruction) -> float:
@@ -115,7 +119,7 @@ def height_over_sphere(mesh: Mesh) -> torch.Tensor:
 def test_a_cap_of_a_sphere_is_rounder_after_the_chain_than_its_facets_are(preset):
     scene = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
     result = surface_of(scene, preset)
-    facets = Triangulate(pt.load_config(preset, SMALL[preset]).triangulate)(result.scene)
+    facets = OneSide(num_points=20)(result.scene)
     coarse = height_over_sphere(facets.mesh).square().mean().sqrt()
     fine = height_over_sphere(result.mesh).square().mean().sqrt()
     log.info("%s: sphere, facets off by %.5f, surface by %.5f", preset, coarse, fine)
@@ -173,8 +177,7 @@ class Spy(nn.Module):
 
 def test_a_fold_is_mended_before_a_round_or_the_mesh_builds_on_it():
     scene = photographed(Sphere(), 165, target=(0.0, 0.0, 1.0))
-    pimper = pt.Pimper(pt.load_config("default", SMALL["default"]))
-    pimper.reconstruct = Given(sparse_scene(scene, 150, torch.Generator().manual_seed(17)))
+    pimper = small_chain("default", sparse_scene(scene, 150, torch.Generator().manual_seed(17)))
     pimper.fuse, pimper.adapt = Dragging(pimper.fuse), Spy(pimper.adapt)
     result = pimper(scene.views)
     last = pimper.fuse.sound[-1]
@@ -212,7 +215,7 @@ def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
     save_masks(truth.foreground, truth.views.names, tmp_path / "masks")
     views = pt.load_views(tmp_path / "photos", masks=tmp_path / "masks")
     placed = sparse_scene(truth, 600, torch.Generator().manual_seed(17))
-    pimper = pt.Pimper(pt.load_config("default", {"enclose": {"num_facets": 400}}))
+    pimper = pt.load_chain("default", {"enclose": {"num_facets": 400}})
     pimper.reconstruct = Given(placed.replace(views=views))
     result = pimper(views)
     facets = compared(result.coarse.mesh, result, truth)
@@ -241,7 +244,7 @@ def potato(tmp_path_factory):
     save_photographs(truth.views, folder / "photos")
     save_masks(truth.foreground, truth.views.names, folder / "masks")
     views = pt.load_views(folder / "photos", masks=folder / "masks")
-    found = pt.Pimper(pt.load_config("default")).reconstruct(views)
+    found = pt.load_chain("default").reconstruct(views)
     return truth, views, found
 
 
@@ -250,13 +253,13 @@ def potato(tmp_path_factory):
 def test_a_potato_is_reconstructed_from_files_better_than_published(preset, potato):
     truth, views, found = potato
     assert found.views.num_views == truth.views.num_views
-    pimper = pt.Pimper(pt.load_config(preset))
+    pimper = pt.load_chain(preset)
     pimper.reconstruct = Given(found)  # the same in both presets, and the longest stage
     with warnings.catch_warnings():
         # A few facets on the rim may lack light, which may rightly be said.
         warnings.simplefilter("ignore", PimperWarning)
         result = pimper(views)
-    facets = Triangulate(pt.load_config(preset).triangulate)(result.scene)
+    facets = Triangulate()(result.scene)
     coarse = compared(facets.mesh, result, truth)
     fine = compared(result.mesh, result, truth)
     shape = compared(result.mesh.replace(normals_world=None), result, truth)

@@ -7,6 +7,8 @@ import pytest
 import yaml
 
 from pimper_torch import config as config_module
+from pimper_torch.chains.presets import load_config
+from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.config import (
     build,
     find_config,
@@ -18,7 +20,6 @@ from pimper_torch.config import (
     to_yaml,
 )
 from pimper_torch.errors import ConfigError
-from pimper_torch.pipeline import PimperConfig, load_config
 
 
 class Shade(Enum):
@@ -216,9 +217,21 @@ ABLATIONS = sorted((Path(__file__).parents[1] / "configs" / "ablation").glob("*.
 @pytest.mark.parametrize("name", [*presets(), *ABLATIONS], ids=lambda name: Path(name).stem)
 def test_a_preset_holds_only_what_differs_from_the_stages_defaults(name):
     mapping = read_mapping(find_config(name))
-    assert build(PimperConfig, mapping, str(name)) == load_config(name)
-    defaults = dict(leaves(to_mapping(PimperConfig())))
-    assert not [path for path, value in leaves(mapping) if defaults[path] == value]
+    config = load_config(name)
+    assert build(type(config), mapping, str(name)) == config
+    defaults = dict(leaves(to_mapping(type(config)())))
+    same = [path for path, value in leaves(mapping) if defaults[path] == value]
+    assert same == (["chain"] if "chain" in mapping else [])
+
+
+def test_settings_say_which_chain_they_are_for():
+    assert load_config("default").chain == "coarse-to-fine"
+    assert load_config("paper").chain == "published"
+    assert load_config("default", {"chain": "published"}) == PublishedConfig()
+    with pytest.raises(ConfigError, match="chain is 'other'; needed: coarse-to-fine or published"):
+        load_config("default", {"chain": "other"})
+    with pytest.raises(ConfigError, match="no setting `sweep`"):
+        load_config("paper", {"sweep": {"steps": 9}})
 
 
 def test_changes_are_laid_over_a_preset():

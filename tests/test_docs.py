@@ -13,11 +13,11 @@ import tyro
 from torch.nn.functional import normalize
 
 import pimper_torch
-from pimper_torch import pipeline
+from pimper_torch.chains import presets
+from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
 from pimper_torch.io import results
 from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.pipeline import load_config
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.scenes import RenderedScene, render_shape, save_photographs, sparse_scene
 from pimper_torch.scenes.cameras import arc_cameras
@@ -70,7 +70,7 @@ def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
     draw = results.draw_overview
     monkeypatch.setattr(results, "draw_overview", lambda found, path: draw(found, path, 40))
     few = {"enclose": {"num_facets": 100}}  # thousands take a third of a minute
-    monkeypatch.setattr(pipeline, "load_config", lambda name: load_config(name, few))
+    monkeypatch.setattr(presets, "load_config", lambda name, _: load_config(name, few))
     return {}
 
 
@@ -140,7 +140,7 @@ def test_every_block_of_python_in_the_readme_is_run():
 def test_newcomers_are_shown_the_default():
     example = next(block for block in BLOCKS if "load_views" in block)
     for shown in (example, pimper_torch.__doc__):
-        assert re.findall(r"load_config\((.*?)\)", shown) == ['"default"']
+        assert re.findall(r"load_chain\((.*?)\)", shown) == ['"default"']
     mine = [line for line in COMMANDS if line.startswith("reconstruct photos/")]
     assert mine
     assert not any("--preset" in line for line in mine)

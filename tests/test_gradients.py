@@ -27,7 +27,7 @@ def generator():
 
 
 def chain_of(preset, **changes):
-    return pt.Pimper(pt.load_config(preset, {"rounds": {"all_round": False}, **changes}))
+    return pt.load_chain(preset, changes)
 
 
 def assert_agree(stage, pairs, tolerance):
@@ -38,7 +38,7 @@ def assert_agree(stage, pairs, tolerance):
 
 
 def in_rounds(**changes):
-    return chain_of("default", rounds={"all_round": False, "scales": [0.5, 1.0]}, **changes)
+    return chain_of("default", scales=[0.5, 1.0], **changes)
 
 
 @pytest.fixture(scope="module")

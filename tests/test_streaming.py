@@ -4,7 +4,9 @@ from torch import nn
 from torch.testing import assert_close
 
 import pimper_torch as pt
-from pimper_torch.bench.gradients import Given, small_scene
+from pimper_torch.bench.gradients import small_scene
+from pimper_torch.chains.streaming import photometry_and_heights
+from pimper_torch.errors import ConfigError
 from pimper_torch.kernels.switch import using
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
@@ -12,7 +14,7 @@ from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.mesh_light import thinned
 from pimper_torch.records import StageReport
 from pimper_torch.reporting import Silent
-from pimper_torch.streaming import photometry_and_heights
+from pimper_torch.stage import Given
 from pimper_torch.sweep.sweep import Sweep
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
@@ -107,12 +109,30 @@ class Listener(Silent):
 
 
 def in_rounds(listener, **changes):
-    rounds = {"all_round": False, "scales": [0.5, 1.0]}
-    chain = pt.Pimper(pt.load_config("default", {"rounds": rounds, **changes}), listener)
+    chain = pt.load_chain("default", {"scales": [0.5, 1.0], **changes}, listener)
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
     chain.reconstruct, chain.outline = Given(scene), Given(None)
-    chain.triangulate = chain.enclose = Given(coarse)
+    chain.enclose = Given(coarse)
     return chain, scene
+
+
+def test_steps_show_the_records_of_every_pass_and_end_where_the_run_ends():
+    chain, scene = in_rounds(Silent())
+    steps = list(chain.steps(scene.views))
+    result = chain(scene.views)
+    assert [(step.scale, step.last) for step in steps] == [(0.5, False), (1.0, True)]
+    names = [report.name for step in steps for report in step.reports]
+    assert [report.name for report in result.report] == [*names, "extract"]
+    assert torch.equal(chain.extract(steps[-1].surface).vertices_world, result.mesh.vertices_world)
+    # The second pass stands on facets that were remeshed on the first one's surface.
+    assert steps[0].coarse is chain.enclose.record
+    remeshed = chain.adapt(steps[0].heights, steps[0].surface, None)
+    assert torch.equal(steps[1].coarse.mesh.faces, remeshed.mesh.faces)
+
+
+def test_a_stage_that_the_chain_has_not_is_refused():
+    with pytest.raises(ConfigError, match=r"the stage 'factorise'.*needed: one of.*factorize"):
+        pt.load_chain("default", factorise=Given(None))
 
 
 def test_a_round_reports_its_photometry_once_and_what_each_part_takes():

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.alignment.anchors import (
     Anchors,
@@ -36,6 +36,7 @@ from pimper_torch.alignment.trust import (
 from pimper_torch.config import require
 from pimper_torch.progress import report
 from pimper_torch.records import AlignVerdict, DepthPatches, Depths, PatchSet, Record
+from pimper_torch.stage import Stage
 
 # An arc over an edge whose middle stands out by 0.7 % of its length has this C; flatter
 # reliefs are not told apart.
@@ -115,7 +116,7 @@ class _Problem(Record):
         return torch.stack([torch.ones_like(self.unit)] * 3 + [self.unit])
 
 
-class Align(nn.Module):
+class Align(Stage):
     r"""Undo the bas-relief transform that photometry leaves each patch with.
 
     The relief z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z, 1)`

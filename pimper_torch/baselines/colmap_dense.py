@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from torch import nn
 
 from pimper_torch.baselines.exchange import (
     estimate_of,
@@ -26,6 +25,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import MissingProgramError, ReconstructionError
 from pimper_torch.progress import report
 from pimper_torch.records import CoarseMesh, Estimate, SparseScene
+from pimper_torch.stage import Stage
 
 COLMAP = Program(
     name="colmap",
@@ -83,7 +83,7 @@ class Step:
     arguments: tuple[str, ...]
 
 
-class ColmapDense(nn.Module):
+class ColmapDense(Stage):
     """Patch match with geometric consistency, fusion, and Poisson's or Delaunay's surface."""
 
     def __init__(self, config: ColmapDenseConfig | None = None) -> None:

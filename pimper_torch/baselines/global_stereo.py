@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.baselines.anchoring import (
     apply_bas_relief,
@@ -40,6 +40,7 @@ from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.lights import fit_distant_lights
 from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.records import CoarseMesh, Convergence, Estimate, Record, SparseScene
+from pimper_torch.stage import Stage
 
 # Lights are fitted to the mesh, and the ambiguity is fixed, on this many samples.
 LIGHT_SAMPLES = 30_000
@@ -116,7 +117,7 @@ class WholePhotometry(Record):
     converged: bool
 
 
-class GlobalStereo(nn.Module):
+class GlobalStereo(Stage):
     """Global photometric stereo by masked factorization: one matrix, one light a view.
 
     The published comparison factorizes the whole object, registered on the coarse mesh, as

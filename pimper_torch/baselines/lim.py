@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.baselines.anchoring import (
@@ -45,6 +45,7 @@ from pimper_torch.integration.integrate import integrate_normals
 from pimper_torch.patches.warp import WarpConfig
 from pimper_torch.photometry.lights import fit_distant_lights
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, Record, SparseScene
+from pimper_torch.stage import Stage
 
 # A relief that hides samples from a view needs no more vertices than this many samples apart.
 OCCLUDER_STRIDE = 4
@@ -89,7 +90,7 @@ class LimConfig:
         require(steps >= 0, "integration_steps", steps, "0 or more")
 
 
-class Lim(nn.Module):
+class Lim(Stage):
     """Photometric stereo on views registered by the surface, and the surface from it, in turn.
 
     A round registers all views on the present surface (first the facets through the sparse

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import nn
 
 from pimper_torch.baselines.exchange import (
     estimate_of,
@@ -17,6 +16,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.progress import report
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
+from pimper_torch.stage import Stage
 
 
 def _program(name: str) -> Program:
@@ -70,7 +70,7 @@ class OpenMvsConfig:
         require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
 
 
-class OpenMvs(nn.Module):
+class OpenMvs(Stage):
     """Depth maps by patch match, a mesh that explains their visibility, refined."""
 
     def __init__(self, config: OpenMvsConfig | None = None) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.baselines.exchange import (
     estimate_of,
@@ -16,6 +16,7 @@ from pimper_torch.baselines.exchange import (
 from pimper_torch.baselines.external import Deadline, Program, all_cores, run_program, workspace
 from pimper_torch.config import require
 from pimper_torch.records import Cameras, CoarseMesh, Estimate, SparseScene
+from pimper_torch.stage import Stage
 
 PMVS2 = Program(
     name="pmvs2",
@@ -70,7 +71,7 @@ class PmvsConfig:
         require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
 
 
-class Pmvs(nn.Module):
+class Pmvs(Stage):
     """Patch-based multi-view stereo: oriented points where neighbouring views agree."""
 
     def __init__(self, config: PmvsConfig | None = None) -> None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from scipy.sparse import coo_array
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
@@ -33,6 +33,7 @@ from pimper_torch.geometry.surfaces import (
 )
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
+from pimper_torch.stage import Stage
 
 # A needle's area is taken as at least this share of its longest edge squared.
 _LEAST_SHAPE = 1e-3
@@ -65,7 +66,7 @@ class SmoothedConfig:
         require(filled >= 0, "filled_fidelity", filled, "0 or more")
 
 
-class Smoothed(nn.Module):
+class Smoothed(Stage):
     """Smooth the coarse mesh as a thin plate held by its vertices.
 
     Any mesh will do, closed ones and several pieces too. Photographs are not looked at;

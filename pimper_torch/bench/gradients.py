@@ -13,15 +13,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.chains.published import Published
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.metrics.derivatives import DerivativeCheck, Tensors, check_derivatives
-from pimper_torch.pipeline import Pimper
-from pimper_torch.records import Cameras, CoarseMesh, Record, SparseScene, Views
+from pimper_torch.records import (
+    Cameras,
+    CoarseMesh,
+    PatchViews,
+    PhotometricPatches,
+    Record,
+    SparseScene,
+    Views,
+)
 from pimper_torch.scenes import render_shape, sparse_scene
 from pimper_torch.scenes.cameras import arc_cameras
 from pimper_torch.scenes.lights import wandering_lights
 from pimper_torch.scenes.noise import random_speckle
 from pimper_torch.scenes.shapes import Sphere
+from pimper_torch.stage import Given, Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,40 +99,31 @@ def small_scene(
     return scene, coarse
 
 
-class Given(nn.Module):
-    """A stage that hands out what it was made with, whatever it is handed."""
+AnyChain = CoarseToFine | Published
 
-    def __init__(self, record: Record | None) -> None:
+
+class Whole(Stage):
+    """A factorization that is called with all patches at once."""
+
+    def __init__(self, factorize: Callable[[PatchViews], PhotometricPatches]) -> None:
         super().__init__()
-        self.record = record
+        self.factorize = factorize
 
-    def forward(self, *_: object) -> Record | None:
-        """Hand it out."""
-        return self.record
-
-
-class Whole(nn.Module):
-    """A stage that is called with all patches at once."""
-
-    def __init__(self, stage: nn.Module) -> None:
-        super().__init__()
-        self.stage = stage
-
-    def forward(self, *given: object) -> object:
+    def forward(self, seen: PatchViews) -> PhotometricPatches:
         """Call it."""
-        return self.stage(*given)
+        return self.factorize(seen)
 
 
-def probes(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> dict[str, Probe]:
+def probes(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str, Probe]:
     """Run the chain once, and make a probe of every stage that took part, and of the whole.
 
     Args:
-        pimper: Its stages may be swapped; structure from motion and the coarse mesh are replaced
+        chain: Its stages may be swapped; structure from motion and the coarse mesh are replaced
             by ``scene`` and ``coarse``, and no outlines are looked for.
         scene: Float64.
         coarse: In the same frame.
     """
-    calls = _calls(pimper, scene, coarse)
+    calls = _calls(chain, scene, coarse)
     makers: dict[str, Callable[..., Probe]] = {
         "warp": _warp,
         "factorize": _factorize,
@@ -135,13 +136,13 @@ def probes(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> dict[str, 
         "adapt": _adapt,
     }
     found = {
-        name: make(getattr(pimper, name), *calls[name])
+        name: make(getattr(chain, name), *calls[name])
         for name, make in makers.items()
         if name in calls
     }
     if "adapt" in calls:
-        found["decompose"] = _decompose(pimper.decompose, *calls["decompose"])
-    return {**found, "chain": _chain(pimper, scene, coarse)}
+        found["decompose"] = _decompose(chain.decompose, *calls["decompose"])
+    return {**found, "chain": _chain(chain, scene, coarse)}
 
 
 def moved_cameras(cameras: Cameras, motion: Float[Tensor, "view 6"]) -> Cameras:
@@ -156,26 +157,29 @@ def moved_cameras(cameras: Cameras, motion: Float[Tensor, "view 6"]) -> Cameras:
     return cameras.replace(cam_from_world=moved)
 
 
-def _calls(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> dict[str, tuple[Any, ...]]:
+def _calls(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str, tuple[Any, ...]]:
     """Run the chain and keep what each stage was handed last."""
     calls: dict[str, tuple[Any, ...]] = {}
 
     def keep(name: str) -> Callable[[nn.Module, tuple[Any, ...]], None]:
         return lambda _, handed: calls.update({name: handed})
 
-    _place(pimper, scene, coarse)
-    pimper.factorize = Whole(pimper.factorize)
-    hooks = [stage.register_forward_pre_hook(keep(name)) for name, stage in pimper.named_children()]
-    pimper(scene.views)
+    _place(chain, scene, coarse)
+    chain.factorize = Whole(chain.factorize)
+    hooks = [stage.register_forward_pre_hook(keep(name)) for name, stage in chain.named_children()]
+    chain(scene.views)
     for hook in hooks:
         hook.remove()
     return calls
 
 
-def _place(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> None:
-    pimper.reconstruct = Given(scene)
-    pimper.outline = Given(None)  # outlines jump as photographs change: everything is the object
-    pimper.triangulate = pimper.enclose = Given(coarse)
+def _place(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> None:
+    chain.reconstruct = Given(scene)
+    chain.outline = Given(None)  # outlines jump as photographs change: everything is the object
+    if isinstance(chain, Published):
+        chain.triangulate = Given(coarse)
+    else:
+        chain.enclose = Given(coarse)
 
 
 def _gathered(buckets: Sequence[Record], name: str) -> Float[Tensor, " value"]:
@@ -416,7 +420,7 @@ def _adapt(stage: nn.Module, swept: Any, surface: Any, rims: Any) -> Probe:  # n
 
 
 def _decompose(
-    stage: nn.Module,
+    stage: Callable[..., Any],
     coarse: CoarseMesh,
     cameras: Cameras,
     surface: Any,  # noqa: ANN401
@@ -445,20 +449,20 @@ def _decompose(
     return Probe(function=function, inputs=inputs, scales={"vertices": step, "facets": step})
 
 
-def _chain(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> Probe:
+def _chain(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> Probe:
     step = _step_of(coarse.mesh.vertices_world, coarse.mesh.faces)
 
     def function(x: Tensors) -> Tensors:
         views = scene.views.replace(images=x["photographs"])
         mesh = coarse.mesh.replace(vertices_world=x["mesh"])
         moved = scene.replace(views=views, cameras=moved_cameras(scene.cameras, x["cameras"]))
-        _place(pimper, moved, coarse.replace(mesh=mesh))
-        result = pimper(views)
+        _place(chain, moved, coarse.replace(mesh=mesh))
+        result = chain(views)
         found = result.mesh
         return {
             "vertices": found.vertices_world,
-            "normals": found.normals_world,
-            "albedo": found.albedo,
+            "normals": _known(found.normals_world),
+            "albedo": _known(found.albedo),
             "lights": _gathered(result.patches.photometric.buckets, "lights_patch"),
         }
 
@@ -469,6 +473,11 @@ def _chain(pimper: Pimper, scene: SparseScene, coarse: CoarseMesh) -> Probe:
     }
     scales = {"mesh": step, "cameras": _per_pixel(scene.cameras)}
     return Probe(function=function, inputs=inputs, scales=scales)
+
+
+def _known(values: Tensor | None) -> Tensor:
+    assert values is not None  # what a chain extracts has all
+    return values
 
 
 def _of_surface(surface: Any) -> Tensors:  # noqa: ANN401

@@ -12,16 +12,16 @@ from pimper_torch.baselines.lim import Lim
 from pimper_torch.baselines.openmvs import OpenMvs
 from pimper_torch.baselines.pmvs import Pmvs
 from pimper_torch.baselines.smoothed import Smoothed
+from pimper_torch.chains.presets import load_config, make_chain
 from pimper_torch.errors import ConfigError
 from pimper_torch.io.estimates import estimate_of
-from pimper_torch.pipeline import Pimper, load_config
 from pimper_torch.records import (
     CoarseMesh,
     Estimate,
     Record,
     SparseScene,
-    Views,
 )
+from pimper_torch.stage import Given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -73,26 +73,13 @@ def method_named(name: str) -> Method:
         raise ConfigError(f"method {name!r}: {error} Rivals are {', '.join(_RIVALS)}.") from error
 
 
-class Given(nn.Module):
-    """Stands in for structure from motion that has run already."""
-
-    def __init__(self, scene: SparseScene) -> None:
-        super().__init__()
-        self.scene = scene
-
-    def forward(self, views: Views, sparse_model: object = None) -> SparseScene:
-        """Give the scene, whatever the views."""
-        return self.scene
-
-
 def _preset(name: str) -> Method:
     config = load_config(name)
 
     def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
-        pimper = Pimper(config)
-        pimper.reconstruct = Given(scene)
+        chain = make_chain(config, reconstruct=Given(scene))
         began = time.perf_counter()
-        result = pimper(scene.views)
+        result = chain(scene.views)
         seconds = time.perf_counter() - began
         found = {key: value for report in result.report for key, value in report.figures.items()}
         return Outcome(

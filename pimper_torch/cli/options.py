@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from pimper_torch.chains.presets import Config, load_config
+from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.photographs import list_images
 from pimper_torch.io.results import RESULT_NAMES
-from pimper_torch.pipeline import PimperConfig, load_config
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 # Several numbers are one word, 15000,15100,14900: a list would swallow PHOTOS behind it.
@@ -78,7 +79,7 @@ class Job:
     photos: Path
     out: Path
     common: CommonOptions
-    config: PimperConfig
+    config: Config
     inputs: InputOptions = field(default_factory=InputOptions)
 
 
@@ -97,13 +98,14 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         SystemExit: Arguments that are none, told as tyro does, or ``--help``.
     """
     preset = load_config(_preset(arguments))
+    settings: Any = type(preset)  # each chain has its own
 
     def reconstruct(
         photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")],
         out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],
         inputs: Annotated[InputOptions, tyro.conf.arg(name="")] = InputOptions(),
         common: Annotated[CommonOptions, tyro.conf.arg(name="")] = CommonOptions(),
-        config: Annotated[PimperConfig, tyro.conf.arg(name="")] = preset,
+        config: Annotated[settings, tyro.conf.arg(name="")] = preset,
     ) -> Job:
         """Reconstruct the surface that a folder of photographs shows.
 
@@ -119,7 +121,7 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
     def demo(
         out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")] = Path("pimper_demo"),
         common: Annotated[CommonOptions, tyro.conf.arg(name="")] = SKULL,
-        config: Annotated[PimperConfig, tyro.conf.arg(name="")] = preset,
+        config: Annotated[settings, tyro.conf.arg(name="")] = preset,
     ) -> Job:
         """Reconstruct the skull whose photographs come with the package.
 
@@ -144,11 +146,14 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
     job = dataclasses.replace(job, config=dataclasses.replace(job.config, outline=outline))
     if job.common.reference:
         named = job.common.reference
+        config = job.config
         config = dataclasses.replace(
-            job.config,
-            triangulate=dataclasses.replace(job.config.triangulate, reference=named),
-            enclose=dataclasses.replace(job.config.enclose, reference=named),
+            config, enclose=dataclasses.replace(config.enclose, reference=named)
         )
+        if isinstance(config, PublishedConfig):
+            config = dataclasses.replace(
+                config, triangulate=dataclasses.replace(config.triangulate, reference=named)
+            )
         job = dataclasses.replace(job, config=config)
     return job
 

@@ -8,13 +8,13 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.bars import Bars
 from pimper_torch.cli.options import Job, checked
 from pimper_torch.errors import ConfigError
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import write_result
-from pimper_torch.pipeline import Pimper
 from pimper_torch.progress import listening
 from pimper_torch.records import Reconstruction, StageReport, Views
 from pimper_torch.reporting import peak_memory_mb
@@ -36,7 +36,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
     with Bars(console) as bars:
         views = _watched(bars, "read", lambda: _read(job))
         mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
-        result = Pimper(job.config, bars, common.cache)(
+        result = make_chain(job.config, bars, common.cache)(
             views.to(common.device), job.inputs.sparse, mesh
         )
         _watched(bars, "write", lambda: _write(job, result))

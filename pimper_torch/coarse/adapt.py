@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.contradicted import contradicted, misfit_of
@@ -24,6 +24,7 @@ from pimper_torch.geometry.visibility import ambient_occlusion
 from pimper_torch.outlines.hull import Hull
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
 from pimper_torch.rims.constraints import Rims
+from pimper_torch.stage import Stage
 
 # A lattice vertex lies on an edge when its coordinate opposite to it is below this: lattices
 # have far fewer than a million pieces.
@@ -75,7 +76,7 @@ class AdaptConfig:
         require(0 <= self.max_hole < 1, "adapt.max_hole", self.max_hole, "in [0, 1)")
 
 
-class Adapt(nn.Module):
+class Adapt(Stage):
     """Fit the coarse mesh to a surface. See :func:`adapt`."""
 
     def __init__(self, config: AdaptConfig | None = None) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.coarse.brought import checked
 from pimper_torch.coarse.cloud import point_covariances
@@ -34,6 +34,7 @@ from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Outlines, SparseScene
 from pimper_torch.rims.constraints import Rim, Rims
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
+from pimper_torch.stage import Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +103,7 @@ class EncloseConfig:
         require(self.max_distance_px > 0, "max_distance_px", self.max_distance_px, "above 0")
 
 
-class Enclose(nn.Module):
+class Enclose(Stage):
     """Enclose the object in facets; the result is a constant to autograd."""
 
     def __init__(self, config: EncloseConfig | None = None) -> None:

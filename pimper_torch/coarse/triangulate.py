@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 from pimper_torch.coarse.cloud import with_cloud
@@ -32,6 +32,7 @@ from pimper_torch.geometry.surfaces import (
     vertex_normals,
 )
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
+from pimper_torch.stage import Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +107,7 @@ class TriangulateConfig:
         require(self.fill_smoothing >= 0, "fill_smoothing", self.fill_smoothing, "0 or more")
 
 
-class Triangulate(nn.Module):
+class Triangulate(Stage):
     """Span facets between trustworthy points; the result is a constant to autograd."""
 
     def __init__(self, config: TriangulateConfig | None = None) -> None:

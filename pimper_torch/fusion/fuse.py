@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
@@ -40,6 +40,7 @@ from pimper_torch.records import (
     SweptPatches,
 )
 from pimper_torch.rims.constraints import Rims
+from pimper_torch.stage import Stage
 
 # Information that every vertex holds to where it is by, in units of one over its spacing
 # squared: as if it were known to 100 spacings. It decides where nothing else does.
@@ -152,7 +153,7 @@ class _Learnt(Record):
     coarse: Fused
 
 
-class Fuse(nn.Module):
+class Fuse(Stage):
     """Solve for the surface that all evidence suits best, over the whole connected lattice.
 
     Unknown is the height of every lattice vertex along the coarse mesh's smoothed normal.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.geometry.frames import transform
@@ -16,6 +16,7 @@ from pimper_torch.linalg.poisson import integrate_weighted
 from pimper_torch.progress import track
 from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
 from pimper_torch.records.patches import Photometry, Templates
+from pimper_torch.stage import Stage
 
 # What filled slopes weigh next to measured ones. Small enough to leave the measured ones
 # alone, large enough to decide where nothing else does.
@@ -45,7 +46,7 @@ class IntegrateConfig:
         require(self.iterations >= 0, "iterations", self.iterations, "0 or more")
 
 
-class Integrate(nn.Module):
+class Integrate(Stage):
     """Integrate the normals of every patch on its template.
 
     Frankot and Chellappa's projection in the cosine basis, bucket by bucket. Samples without

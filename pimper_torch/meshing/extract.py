@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
@@ -13,6 +13,7 @@ from pimper_torch.geometry.components import component_areas, face_components, v
 from pimper_torch.meshing.faults import faults, overturned, stretched
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.records import Mesh, Surface
+from pimper_torch.stage import Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +53,7 @@ class ExtractConfig:
         require(0 <= self.min_piece <= 1, "min_piece", self.min_piece, "in [0, 1]")
 
 
-class Extract(nn.Module):
+class Extract(Stage):
     """Keep what the photographs support, as one connected manifold mesh.
 
     Faces without support go, and so do spikes and faces turned over. Of the rest the large

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.geometry.components import vertex_components
@@ -17,6 +17,7 @@ from pimper_torch.meshing.faults import faults
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.meshing.plates import least_bent
 from pimper_torch.records import Surface
+from pimper_torch.stage import Stage
 
 # Rings of sound vertices that a place which stays broken may take in, one at a time.
 _RINGS = 12
@@ -41,7 +42,7 @@ class MendConfig:
         require(self.max_stretch > 1, "mend.max_stretch", self.max_stretch, "above 1")
 
 
-class Mend(nn.Module):
+class Mend(Stage):
     """Mend spikes and folds that other faces enclose, before a round or a mesh builds on them.
 
     A fold that is left would be carried by the next round's templates, and grow there. Mended

@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pimper_torch.config import require
@@ -20,6 +20,7 @@ from pimper_torch.outlines.pictures import working_pictures
 from pimper_torch.outlines.rounds import Cues, Cuts, cut_in_rounds
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Outlines, SparseScene, Views
+from pimper_torch.stage import Stage
 
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
 # Probabilities where a view's cut and the hull contradict each other by more than two pixels.
@@ -82,7 +83,7 @@ class OutlineConfig:
         require(fits, "region", self.region, "nothing, or smallest x, y, z, then largest")
 
 
-class Outline(nn.Module):
+class Outline(Stage):
     """Find the object's outline in every view; a constant to autograd."""
 
     def __init__(self, config: OutlineConfig | None = None) -> None:

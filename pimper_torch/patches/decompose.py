@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
@@ -15,6 +15,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
 from pimper_torch.patches.carry import carry
 from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
+from pimper_torch.stage import Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +44,7 @@ class DecomposeConfig:
         require(self.bucket_entries >= 1, "bucket_entries", self.bucket_entries, "1 or more")
 
 
-class Decompose(nn.Module):
+class Decompose(Stage):
     """Give every facet a frame, an enlarged triangle and a raster."""
 
     def __init__(self, config: DecomposeConfig | None = None) -> None:

@@ -6,7 +6,7 @@ from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.config import require
@@ -27,6 +27,7 @@ from pimper_torch.records import (
     Templates,
     Views,
 )
+from pimper_torch.stage import Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +61,7 @@ class WarpConfig:
         require(self.pyramid_levels >= 1, "pyramid_levels", self.pyramid_levels, ">= 1")
 
 
-class Warp(nn.Module):
+class Warp(Stage):
     """Resample all views on all templates.
 
     Perspective-correct, because each sample's own 3D point is projected; anti-aliased,

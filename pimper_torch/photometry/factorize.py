@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
@@ -42,6 +42,7 @@ from pimper_torch.records import (
     Registered,
     Templates,
 )
+from pimper_torch.stage import Stage
 
 # The pull on a light counts as if so many samples more were seen than there are.
 BORROWED_SAMPLES = 16.0
@@ -185,7 +186,7 @@ class _Posed(Record):
     problem: Bilinear
 
 
-class Factorize(nn.Module):
+class Factorize(Stage):
     r"""Separate albedo, normals and light: ``J = L N`` with ``N`` on the photometric cone.
 
     First the light field of every view is fitted to the smoothed normals of the coarse mesh:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
@@ -15,6 +15,7 @@ from pimper_torch.geometry.surfaces import face_edges, vertex_normals
 from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.refinement.energy import assemble, facet_trends, plane_pull
+from pimper_torch.stage import Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +49,7 @@ class RefineConfig:
             require(value > 0, name, value, "above 0")
 
 
-class Refine(nn.Module):
+class Refine(Stage):
     r"""Join the patches and smooth their seams, keeping the middle of every facet.
 
     Minimises :math:`\int \lambda (1-G) |\cup S_\mu - S|^2 + G |\nabla S|^2` over the lattice

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.projection import triangulate_rays
@@ -13,6 +13,7 @@ from pimper_torch.outlines.hull import Hull, visual_hull
 from pimper_torch.records import Cameras, Outlines, Record, RimPoints, RimRays
 from pimper_torch.rims.contours import RimConfig, rim_rays
 from pimper_torch.rims.touching import rim_points
+from pimper_torch.stage import Stage
 
 # Share of the views whose outline may be wrong at a place: as large for outlines that are found as
 # in the vote that finds them. In one of 24 photographs of a skull, shadow took the end of the jaw.
@@ -45,7 +46,7 @@ class Rims(Record):
         return rim_points(self.rays, self.cameras, self.hull, points_world, normals_world)
 
 
-class Rim(nn.Module):
+class Rim(Stage):
     """Turn outlines into constraints on the surface; a constant to autograd."""
 
     def __init__(self, config: RimConfig | None = None) -> None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from torch import nn
 
 from pimper_torch.config import require
 from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
@@ -26,6 +25,7 @@ from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
 from pimper_torch.sfm.scene import assemble_scene
 from pimper_torch.sfm.workspace import workspace
+from pimper_torch.stage import Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,7 +147,7 @@ class ReconstructConfig:
         )
 
 
-class Reconstruct(nn.Module):
+class Reconstruct(Stage):
     """Find cameras and a sparse cloud, and undistort the photographs to pinholes.
 
     The photographs are written as 8-bit sRGB files to a temporary folder, where COLMAP

@@ -5,7 +5,7 @@ from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
@@ -29,6 +29,7 @@ from pimper_torch.records import (
     Templates,
     Views,
 )
+from pimper_torch.stage import Stage
 from pimper_torch.sweep.consistency import inconsistency
 from pimper_torch.sweep.costs import compiled_costs
 from pimper_torch.sweep.minimum import parabola_minimum, posterior_variance
@@ -100,7 +101,7 @@ class _Swept(Record):
     shading: Float[Tensor, "sample chosen"]
 
 
-class Sweep(nn.Module):
+class Sweep(Stage):
     r"""Move every sample along the normal of what its template carries to where views agree.
 
     For each of a few heights all views are looked up again, and the light that was fitted, the

@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.alignment.align import Align, AlignConfig
 from pimper_torch.alignment.system import Pulls, solve_transforms
-from pimper_torch.pipeline import load_config
+from pimper_torch.chains.presets import load_config
 
 RADIUS = 2.0
 CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)

@@ -108,7 +108,7 @@ def test_a_run_is_measured_kept_and_compared(speed, reconstruction, monkeypatch,
                 self.observer.finished(told(stage, **figures))
             return reconstruction
 
-    monkeypatch.setattr(speed, "Pimper", Chain)
+    monkeypatch.setattr(speed, "make_chain", Chain)
     monkeypatch.setattr(speed, "load_views", lambda *_, **__: reconstruction.scene.views)
     monkeypatch.setattr(speed, "copy_bytes_per_s", lambda: 1e9)
     figures = tmp_path / "figures.json"

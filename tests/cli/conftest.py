@@ -47,7 +47,7 @@ def chain(reconstruction, monkeypatch):
 
     draw = results.draw_overview
     monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
-    monkeypatch.setattr(run, "Pimper", Chain)
+    monkeypatch.setattr(run, "make_chain", Chain)
     return Chain
 
 

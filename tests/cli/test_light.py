@@ -6,12 +6,12 @@ from importlib import import_module
 
 import pytest
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.cli import light as light_module
 from pimper_torch.cli.light import ABSENT, light
 from pimper_torch.cli.main import _COMMANDS, _READERS, main
 from pimper_torch.config import to_mapping
 from pimper_torch.errors import ConfigError
-from pimper_torch.pipeline import PimperConfig
 
 
 def reader(command):
@@ -78,14 +78,14 @@ def test_help_and_refusals_do_not_wait_for_torch(tmp_path):
 
 
 def test_settings_are_read_as_the_command_reads_them():
-    line = ["photos", "-o", "out", "--preset", "fast", "--rounds.scales", "(0.5,)"]
+    line = ["photos", "-o", "out", "--preset", "fast", "--decompose.overlap-samples", "3"]
     line += ["--photographs.saturation", "1,2,3", "--factorize.rank", "9"]
     line += ["--region", "(0,0,0,1,1,1)", "--reference", "a"]
     options = "pimper_torch.cli.options"
     found = light(options, "parse")("reconstruct", line)
     job = import_module(options).parse("reconstruct", line)
     assert to_mapping(found.config) == to_mapping(job.config)
-    assert type(found.config) is not PimperConfig
+    assert type(found.config) is not CoarseToFineConfig
 
 
 def test_what_takes_long_to_load_is_absent_and_stands_any_use():

@@ -8,13 +8,14 @@ import torch
 import yaml
 from PIL import Image
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
 from pimper_torch.errors import PimperWarning, ReconstructionError
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.io.version import installed_version
 from pimper_torch.outlines.outline import Outline
-from pimper_torch.pipeline import PimperConfig, load_config
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Mesh, Outlines
 
@@ -31,7 +32,7 @@ def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys)
     assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
     assert held(tmp_path / "out") == sorted({*RESULT_NAMES} - {"masks"})
     config, views, sparse = chain.given
-    assert config == PimperConfig() == load_config("default")
+    assert config == CoarseToFineConfig() == load_config("default")
     assert views.names == ("0.png", "1.png", "2.png")
     assert sparse is None
     told = capsys.readouterr()
@@ -52,7 +53,7 @@ def test_options_reach_their_places(photos, chain, tmp_path):
     assert code == 0
     config, views, sparse = chain.given
     assert views.images.shape[-2:] == (12, 16)
-    assert (config.reconstruct.starts, config.triangulate.reference) == (7, "1.png")
+    assert (config.reconstruct.starts, config.enclose.reference) == (7, "1.png")
     assert sparse == tmp_path
     written = yaml.safe_load((out / "config.yaml").read_text())
     assert written["reconstruct"]["starts"] == 7
@@ -83,7 +84,7 @@ def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, 
     inside = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(4))
     trusted = torch.tensor([True, True, False])
     found = Outlines(inside=inside, trusted=trusted, source="found")
-    write_result(reconstruction.replace(outlines=found), PimperConfig(), tmp_path / "first")
+    write_result(reconstruction.replace(outlines=found), CoarseToFineConfig(), tmp_path / "first")
     photos = tmp_path / "photos"
     photos.mkdir()
     for name, image in zip(scene.views.names, scene.views.images, strict=True):
@@ -206,7 +207,7 @@ def test_every_setting_is_an_option_with_its_help(capsys):
         run("demo", "--help")
     assert ended.value.code == 0
     told = capsys.readouterr().out
-    for name in ("--reconstruct.starts", "--triangulate.reference", "--overwrite", "--preset"):
+    for name in ("--reconstruct.starts", "--enclose.reference", "--overwrite", "--preset"):
         assert name in told
 
 

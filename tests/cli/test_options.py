@@ -7,12 +7,13 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import pytest
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.errors import ConfigError
 from pimper_torch.io import results
 from pimper_torch.io.meshes import read_mesh, write_ply
-from pimper_torch.pipeline import PimperConfig
 from pimper_torch.records import Mesh
 from pimper_torch.scenes.meshes import icosphere
 
@@ -20,14 +21,14 @@ from pimper_torch.scenes.meshes import icosphere
 RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
-        "--full-mesh --max-memory 20GB --kernels torch --preset {preset} --reference view_002 "
-        "--max-size-px 48 --overwrite "
+        "--full-mesh --max-memory 20GB --scales (0.5,) --kernels torch --preset {preset} "
+        "--reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0)"
     ],
     "demo": [
-        "-o {out} --preset fast --reference 38 --device cpu --max-size-px 60 --overwrite "
-        "--full-mesh --cache {out}_kept --kernels numba --max-memory 20GB",
+        "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
+        "--overwrite --full-mesh --cache {out}_kept --kernels numba --max-memory 20GB",
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
@@ -60,7 +61,7 @@ RUNS = {
     "gamma": ["{photos} --mask {masks}/view_000.png --rank 3 --max-size-px 40"],
 }
 TINY = "--num-views 2 --width 32 --height 24 --processes 1"
-PRESET = "rounds: {scales: [0.5]}\nsweep: {min_views: 2, num_views: 4}\n"
+PRESET = "scales: [0.5]\nsweep: {min_views: 2, num_views: 4}\n"
 
 
 @pytest.fixture(scope="module")
@@ -114,9 +115,14 @@ def test_every_option_of_the_demo_reaches_the_chain(chain, tmp_path):
     (line,) = RUNS["demo"]
     assert run("demo", line, {}, tmp_path) == 0
     config, views, _ = chain.given
-    assert config.enclose.reference == config.triangulate.reference == "38"
-    assert config.rounds.scales == ()
+    assert config.enclose.reference == "38"
+    assert config.scales == (0.5,)
     assert max(views.images.shape[-2:]) == 60
+
+
+def test_the_reference_reaches_every_stage_that_has_one():
+    published = parse("demo", ["--preset", "paper", "--reference", "38"]).config
+    assert published.enclose.reference == published.triangulate.reference == "38"
 
 
 def told(command, capsys):
@@ -132,8 +138,8 @@ def test_no_option_is_without_a_run(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     names = told(command, capsys) - {"-h", "--help"}
     if command in ("reconstruct", "demo"):
-        settings = {name for field in leaves(PimperConfig()) for name in spelt(field)}
-        assert settings <= names
+        settings = {name for field in leaves(CoarseToFineConfig()) for name in spelt(field)}
+        assert settings <= names  # those of the other chain come with its presets
         # Those of a stage have a test below; those of the run are options like others.
         names -= {name for name in settings if "." in name}
     given = " ".join(RUNS[command]).replace("{tiny}", TINY).replace("-o ", "--out ").split()
@@ -203,10 +209,13 @@ def words(leaf, value):
     return [spelt(leaf)[0], text]
 
 
-def test_every_setting_of_every_stage_reaches_the_configuration():
-    left = list(leaves(PimperConfig()))
+@pytest.mark.parametrize("chain", [CoarseToFineConfig, PublishedConfig])
+def test_every_setting_of_every_stage_reaches_the_configuration(chain, tmp_path):
+    preset = tmp_path / "defaults.yaml"
+    preset.write_text(f"chain: {chain().chain}\n")
+    left = list(leaves(chain()))
     while left:  # some settings exclude one another: those refused come in the next line
-        config, line, refused = PimperConfig(), [], []
+        config, line, refused = chain(), ["--preset", str(preset)], []
         for leaf in left:
             for value in rivals(leaf):
                 try:

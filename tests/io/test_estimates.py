@@ -5,18 +5,18 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.errors import InputError
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of, read_estimate
 from pimper_torch.io.meshes import write_ply
-from pimper_torch.pipeline import PimperConfig
 
 
 @pytest.fixture
 def folder(reconstruction, tmp_path, monkeypatch):
     draw = results.draw_overview
     monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
-    results.write_result(reconstruction, PimperConfig(), tmp_path / "out")
+    results.write_result(reconstruction, CoarseToFineConfig(), tmp_path / "out")
     return tmp_path / "out"
 
 

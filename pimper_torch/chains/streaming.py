@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 from threading import Lock
 from typing import Protocol, runtime_checkable
 
-from torch import nn
-
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.sources import Sources
 from pimper_torch.photometry.factorize import Illumination
@@ -55,6 +53,7 @@ class Prepares(Protocol):
         """Prepare them."""
 
 
+Factorizing = Callable[[PatchViews], PhotometricPatches]
 Warping = Callable[[Views, Cameras, PatchSet, Sources | None], PatchViews]
 Sweeping = Callable[[Views, Cameras, PatchViews, PhotometricPatches, Sources | None], SweptPatches]
 
@@ -71,7 +70,7 @@ class _Bucket(Record):
 
 def photometry_and_heights(
     warp: Warping,
-    factorize: nn.Module,
+    factorize: Factorizing,
     sweep: Sweeping,
     views: Views,
     cameras: Cameras,

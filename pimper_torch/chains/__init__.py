@@ -1,0 +1,1 @@
+"""The two ways through the stages: coarse to fine, and as published."""

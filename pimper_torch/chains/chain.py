@@ -1,0 +1,161 @@
+"""What both chains have in common: a run is a sequence of steps, and the last one's mesh."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import nn
+
+from pimper_torch.config import require
+from pimper_torch.kernels.switch import Kernels, compile_all, using
+from pimper_torch.records import (
+    Cameras,
+    CoarseMesh,
+    DepthPatches,
+    Mesh,
+    Outlines,
+    PatchSet,
+    PhotometricPatches,
+    Reconstruction,
+    Record,
+    SparseScene,
+    StageReport,
+    Surface,
+    SweptPatches,
+    Views,
+)
+from pimper_torch.reporting import Observer, Silent, recorded, stage
+from pimper_torch.stage import Stage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Step(Record):
+    """All records of one pass over the facets.
+
+    Attributes:
+        scale: Of the photographs that templates were sampled for; 1 is their own size.
+        last: Whether this step's surface is the result.
+        scene: Cameras, undistorted photographs and the cloud.
+        outlines: Where every view shows the object; ``None`` where everything is.
+        heights: Depth maps of all patches, with their normals, albedo and lights.
+        surface: Joined over all facets, on the subdivided coarse mesh.
+        reports: One of each stage that ran for this step, in order.
+    """
+
+    scale: float
+    last: bool
+    scene: SparseScene
+    outlines: Outlines | None
+    heights: DepthPatches | SweptPatches
+    surface: Surface
+    reports: tuple[StageReport, ...] = ()
+
+    @property
+    def photometric(self) -> PhotometricPatches:
+        """Normals, albedo and lights of every patch."""
+        return self.heights.photometric
+
+    @property
+    def patches(self) -> PatchSet:
+        """The templates."""
+        return self.heights.patches
+
+    @property
+    def coarse(self) -> CoarseMesh:
+        """The facets that the templates stand on."""
+        return self.heights.patches.coarse
+
+
+class Chain(Stage):
+    """A graph of stages from photographs to a mesh.
+
+    Each stage is an attribute; assigning another module that takes and gives the same records
+    swaps it, as naming it to the constructor does: ``CoarseToFine(config, factorize=Mine())``.
+
+    Gradients run from photographs, cameras and coarse mesh through every stage after it. Structure
+    from motion, how the coarse mesh is found, and what is chosen (views, samples, faces, splits)
+    are constants to autograd.
+    """
+
+    reconstruct: Callable[[Views, Path | str | None], SparseScene]
+    outline: Callable[[SparseScene], Outlines | None]
+    decompose: Callable[[CoarseMesh, Cameras, Surface | None, float], PatchSet]
+    extract: Callable[[Surface], Mesh]
+
+    def __init__(self, kernels: Kernels, observer: Observer | None) -> None:
+        super().__init__()
+        self.kernels: Kernels = kernels
+        self.observer = observer or Silent()
+
+    @abstractmethod
+    def passes(
+        self, views: Views, sparse_model: Path | str | None, mesh: Mesh | None
+    ) -> Iterator[Step]:
+        """Run the stages up to the surface; give each pass's records, without reports."""
+
+    def steps(
+        self, views: Views, sparse_model: Path | str | None = None, mesh: Mesh | None = None
+    ) -> Iterator[Step]:
+        """Run the stages up to the surface, pass by pass; takes what :meth:`forward` takes.
+
+        Yields:
+            The records of a pass, as soon as it is done. The next one runs when it is asked for.
+        """
+        passes = self.passes(views, sparse_model, mesh)
+        compiled = self.kernels == "torch"
+        while True:
+            with using(self.kernels), recorded(self, self.observer) as reports:
+                if not compiled:
+                    with stage("compile"):  # next to nothing but for an installation's first run
+                        compile_all()
+                    compiled = True
+                step = next(passes, None)
+            if step is None:
+                return
+            yield step.replace(reports=tuple(reports))
+
+    def forward(
+        self, views: Views, sparse_model: Path | str | None = None, mesh: Mesh | None = None
+    ) -> Reconstruction:
+        """Reconstruct the surface that the photographs show.
+
+        Args:
+            views: Photographs, on the device that everything after structure from motion
+                is to run on.
+            sparse_model: Folder of a COLMAP model of these photographs, used instead of
+                running structure from motion.
+            mesh: A rough surface in that model's frame, of any floating-point type, used
+                instead of the photographs' own.
+
+        Raises:
+            PimperError: What was found at which stage, what was needed, what to do.
+        """
+        steps = self.steps(views, sparse_model, mesh)
+        step = next(steps)
+        reports = list(step.reports)
+        while not step.last:
+            del step  # the next pass needs its memory
+            step = next(steps)
+            reports += step.reports
+        with using(self.kernels), recorded(self, self.observer) as last:
+            found = self.extract(step.surface)
+        return Reconstruction(
+            mesh=found,
+            scene=step.scene,
+            outlines=step.outlines,
+            coarse=step.coarse,
+            patches=step.heights,
+            report=(*reports, *last),
+        )
+
+    def _swap(self, stages: Mapping[str, nn.Module]) -> None:
+        """Put modules in the places of stages.
+
+        Raises:
+            ConfigError: The chain has no stage of that name.
+        """
+        for name, module in stages.items():
+            known = [name for name, _ in self.named_children()]
+            require(name in known, f"the stage {name!r}", module, f"one of {', '.join(known)}")
+            setattr(self, name, module)

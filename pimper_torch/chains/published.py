@@ -1,0 +1,109 @@
+"""The published chain: every facet by itself, then all joined."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+from torch import nn
+
+from pimper_torch.alignment.align import Align, AlignConfig
+from pimper_torch.chains.chain import Chain, Step
+from pimper_torch.coarse.enclose import Enclose, EncloseConfig
+from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.integration.integrate import Integrate, IntegrateConfig
+from pimper_torch.kernels.switch import Kernels
+from pimper_torch.meshing.extract import Extract, ExtractConfig
+from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
+from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.patches.warp import Warp, WarpConfig
+from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.radiometry import Encoding
+from pimper_torch.records import (
+    Cameras,
+    CoarseMesh,
+    DepthPatches,
+    Mesh,
+    PatchSet,
+    PatchViews,
+    PhotometricPatches,
+    SparseScene,
+    Surface,
+    Views,
+)
+from pimper_torch.refinement.refine import Refine, RefineConfig
+from pimper_torch.reporting import Observer
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishedConfig:
+    """The settings of every stage of the published chain, in the order they run.
+
+    Attributes:
+        chain: Which chain these are the settings of.
+        kernels: Whether compiled kernels stand in for torch on the CPU, where no gradients are
+            asked for (numba), or nowhere (torch).
+        photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
+    """
+
+    chain: ClassVar[str] = "published"
+    kernels: Kernels = "numba"
+    photographs: Encoding = field(default_factory=Encoding)
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
+    outline: OutlineConfig = field(default_factory=OutlineConfig)
+    triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
+    enclose: EncloseConfig = field(default_factory=EncloseConfig)
+    decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
+    warp: WarpConfig = field(default_factory=WarpConfig)
+    factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
+    integrate: IntegrateConfig = field(default_factory=IntegrateConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    extract: ExtractConfig = field(default_factory=ExtractConfig)
+
+
+class Published(Chain):
+    """Facets between points of the cloud, depth of each by its normals, then all joined.
+
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, piecewise dense 3D reconstruction from
+    multi-view and multi-illumination images, 2015.
+    """
+
+    def __init__(
+        self,
+        config: PublishedConfig | None = None,
+        observer: Observer | None = None,
+        cache: Path | str | None = None,
+        **stages: nn.Module,
+    ) -> None:
+        self.config = config = config or PublishedConfig()
+        super().__init__(config.kernels, observer)
+        self.reconstruct = Reconstruct(config.reconstruct, cache)
+        self.outline = Outline(config.outline)
+        self.triangulate: Callable[[SparseScene], CoarseMesh] = Triangulate(config.triangulate)
+        self.enclose: Callable[[SparseScene, Mesh | None], CoarseMesh] = Enclose(config.enclose)
+        self.decompose = Decompose(config.decompose)
+        self.warp: Callable[[Views, Cameras, PatchSet], PatchViews] = Warp(config.warp)
+        self.factorize: Callable[[PatchViews], PhotometricPatches] = Factorize(config.factorize)
+        self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate(config.integrate)
+        self.align: Callable[[DepthPatches], DepthPatches] = Align(config.align)
+        self.refine: Callable[[DepthPatches], Surface] = Refine(config.refine)
+        self.extract = Extract(config.extract)
+        self._swap(stages)
+
+    def passes(
+        self, views: Views, sparse_model: Path | str | None, mesh: Mesh | None
+    ) -> Iterator[Step]:
+        """Run once through the stages."""
+        scene = self.reconstruct(views, sparse_model)
+        outlines = self.outline(scene)
+        scene = masked(scene, outlines, self.config.outline.margin)
+        coarse = self.triangulate(scene) if mesh is None else self.enclose(scene, mesh)
+        patches = self.decompose(coarse, scene.cameras, None, 1.0)
+        seen = self.warp(scene.views, scene.cameras, patches)
+        heights = self.align(self.integrate(self.factorize(seen)))
+        surface = self.refine(heights)
+        yield Step(
+            scale=1.0, last=True, scene=scene, outlines=outlines, heights=heights, surface=surface
+        )
