@@ -343,7 +343,7 @@ def _sweep(
     return Probe(function=function, inputs=inputs, scales=scales)
 
 
-def _fuse(stage: nn.Module, swept: Any, rims: Any) -> Probe:  # noqa: ANN401
+def _fuse(stage: nn.Module, swept: Any, rims: Any, expected: bool) -> Probe:  # noqa: ANN401
     photometric = swept.photometric
     patches = photometric.patches
     spacing, cloud = _spacing(patches), patches.coarse.points
@@ -370,6 +370,7 @@ def _fuse(stage: nn.Module, swept: Any, rims: Any) -> Probe:  # noqa: ANN401
                 buckets=heights,
             ),
             rims,
+            expected,
         )
         return _of_surface(surface)
 
