@@ -19,8 +19,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from pimper_torch.alignment.align import Align, AlignConfig
 from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.paper.alignment.align import Align, AlignConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,

@@ -14,18 +14,18 @@ from pathlib import Path
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.alignment.align import Align, AlignConfig
 from pimper_torch.chains.published import Published, PublishedConfig
 from pimper_torch.config import build
-from pimper_torch.datasets import read_rendered
+from pimper_torch.evidence.datasets import read_rendered
+from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
+from pimper_torch.evidence.metrics.relative import angles_deg, meet_in_view
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.io.photographs import load_views
 from pimper_torch.meshing.extract import Extract
-from pimper_torch.metrics import pair_views, similarity_between_cameras
-from pimper_torch.metrics.relative import angles_deg, meet_in_view
+from pimper_torch.paper.alignment.align import Align, AlignConfig
+from pimper_torch.paper.refinement.refine import Refine, RefineConfig
 from pimper_torch.records import Capture, DepthPatches, Mesh, SparseScene
-from pimper_torch.refinement.refine import Refine, RefineConfig
 
 # The chain that aligns patches, whose figures the README gives.
 SETTINGS = {

@@ -18,13 +18,7 @@ import torch
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
-from pimper_torch.photometric_stereo.chromaticity import chromaticity_groups
-from pimper_torch.photometric_stereo.colour_profiles import resolve_by_colour_profiles
-from pimper_torch.photometric_stereo.diffuse_maxima import resolve_by_diffuse_maxima
-from pimper_torch.photometric_stereo.perspective import factorize_in_perspective
-from pimper_torch.photometry.bas_relief import BasRelief, align_reliefs
-from pimper_torch.scenes.one_view import (
+from pimper_torch.evidence.scenes.one_view import (
     OneView,
     ball,
     bumps,
@@ -33,6 +27,12 @@ from pimper_torch.scenes.one_view import (
     photograph,
     regions,
 )
+from pimper_torch.photometry.bas_relief import BasRelief, align_reliefs
+from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
+from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
+from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles
+from pimper_torch.single_view.photometric_stereo.diffuse_maxima import resolve_by_diffuse_maxima
+from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 
 NOISES = (0.0, 0.005, 0.01)
 VIEWS = (10, 20)

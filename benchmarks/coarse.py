@@ -28,14 +28,14 @@ from pimper_torch.coarse.oriented import OrientedPoints, joined_points
 from pimper_torch.coarse.outlined import closed_surface, poisson, seen_surface, supports
 from pimper_torch.coarse.select import frontal_view
 from pimper_torch.coarse.trim import evidence, point_distances
-from pimper_torch.datasets.rendered import read_rendered
 from pimper_torch.errors import PimperWarning
+from pimper_torch.evidence.datasets.rendered import read_rendered
+from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
+from pimper_torch.evidence.metrics.distances import TrueSurface
+from pimper_torch.evidence.metrics.in_view import compare_along_rays
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views
-from pimper_torch.metrics import pair_views, similarity_between_cameras
-from pimper_torch.metrics.distances import TrueSurface
-from pimper_torch.metrics.in_view import compare_along_rays
 from pimper_torch.records import Mesh, Outlines, RimPoints, SparseScene
 from pimper_torch.rims.constraints import Rim
 from pimper_torch.sfm.reconstruct import Reconstruct

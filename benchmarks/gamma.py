@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.datasets import read_uw_ps, read_yale_b
+from pimper_torch.evidence.datasets import read_uw_ps, read_yale_b
 from pimper_torch.photometry.gamma import GammaEstimate, estimate_gamma, gamma_of_photographs
 from pimper_torch.radiometry import Gamma, Linear, Srgb
 

@@ -13,8 +13,8 @@ import warnings
 import torch
 
 import pimper_torch as pt
-from pimper_torch.bench.gradients import probes, small_scene
 from pimper_torch.errors import PimperWarning
+from pimper_torch.evidence.bench.gradients import probes, small_scene
 
 
 def main() -> None:

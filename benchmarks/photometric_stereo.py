@@ -20,20 +20,20 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.datasets.one_viewpoint import read_uw_ps, read_yale_b
 from pimper_torch.errors import PimperError
+from pimper_torch.evidence.datasets.one_viewpoint import read_uw_ps, read_yale_b
+from pimper_torch.evidence.scenes import Body, SensorConfig, render_bodies
+from pimper_torch.evidence.scenes.bodies import Texture
+from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.photometric_stereo import PhotometricStereo, photometric_stereo
-from pimper_torch.photometric_stereo.methods import METHODS
 from pimper_torch.photometry.ambiguity import align_factorizations
 from pimper_torch.photometry.bas_relief import BasRelief, align_reliefs
 from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.radiometry import linear_from_srgb
-from pimper_torch.scenes import Body, SensorConfig, render_bodies
-from pimper_torch.scenes.bodies import Texture
-from pimper_torch.scenes.cameras import look_at, pinholes
-from pimper_torch.scenes.lights import Lights
+from pimper_torch.single_view.photometric_stereo import PhotometricStereo, photometric_stereo
+from pimper_torch.single_view.photometric_stereo.methods import METHODS
 
 HEIGHT = 240  # pixels of the rendered photographs
 LAMPS, SPREAD_DEG = 20, 60.0

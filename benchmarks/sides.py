@@ -19,8 +19,8 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.evidence.metrics.closedness import Closedness, closedness
 from pimper_torch.io.estimates import read_estimate
-from pimper_torch.metrics.closedness import Closedness, closedness
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viz.render import bounding_box, crop, shade
 

@@ -36,15 +36,15 @@ from typing import Any
 import torch
 from PIL import Image
 
-from pimper_torch.bench.machine import this_machine
-from pimper_torch.bench.memory import peak_memory
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, parse
+from pimper_torch.evidence.bench.machine import this_machine
+from pimper_torch.evidence.bench.memory import peak_memory
+from pimper_torch.evidence.scenes.config import SceneConfig
+from pimper_torch.evidence.scenes.write import render_scene
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import write_result
 from pimper_torch.records import StageReport, Views
-from pimper_torch.scenes.config import SceneConfig
-from pimper_torch.scenes.write import render_scene
 
 SCENES = ("mug", "jar", "balls", "potatoes", "pair")
 SIZES = (0.5, math.sqrt(0.5), 1.0)  # of photographs: 1, 2 and 4 times the samples

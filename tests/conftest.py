@@ -38,6 +38,7 @@ def reconstruction():
     """A bump on a square seen by three cameras: a small, complete result."""
     from torch.nn.functional import normalize
 
+    from pimper_torch.evidence.scenes.cameras import arc_cameras
     from pimper_torch.geometry.frames import rigid
     from pimper_torch.geometry.projection import project
     from pimper_torch.geometry.surfaces import vertex_normals
@@ -57,7 +58,6 @@ def reconstruction():
         Templates,
         Views,
     )
-    from pimper_torch.scenes.cameras import arc_cameras
 
     generator = torch.Generator().manual_seed(75)
     cameras = arc_cameras(3, width=60, height=40, focal_px=90.0, distance=6.0, span_deg=30.0)
@@ -163,6 +163,11 @@ def lift():
     """
     from types import SimpleNamespace
 
+    from pimper_torch.evidence.scenes import render_shape
+    from pimper_torch.evidence.scenes.cameras import arc_cameras
+    from pimper_torch.evidence.scenes.lights import wandering_lights
+    from pimper_torch.evidence.scenes.noise import random_speckle
+    from pimper_torch.evidence.scenes.shapes import Plane
     from pimper_torch.geometry.frames import rotate
     from pimper_torch.patches.decompose import Decompose, DecomposeConfig
     from pimper_torch.patches.warp import Warp
@@ -174,11 +179,6 @@ def lift():
         PhotometricPatches,
         Photometry,
     )
-    from pimper_torch.scenes import render_shape
-    from pimper_torch.scenes.cameras import arc_cameras
-    from pimper_torch.scenes.lights import wandering_lights
-    from pimper_torch.scenes.noise import random_speckle
-    from pimper_torch.scenes.shapes import Plane
 
     slant = (0.15, -0.1, 1.0)
 
@@ -242,3 +242,42 @@ def lift():
         )
 
     return make
+
+
+@pytest.fixture(scope="session")
+def dtu(tmp_path_factory):
+    """Write scan 9 of three places, seen under lights 0 and 3, with the files of its protocol."""
+    import numpy as np
+    import scipy.io
+    from PIL import Image
+
+    from pimper_torch.evidence.scenes.cameras import arc_cameras
+    from pimper_torch.evidence.scenes.meshes import icosphere
+    from pimper_torch.records import Mesh
+
+    cameras = arc_cameras(3, width=1600, height=1200, focal_px=2000.0, distance=600.0)
+    root = tmp_path_factory.mktemp("dtu")
+    photographs, calibration = root / "Rectified" / "scan9", root / "Calibration" / "cal18"
+    for folder in (photographs, calibration, root / "Points" / "stl", root / "ObsMask"):
+        folder.mkdir(parents=True)
+    K = cameras.intrinsics.clone()
+    K[:, :2, 2] -= 0.5
+    picture = Image.fromarray(np.full((1200, 1600, 3), 90, dtype=np.uint8))
+    for place in (1, 2, 3):
+        for light in (0, 3):
+            picture.save(photographs / f"rect_{place:03d}_{light}_r5000.png")
+        matrix = K[place - 1] @ cameras.cam_from_world[place - 1, :3]
+        np.savetxt(calibration / f"pos_{place:03d}.txt", matrix.numpy())
+    vertices, _ = icosphere(4)
+    cloud = Mesh(vertices_world=10 * vertices, faces=torch.zeros(0, 3, dtype=torch.long))
+    rows = "\n".join(" ".join(f"{x:.6f}" for x in row) for row in cloud.vertices_world.tolist())
+    properties = "\n".join(f"property float {axis}" for axis in "xyz")
+    (root / "Points" / "stl" / "stl009_total.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(cloud.vertices_world)}\n{properties}\n"
+        f"end_header\n{rows}\n"
+    )
+    corners = np.array([[-12.0] * 3, [12.0] * 3])
+    mask = {"ObsMask": np.ones((25, 25, 25)), "BB": corners, "Res": np.array([[1.0]])}
+    scipy.io.savemat(root / "ObsMask" / "ObsMask9_10.mat", mask)
+    scipy.io.savemat(root / "ObsMask" / "Plane9.mat", {"P": np.array([[0.0], [0], [1], [20]])})
+    return root

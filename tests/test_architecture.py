@@ -14,9 +14,9 @@ import pimper_torch
 PACKAGE = Path(pimper_torch.__file__).parent
 ROOT = Path(__file__).parents[1]
 
-# A room imports from rooms above it in this list. viz stands above io, which draws the
-# contact sheet of a result with it, and both above the evidence: scenes, datasets, metrics
-# and baselines read and write files too.
+# A room imports from rooms above it in this list: the core never from the wings, which come last
+# (the command line names its verbs there, and imports one when it is called). viz stands above io,
+# which draws the contact sheet of a result with it.
 ROOMS = [
     "errors",
     "config",
@@ -36,22 +36,16 @@ ROOMS = [
     "patches",
     "photometry",
     "sweep",
-    "integration",
-    "alignment",
     "fusion",
-    "refinement",
+    "paper",
     "meshing",
     "reporting",
     "chains",
     "viz",
     "io",
-    "photometric_stereo",
-    "scenes",
-    "datasets",
-    "metrics",
-    "baselines",
-    "bench",
     "cli",
+    "single_view",
+    "evidence",
 ]
 
 SOLE_IMPORTERS = {
@@ -63,7 +57,7 @@ SOLE_IMPORTERS = {
     "cv2": {"outlines/opencv.py"},
     "numba": {"kernels/switch.py"},
     "yaml": {"config.py"},
-    "tyro": {"cli/"},
+    "tyro": {"cli/", "evidence/cli/", "single_view/cli/"},
     "matplotlib": {"viz/"},
 }
 

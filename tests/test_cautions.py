@@ -3,9 +3,9 @@
 import pytest
 from torch import nn
 
-from pimper_torch.bench.gradients import small_scene
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.errors import PimperWarning, caution, held
+from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.stage import Given
 
 

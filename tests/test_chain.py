@@ -10,9 +10,21 @@ from torch import nn
 import pimper_torch as pt
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.errors import PimperWarning
+from pimper_torch.evidence.metrics import compare_in_view, pair_views, similarity_between_cameras
+from pimper_torch.evidence.metrics.relative import ViewComparison, angles_deg
+from pimper_torch.evidence.scenes import (
+    RenderedScene,
+    potato_on_table,
+    render_shape,
+    save_masks,
+    save_photographs,
+)
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.lights import wandering_lights
+from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.shapes import Plane, Shape, Sphere
+from pimper_torch.evidence.scenes.sparse import sparse_scene
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.metrics import compare_in_view, pair_views, similarity_between_cameras
-from pimper_torch.metrics.relative import ViewComparison, angles_deg
 from pimper_torch.records import (
     CoarseMesh,
     Mesh,
@@ -22,18 +34,6 @@ from pimper_torch.records import (
     SweptPatches,
 )
 from pimper_torch.rims.constraints import Rims
-from pimper_torch.scenes import (
-    RenderedScene,
-    potato_on_table,
-    render_shape,
-    save_masks,
-    save_photographs,
-)
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.lights import wandering_lights
-from pimper_torch.scenes.noise import random_speckle
-from pimper_torch.scenes.shapes import Plane, Shape, Sphere
-from pimper_torch.scenes.sparse import sparse_scene
 from pimper_torch.stage import Given
 
 log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figures

@@ -16,14 +16,14 @@ import pimper_torch
 from pimper_torch.chains import presets
 from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
+from pimper_torch.evidence.scenes import RenderedScene, render_shape, save_photographs, sparse_scene
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.lights import wandering_lights
+from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.io import results
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.scenes import RenderedScene, render_shape, save_photographs, sparse_scene
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.lights import wandering_lights
-from pimper_torch.scenes.noise import random_speckle
-from pimper_torch.scenes.shapes import Sphere
 from pimper_torch.sfm.reconstruct import Reconstruct
 
 PACKAGE = Path(pimper_torch.__file__).parent

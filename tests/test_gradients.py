@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import pimper_torch as pt
-from pimper_torch.bench.gradients import probes, small_scene
-from pimper_torch.metrics.derivatives import check_derivatives
+from pimper_torch.evidence.bench.gradients import probes, small_scene
+from pimper_torch.evidence.metrics.derivatives import check_derivatives
 
 # What is promised of the chain whole; single stages do far better. Kinks that are too small to tell
 # from slopes, at borders of pixels, are left.

@@ -3,8 +3,8 @@ import mmap
 import pytest
 
 import pimper_torch as pt
-from pimper_torch.bench.gradients import small_scene
 from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.memory import bytes_of, require_memory, resident_bytes
 from pimper_torch.patches.decompose import Decompose
 

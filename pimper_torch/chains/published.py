@@ -7,14 +7,15 @@ from typing import ClassVar
 
 from torch import nn
 
-from pimper_torch.alignment.align import Align, AlignConfig
 from pimper_torch.chains.chain import Chain, Step
 from pimper_torch.coarse.enclose import Enclose, EncloseConfig
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
-from pimper_torch.integration.integrate import Integrate, IntegrateConfig
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
+from pimper_torch.paper.alignment.align import Align, AlignConfig
+from pimper_torch.paper.integrate import Integrate, IntegrateConfig
+from pimper_torch.paper.refinement.refine import Refine, RefineConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
@@ -31,7 +32,6 @@ from pimper_torch.records import (
     Surface,
     Views,
 )
-from pimper_torch.refinement.refine import Refine, RefineConfig
 from pimper_torch.reporting import Observer
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 

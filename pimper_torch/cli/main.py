@@ -43,11 +43,11 @@ albedo and light.
 _COMMANDS = {
     "reconstruct": "pimper_torch.cli.run",
     "demo": "pimper_torch.cli.run",
-    "render": "pimper_torch.cli.render",
-    "evaluate": "pimper_torch.cli.evaluate",
-    "bench": "pimper_torch.cli.bench",
-    "convert": "pimper_torch.cli.convert",
-    "gamma": "pimper_torch.cli.gamma",
+    "render": "pimper_torch.evidence.cli.render",
+    "evaluate": "pimper_torch.evidence.cli.evaluate",
+    "bench": "pimper_torch.evidence.cli.bench",
+    "convert": "pimper_torch.evidence.cli.convert",
+    "gamma": "pimper_torch.single_view.cli.gamma",
 }
 _READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}
 _FAILED, _INTERRUPTED = 2, 130

@@ -228,6 +228,14 @@ def _is_dark(
     return dark
 
 
+def read_mask(path: Path, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
+    """Read a drawn mask, true where it is brighter than half; shrunk as its photographs are."""
+    drawn = decode(path).samples.amax(dim=0) >= OPAQUE
+    if max_size_px == 0:
+        return drawn
+    return resized_mask(drawn.float(), *shrunk_size(read_header(path), max_size_px))
+
+
 def _read_mask(path: Path, photograph: Path, header: Header) -> Float[Tensor, "height width"]:
     """Give 1 on the object, 0 off it, the way the photograph is turned."""
     drawn = _on_object(decode(path))

@@ -5,13 +5,13 @@ from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.enclose import EncloseConfig
+from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.evidence.scenes.render import render_shape
+from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.sparse import sparse_scene
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Outlines
-from pimper_torch.scenes.cameras import look_at, pinholes
-from pimper_torch.scenes.render import render_shape
-from pimper_torch.scenes.shapes import Sphere
-from pimper_torch.scenes.sparse import sparse_scene
 
 SETTINGS = EncloseConfig(
     num_facets=600,

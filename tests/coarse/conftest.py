@@ -1,11 +1,11 @@
 import pytest
 import torch
 
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.render import render_shape
+from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.sparse import sparse_scene
 from pimper_torch.records import SparseScene
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.render import render_shape
-from pimper_torch.scenes.shapes import Sphere
-from pimper_torch.scenes.sparse import sparse_scene
 from tests.coarse.ball import all_round, photographed
 
 

@@ -8,6 +8,7 @@ from torch.testing import assert_close
 from pimper_torch.coarse.adapt import AdaptConfig, adapt, within
 from pimper_torch.coarse.fill import delaunay
 from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import (
     barycentric_2d,
@@ -17,7 +18,6 @@ from pimper_torch.geometry.surfaces import (
 )
 from pimper_torch.outlines.hull import Hull
 from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
-from pimper_torch.scenes.meshes import icosphere
 
 SPACING = 0.02
 

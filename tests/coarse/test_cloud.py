@@ -3,10 +3,10 @@ from torch.testing import assert_close
 
 from pimper_torch.coarse.cloud import facets_under, point_covariances
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.render import render_shape
-from pimper_torch.scenes.shapes import Sphere
-from pimper_torch.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.render import render_shape
+from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.sparse import sparse_scene
 
 
 def noisy_cloud(noise_px, seed, span_deg=50.0):

@@ -11,11 +11,11 @@ from pimper_torch.coarse.trim import (
     too_far,
     without_small_holes,
 )
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.meshes import icosphere, table
-from pimper_torch.scenes.render import render_shape
-from pimper_torch.scenes.shapes import Sphere
-from pimper_torch.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.meshes import icosphere, table
+from pimper_torch.evidence.scenes.render import render_shape
+from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.sparse import sparse_scene
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)

@@ -6,12 +6,12 @@ from torch.testing import assert_close
 from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.enclose import Enclose, EncloseConfig, two_faces_an_edge
 from pimper_torch.errors import ConfigError, InputError, ReconstructionError
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals, face_pairs
 from pimper_torch.records import Mesh
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.meshes import icosphere
 from tests.coarse.ball import SETTINGS, photographed
 
 

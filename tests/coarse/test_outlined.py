@@ -9,13 +9,13 @@ from pimper_torch.coarse.oriented import no_points
 from pimper_torch.coarse.outlined import OutlinedConfig, closed_surface, seen_surface
 from pimper_torch.coarse.trim import Evidence
 from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals, face_pairs
 from pimper_torch.records import Support
 from pimper_torch.rims.constraints import Rim
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.meshes import icosphere
 from tests.coarse.ball import SETTINGS, outlines_of, photographed
 
 SMALL_HOLES = OutlinedConfig(hole_px=0.3**0.5)  # closed up to an area of 0.3 with pixels of 1

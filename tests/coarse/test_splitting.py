@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.coarse.splitting import mark_edges, split_edges
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.surfaces import face_edges, face_normals
-from pimper_torch.scenes.meshes import icosphere
 
 
 def areas(vertices, faces):

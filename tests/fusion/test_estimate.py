@@ -2,12 +2,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.fusion.estimate import fuse_evidence, noise_factor
 from pimper_torch.fusion.evidence import Evidence
 from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.singular import SingularSystemError
-from pimper_torch.metrics.derivatives import check_derivatives
 
 COUNT = 900
 

@@ -3,6 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.fusion.contacts import Ground, cloud_points, passing, rim_tangents
 from pimper_torch.fusion.evidence import (
     Common,
@@ -14,7 +15,6 @@ from pimper_torch.fusion.evidence import (
 )
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import face_edges
-from pimper_torch.metrics.derivatives import check_derivatives
 from pimper_torch.records import FacetPoints, RimPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.geometry import projection
 from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
-from pimper_torch.scenes.cameras import arc_cameras
 
 
 @pytest.fixture

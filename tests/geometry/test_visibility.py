@@ -2,12 +2,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.meshes import icosphere, table
+from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.visibility import RayCaster, ambient_occlusion, cast_view
 from pimper_torch.records import Mesh
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.meshes import icosphere, table
-from pimper_torch.scenes.shapes import Sphere
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.errors import OutputError
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
@@ -22,7 +23,6 @@ from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Mesh, Outlines
-from pimper_torch.scenes.meshes import icosphere
 from pimper_torch.viz.maps import albedo_scale
 
 

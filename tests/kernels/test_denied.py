@@ -3,8 +3,8 @@ import torch
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.matching import Level
 from pimper_torch.coarse.oriented import denied
+from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.kernels.switch import using
-from pimper_torch.scenes.cameras import arc_cameras
 
 
 def test_points_are_denied_by_as_many_views_as_torch_says():

@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.coarse.matching import Level, Matcher, Windows, pair
+from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.kernels.switch import using
-from pimper_torch.scenes.cameras import arc_cameras
 
 OFFSETS = [-0.2, -0.003, 0.0, 0.004, 0.05]
 

@@ -3,11 +3,11 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.meshing.simplify import Bounds, simplify, with_few_faces
 from pimper_torch.records import Mesh
-from pimper_torch.scenes.meshes import icosphere
 
 
 def square(side, height):

@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.records import Lens, SparseScene, Views
-from pimper_torch.scenes.cameras import arc_cameras
 
 # The ball stands on the plane z = 0.
 CENTER, RADIUS = torch.tensor([0.0, 0.0, 0.5]), 0.5

@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.outlines.hull import silhouette, visual_hull
 from pimper_torch.records import Cameras, Outlines
-from pimper_torch.scenes.cameras import look_at, pinholes
 
 BOX = torch.tensor([[-2.0, -2, -2], [2, 2, 2]])
 

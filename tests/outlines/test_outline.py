@@ -156,7 +156,7 @@ def test_the_table_is_the_supporting_plane(staged, generator):
 
 
 def test_points_without_a_plane_have_none(generator):
-    from pimper_torch.scenes.cameras import arc_cameras
+    from pimper_torch.evidence.scenes.cameras import arc_cameras
 
     cameras = arc_cameras(5, width=80, height=60, focal_px=90.0, distance=4.0).to(torch.float32)
     points = torch.randn(500, 3, generator=generator)

@@ -1,11 +1,11 @@
 import pytest
 import torch
 
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.render import render_shape
+from pimper_torch.evidence.scenes.rendered import RenderedScene
+from pimper_torch.evidence.scenes.shapes import Plane
 from pimper_torch.records import CoarseMesh, Mesh
-from pimper_torch.scenes.cameras import arc_cameras
-from pimper_torch.scenes.render import render_shape
-from pimper_torch.scenes.rendered import RenderedScene
-from pimper_torch.scenes.shapes import Plane
 
 TILTED = Plane(point=(0.0, 0.0, 0.0), normal=(0.2, -0.1, 1.0))
 

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.metrics.derivatives import check_derivatives
+from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.manifolds import Cone, Free, SecondOrder

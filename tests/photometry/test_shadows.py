@@ -4,11 +4,11 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from pimper_torch.evidence.scenes.meshes import icosphere, join, moved, table
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.photometry.light_field import LightField
 from pimper_torch.photometry.shadows import cast_shadows, cast_shadows_on_rasters
 from pimper_torch.records import Mesh
-from pimper_torch.scenes.meshes import icosphere, join, moved, table
 
 RADIUS, HEIGHT = 0.5, 1.2  # of the ball, above the plane z = 0
 

@@ -5,9 +5,9 @@ import jaxtyping
 import pytest
 import torch
 
+from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.records import Cameras, Record, SparseScene, Views
 from pimper_torch.records.patches import Templates
-from pimper_torch.scenes.cameras import arc_cameras
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Cameras, Outlines
-from pimper_torch.scenes.cameras import look_at, pinholes
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 120, 100, 180.0, 5.0
 PIXEL = DISTANCE / FOCAL  # at the origin

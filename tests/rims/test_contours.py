@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.metrics.relative import angles_deg
+from pimper_torch.evidence.metrics.relative import angles_deg
 from pimper_torch.rims.contours import RimConfig, rim_rays
 from tests.rims.shapes import PIXEL, ball, nearest_to, outlines_of, ring
 

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.metrics.relative import angles_deg
+from pimper_torch.evidence.metrics.relative import angles_deg
 from pimper_torch.outlines.hull import visual_hull
 from pimper_torch.rims.contours import rim_rays
 from pimper_torch.rims.touching import TouchConfig, ambiguous, rim_points

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
+from pimper_torch.evidence.scenes.cameras import FRONT, UP, arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras
-from pimper_torch.scenes.cameras import FRONT, UP, arc_cameras
 from pimper_torch.sfm.at_rest import Pair, Rest, find_rest
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0

@@ -2,9 +2,9 @@ import dataclasses
 
 import torch
 
+from pimper_torch.evidence.metrics.similarity import similarity_between_points
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.projection import project
-from pimper_torch.metrics.similarity import similarity_between_points
 from pimper_torch.sfm.bundling import bundle
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.reprojection import observation_errors

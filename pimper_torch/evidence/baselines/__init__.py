@@ -1,0 +1,23 @@
+"""Rivals, to be run beside the method on the same scene."""
+
+from pimper_torch.evidence.baselines.colmap_dense import ColmapDense, ColmapDenseConfig
+from pimper_torch.evidence.baselines.global_stereo import GlobalStereo, GlobalStereoConfig
+from pimper_torch.evidence.baselines.lim import Lim, LimConfig
+from pimper_torch.evidence.baselines.openmvs import OpenMvs, OpenMvsConfig
+from pimper_torch.evidence.baselines.pmvs import Pmvs, PmvsConfig
+from pimper_torch.evidence.baselines.smoothed import Smoothed, SmoothedConfig
+
+__all__ = [
+    "ColmapDense",
+    "ColmapDenseConfig",
+    "GlobalStereo",
+    "GlobalStereoConfig",
+    "Lim",
+    "LimConfig",
+    "OpenMvs",
+    "OpenMvsConfig",
+    "Pmvs",
+    "PmvsConfig",
+    "Smoothed",
+    "SmoothedConfig",
+]

@@ -1,0 +1,171 @@
+"""A scene as files that multi-view stereo programs read, and their surface as an estimate.
+
+Photographs go by their number in the files: programs stumble over spaces and folders in
+names. What SfM undistorted is written, with its pinholes, so that no program has lenses to
+model: all see the very photographs and cameras that our own stages see.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from pimper_torch.errors import InputError, ReconstructionError
+from pimper_torch.evidence.baselines.external import last_lines
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import to_bytes
+from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
+
+
+def write_photographs(scene: SparseScene, folder: Path, suffix: str) -> tuple[str, ...]:
+    """Write the undistorted photographs as 8-bit sRGB colour, saturated at 1.
+
+    Args:
+        scene: Any; padding is cut off.
+        folder: Made if it is not there.
+        suffix: Of a format without loss, ``.png`` or ``.ppm``.
+
+    Returns:
+        The files' names, ``00000000.png`` and so on, in the order of the views.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = []
+    for index, (image, (width, height)) in enumerate(
+        zip(scene.views.images, scene.cameras.sizes_px.tolist(), strict=True)
+    ):
+        encoded = to_bytes(image[:, :height, :width].detach()).expand(3, -1, -1)
+        names.append(f"{index:08d}{suffix}")
+        Image.fromarray(encoded.movedim(0, -1).cpu().numpy()).save(folder / names[-1])
+    return tuple(names)
+
+
+def write_masks(scene: SparseScene, folder: Path, suffix: str) -> bool:
+    """Write the object's masks, white on the object, as ``00000000`` with the suffix.
+
+    Returns:
+        False, and nothing is written, where nobody drew any.
+    """
+    if scene.views.masks is None:
+        return False
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, (mask, (width, height)) in enumerate(
+        zip(scene.views.masks, scene.cameras.sizes_px.tolist(), strict=True)
+    ):
+        white = 255 * mask[:height, :width].cpu().numpy().astype(np.uint8)
+        Image.fromarray(white).save(folder / f"{index:08d}{suffix}")
+    return True
+
+
+def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path) -> None:
+    """Write pinholes and cloud as a COLMAP model in text, which every program reads.
+
+    Every view has a camera of its own, number and image number one more than the view's.
+    Observations are put where the pinholes see their points. Points that no view sees are
+    left out.
+
+    Args:
+        scene: Any.
+        names: Of the written photographs, one a view.
+        folder: Gets ``cameras.txt``, ``images.txt`` and ``points3D.txt``.
+
+    Raises:
+        InputError: No view sees a point; stereo programs choose partners and depths by them.
+    """
+    if not len(scene.observation_point):
+        raise InputError(
+            "the scene has no sparse points that a view sees; needed: some, for a stereo program "
+            "chooses its pairs of views and its range of depth by them."
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = scene.cameras
+    poses = cameras.cam_from_world.detach().cpu().double().numpy()
+    intrinsics = cameras.intrinsics.detach().cpu().double().numpy()
+    lens_lines, image_lines = [], []
+    rows_of_view, point_lines = _observations(scene)
+    for index, (K, (width, height)) in enumerate(
+        zip(intrinsics, cameras.sizes_px.tolist(), strict=True)
+    ):
+        params = _numbers([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+        lens_lines.append(f"{index + 1} PINHOLE {width} {height} {params}")
+        x, y, z, w = Rotation.from_matrix(poses[index, :3, :3]).as_quat()
+        pose = _numbers([w, x, y, z, *poses[index, :3, 3]])
+        image_lines += [f"{index + 1} {pose} {index + 1} {names[index]}", rows_of_view[index]]
+    for name, lines in (
+        ("cameras", lens_lines),
+        ("images", image_lines),
+        ("points3D", point_lines),
+    ):
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _observations(scene: SparseScene) -> tuple[list[str], list[str]]:
+    """Give the line of observations of every view, and the line of every observed point."""
+    points = scene.points_world.detach().cpu().double()
+    cameras = scene.cameras
+    pixels, _ = project(
+        points, cameras.cam_from_world.cpu().double(), cameras.intrinsics.cpu().double()
+    )
+    observed = scene.observed.cpu()
+    identifier = torch.cumsum(observed.any(dim=1), dim=0)  # from 1, without the unseen
+    place = torch.cumsum(observed, dim=0) - 1  # in the view's line
+    views = [
+        " ".join(
+            f"{_numbers(pixels[view, point].tolist())} {int(identifier[point])}"
+            for point in torch.nonzero(observed[:, view])[:, 0].tolist()
+        )
+        for view in range(cameras.num_views)
+    ]
+    errors = scene.reprojection_errors_px.detach().cpu().double()
+    errors = torch.where(errors.isfinite(), errors, 0)  # C++ does not read "inf"
+    lines = []
+    for point in torch.nonzero(observed.any(dim=1))[:, 0].tolist():
+        track = " ".join(
+            f"{view + 1} {int(place[point, view])}"
+            for view in torch.nonzero(observed[point])[:, 0].tolist()
+        )
+        where = _numbers(points[point].tolist())
+        error = _numbers([float(errors[point])])
+        lines.append(f"{int(identifier[point])} {where} 128 128 128 {error} {track}")
+    return views, lines
+
+
+def _numbers(values: list[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def read_surface(path: Path, program: str, printed: str) -> Mesh:
+    """Read the mesh or the points that a program left.
+
+    Its colours are dropped: they are radiance under this light, no albedo.
+
+    Raises:
+        ReconstructionError: It left no file, none that can be read, or no points in it.
+    """
+    if not path.is_file():
+        raise ReconstructionError(
+            f"{program} ended without complaint, but left no {path.name}.{last_lines(printed)}"
+        )
+    try:
+        return read_mesh(path).replace(albedo=None, confidence=None)
+    except InputError as error:
+        raise ReconstructionError(
+            f"{program} found no surface: {error}{last_lines(printed)}"
+        ) from error
+
+
+def estimate_of(mesh: Mesh, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
+    """Put a surface in the scene's frame beside the scene's cameras."""
+    like = scene.points_world
+    return Estimate(
+        mesh=mesh.replace(
+            vertices_world=mesh.vertices_world.to(like),
+            faces=mesh.faces.to(like.device),
+            normals_world=None if mesh.normals_world is None else mesh.normals_world.to(like),
+        ),
+        names=scene.views.names,
+        cameras=scene.cameras,
+        reference=scene.views.names[coarse.reference],
+    )

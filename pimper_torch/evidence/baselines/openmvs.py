@@ -1,0 +1,166 @@
+"""OpenMVS, if the user has it: depth maps, Delaunay and graph cut, refinement."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.evidence.baselines.exchange import (
+    estimate_of,
+    read_surface,
+    write_photographs,
+    write_pinhole_model,
+)
+from pimper_torch.evidence.baselines.external import (
+    Deadline,
+    Program,
+    all_cores,
+    run_program,
+    workspace,
+)
+from pimper_torch.progress import report
+from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
+from pimper_torch.stage import Stage
+
+
+def _program(name: str) -> Program:
+    return Program(
+        name=name,
+        variable="PIMPER_OPENMVS",
+        source="https://github.com/cdcseacave/openMVS",
+        places=(Path("/usr/local/bin/OpenMVS"), Path("/usr/bin/OpenMVS")),
+    )
+
+
+INTERFACE = _program("InterfaceCOLMAP")
+DENSIFY = _program("DensifyPointCloud")
+RECONSTRUCT = _program("ReconstructMesh")
+REFINE = _program("RefineMesh")
+
+# Names that the programs give their results when they are left the choice; the same in all
+# versions, which those after ``-o`` are not.
+_SCENE, _DENSE, _MESH = "scene.mvs", "scene_dense.mvs", "scene_dense_mesh.ply"
+_REFINED = ("scene_dense_refine.ply", "scene_dense_mesh_refine.ply")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenMvsConfig:
+    """OpenMVS's settings under its defaults.
+
+    Attributes:
+        folder: With its programs; else PIMPER_OPENMVS, the PATH or its usual place say.
+        resolution_level: How often the photographs are halved for the depth maps.
+        min_resolution_px: Photographs whose longer side would be less are halved less often.
+        refine: Refine the mesh by the photographs at the end; takes long.
+        threads: 0 for all cores.
+        max_minutes: For all its programs together; then they are stopped.
+        keep_in: Folder to leave their files in; else they are removed.
+    """
+
+    folder: Path | None = None
+    resolution_level: int = 1
+    min_resolution_px: int = 640
+    refine: bool = True
+    threads: int = 0
+    max_minutes: float = 120.0
+    keep_in: Path | None = None
+
+    def __post_init__(self) -> None:
+        require(self.resolution_level >= 0, "resolution_level", self.resolution_level, "0 or more")
+        require(
+            self.min_resolution_px >= 1, "min_resolution_px", self.min_resolution_px, "1 or more"
+        )
+        require(self.threads >= 0, "threads", self.threads, "0 or more")
+        require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
+
+
+class OpenMvs(Stage):
+    """Depth maps by patch match, a mesh that explains their visibility, refined."""
+
+    def __init__(self, config: OpenMvsConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or OpenMvsConfig()
+
+    @torch.no_grad()
+    def forward(self, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
+        """Run OpenMVS on the scene's photographs, cameras and cloud.
+
+        Masks are not handed over: not every version takes them.
+
+        Args:
+            scene: Its cloud chooses pairs of views.
+            coarse: Only names the reference view.
+
+        Returns:
+            A mesh in the scene's frame.
+
+        Raises:
+            MissingProgramError: One of its programs is not here.
+            ReconstructionError: One failed, took too long, or found nothing.
+            InputError: The scene has no cloud.
+        """
+        config = self.config
+        wanted = [INTERFACE, DENSIFY, RECONSTRUCT] + [REFINE] * config.refine
+        found = {program: program.find(config.folder) for program in wanted}
+        with workspace("openmvs", config.keep_in) as folder:
+            names = write_photographs(scene, folder / "images", ".png")
+            write_pinhole_model(scene, names, folder / "sparse")
+            mesh = _Run(found, folder, config).surface()
+        return estimate_of(mesh, scene, coarse)
+
+
+class _Run:
+    """The chain of programs in one folder."""
+
+    def __init__(self, found: dict[Program, Path], folder: Path, config: OpenMvsConfig) -> None:
+        self._found, self._folder, self._config = found, folder, config
+        self._deadline = Deadline(config.max_minutes)
+        self._threads = all_cores(config.threads)
+        self._done = 0
+
+    def surface(self) -> Mesh:
+        """Run them all and read the last one's mesh."""
+        config = self._config
+        self._call(INTERFACE, "-i", str(self._folder), leaves=(_SCENE,))
+        self._call(
+            DENSIFY,
+            *("-i", _SCENE),
+            *("--resolution-level", str(config.resolution_level)),
+            *("--min-resolution", str(config.min_resolution_px)),
+            leaves=(_DENSE,),
+        )
+        # Since version 2.3 the dense points are not in the scene's file, and must be named;
+        # before, the option did not exist.
+        points = ("-p", "scene_dense.ply") if self._names_points() else ()
+        path, printed = self._call(RECONSTRUCT, "-i", _DENSE, *points, leaves=(_MESH,))
+        last = RECONSTRUCT
+        if config.refine and path.is_file():
+            path, printed = self._call(REFINE, "-i", _DENSE, "--mesh-file", _MESH, leaves=_REFINED)
+            last = REFINE
+        return read_surface(path, last.name, printed)
+
+    def _call(self, program: Program, *arguments: str, leaves: tuple[str, ...]) -> tuple[Path, str]:
+        """Run one program; give the file that it leaves and what it printed."""
+        command: list[Path | str] = [self._found[program], *arguments]
+        command += ["-w", str(self._folder), "--max-threads", str(self._threads)]
+        printed = run_program(command, self._folder, self._deadline, threads=self._threads)
+        self._done += 1
+        report(self._done, len(self._found))
+        there = [self._folder / name for name in leaves if (self._folder / name).is_file()]
+        # read_surface says, with the log, that a mesh is not there.
+        path = there[0] if there else self._folder / leaves[0]
+        if not there and path.suffix == ".mvs":
+            read_surface(path, program.name, printed)
+        return path, printed
+
+    def _names_points(self) -> bool:
+        """Tell whether the dense points are handed over beside the scene."""
+        try:
+            help_text = run_program(
+                [self._found[RECONSTRUCT], "--help"], self._folder, self._deadline, threads=1
+            )
+        except ReconstructionError as error:  # some versions fail after showing their help
+            help_text = str(error)
+        return "--pointcloud-file" in help_text

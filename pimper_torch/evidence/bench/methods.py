@@ -1,0 +1,107 @@
+"""Presets and rivals under one signature: a sparse scene and a coarse mesh in, an estimate out."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import nn
+
+from pimper_torch.chains.presets import load_config, make_chain
+from pimper_torch.errors import ConfigError
+from pimper_torch.evidence.baselines.colmap_dense import ColmapDense
+from pimper_torch.evidence.baselines.global_stereo import GlobalStereo
+from pimper_torch.evidence.baselines.lim import Lim
+from pimper_torch.evidence.baselines.openmvs import OpenMvs
+from pimper_torch.evidence.baselines.pmvs import Pmvs
+from pimper_torch.evidence.baselines.smoothed import Smoothed
+from pimper_torch.io.estimates import estimate_of
+from pimper_torch.records import (
+    CoarseMesh,
+    Estimate,
+    Record,
+    SparseScene,
+)
+from pimper_torch.stage import Given
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Outcome(Record):
+    """What a method gave, and what it cost.
+
+    Attributes:
+        estimate: Surface, cameras, lights.
+        seconds: Wall clock without structure from motion.
+        mesh_points: Vertices of the coarse mesh; ``None`` for methods that use none.
+        triangles: Its facets.
+        samples: Samples of all templates times views, missing ones included.
+        missing_share: Of the samples.
+        external: A program of its own did the work, whose memory is not this process's.
+    """
+
+    estimate: Estimate
+    seconds: float
+    mesh_points: int | None = None
+    triangles: int | None = None
+    samples: int | None = None
+    missing_share: float | None = None
+    external: bool = False
+
+
+Method = Callable[[SparseScene, CoarseMesh], Outcome]
+
+_RIVALS: dict[str, Callable[[], nn.Module]] = {
+    "smoothed": Smoothed,
+    "global-stereo": GlobalStereo,
+    "lim": Lim,
+    "pmvs": Pmvs,
+    "openmvs": OpenMvs,
+    "colmap-dense": ColmapDense,
+}
+
+
+def method_named(name: str) -> Method:
+    """Find a rival by name, or a preset, or a YAML file of settings.
+
+    Raises:
+        ConfigError: Nothing has that name.
+    """
+    if name in _RIVALS:
+        return _rival(_RIVALS[name]())
+    try:
+        return _preset(name)
+    except ConfigError as error:
+        raise ConfigError(f"method {name!r}: {error} Rivals are {', '.join(_RIVALS)}.") from error
+
+
+def _preset(name: str) -> Method:
+    config = load_config(name)
+
+    def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
+        chain = make_chain(config, reconstruct=Given(scene))
+        began = time.perf_counter()
+        result = chain(scene.views)
+        seconds = time.perf_counter() - began
+        found = {key: value for report in result.report for key, value in report.figures.items()}
+        return Outcome(
+            estimate=estimate_of(result),
+            seconds=seconds,
+            mesh_points=int(found["mesh_points"]),
+            triangles=int(found["triangles"]),
+            samples=int(found["samples"]),
+            missing_share=float(found["missing_share"]),
+        )
+
+    return run
+
+
+def _rival(module: nn.Module) -> Method:
+    def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
+        began = time.perf_counter()
+        estimate = module(scene, coarse)
+        return Outcome(
+            estimate=estimate,
+            seconds=time.perf_counter() - began,
+            external=isinstance(module, Pmvs | OpenMvs | ColmapDense),
+        )
+
+    return run

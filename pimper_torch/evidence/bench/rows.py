@@ -1,0 +1,254 @@
+"""A table's rows: what every method cost and how near it came, and where that was measured."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pimper_torch.config import build, to_mapping
+from pimper_torch.errors import ConfigError, InputError, MissingProgramError, OutputError
+from pimper_torch.evidence.bench.machine import Machine
+from pimper_torch.records import Record
+
+_FORMAT = "pimper-bench"
+_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row(Record):
+    """One method on one scene; ``None`` is what was not, or cannot be, measured.
+
+    Percentages are of 100. Lengths are percentages of the true bounding box's diagonal.
+
+    Attributes:
+        scene: Name.
+        method: Preset or rival.
+        mesh_points: Vertices of the coarse mesh.
+        triangles: Its facets.
+        samples: Samples of all templates times views, missing ones included.
+        missing_percent: Of the samples.
+        minutes: Wall clock of this method alone.
+        sfm_minutes: Wall clock of the structure from motion that all methods share.
+        relative_error: The published 3D error, along the rays of the reference view, per cent.
+        coverage_percent: Of the true pixels, those whose ray meets the surface, and not where
+            it shows the table; the 3D error is over these.
+        mean_normal_deg: Error of the normals that the vertices carry.
+        median_normal_deg: The same.
+        mean_shape_normal_deg: Error of the normals of the surface's own shape.
+        median_shape_normal_deg: The same.
+        common_percent: Of the true pixels, those that all methods of the table cover that gave
+            a surface.
+        common_relative_error: The 3D error over these.
+        common_mean_normal_deg: Of the normals that the vertices carry, over these.
+        common_median_normal_deg: The same.
+        common_mean_shape_normal_deg: Of the surface's own shape, over these.
+        common_median_shape_normal_deg: The same.
+        pitted_percent: Rays where these are far further off than around: pimples and pits.
+        chamfer: Mean of accuracy and completeness of what three views or more see.
+        accuracy: Mean distance from the surface to the truth.
+        completeness: Mean distance from the truth to the surface.
+        completeness_seen: The same from the truth that three views or more see.
+        f_scores: Pairs of a threshold, a length, and the F-score there, per cent, over the
+            truth that three views or more see.
+        peak_memory_mb: Highest resident memory while the method ran.
+        note: Why figures are missing, such as ``not installed``.
+        published: Printed in a paper, on photographs that are not these.
+    """
+
+    scene: str
+    method: str
+    mesh_points: int | None = None
+    triangles: int | None = None
+    samples: int | None = None
+    missing_percent: float | None = None
+    minutes: float | None = None
+    sfm_minutes: float | None = None
+    relative_error: float | None = None
+    coverage_percent: float | None = None
+    mean_normal_deg: float | None = None
+    median_normal_deg: float | None = None
+    mean_shape_normal_deg: float | None = None
+    median_shape_normal_deg: float | None = None
+    common_percent: float | None = None
+    common_relative_error: float | None = None
+    common_mean_normal_deg: float | None = None
+    common_median_normal_deg: float | None = None
+    common_mean_shape_normal_deg: float | None = None
+    common_median_shape_normal_deg: float | None = None
+    pitted_percent: float | None = None
+    chamfer: float | None = None
+    accuracy: float | None = None
+    completeness: float | None = None
+    completeness_seen: float | None = None
+    f_scores: tuple[tuple[float, float], ...] = ()
+    peak_memory_mb: float | None = None
+    note: str = ""
+    published: bool = False
+
+
+def row_of_failure(scene: str, method: str, error: Exception, **known: int | float | None) -> Row:
+    """Make the row of a method that gave no surface.
+
+    Args:
+        scene: Name.
+        method: Name.
+        error: What stopped it; a missing program is no failure.
+        known: Fields that are known all the same, such as ``minutes``.
+    """
+    said = str(error) or type(error).__name__
+    # The table shows the first line only.
+    note = f"not installed\n{said}" if isinstance(error, MissingProgramError) else f"failed: {said}"
+    return Row(scene=scene, method=method, note=note, **known)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table(Record):
+    """All rows, and where and how they were measured.
+
+    Attributes:
+        rows: In the order they are shown.
+        machine: That they were measured on.
+        date: ISO 8601.
+        scale: ``quick`` or ``full``.
+        settings: Whatever else decides the figures, as JSON can hold it.
+    """
+
+    rows: tuple[Row, ...]
+    machine: Machine
+    date: str
+    scale: str
+    settings: Mapping[str, object] = dataclasses.field(default_factory=dict)
+
+
+def _published(scene: str, **figures: int | float) -> Row:
+    return Row(scene=scene, method="PiMPeR", published=True, **figures)  # type: ignore[arg-type]
+
+
+PUBLISHED = (
+    _published(
+        "mug",
+        mesh_points=115,
+        triangles=198,
+        samples=6_690_000,
+        missing_percent=24.7,
+        minutes=24.4,
+        relative_error=7.1,
+    ),
+    _published(
+        "jar",
+        mesh_points=130,
+        triangles=206,
+        samples=22_600_000,
+        missing_percent=57.8,
+        minutes=33.1,
+        relative_error=9.34,
+    ),
+    _published(
+        "balls",
+        mesh_points=250,
+        triangles=362,
+        samples=42_400_000,
+        missing_percent=69.5,
+        minutes=62.6,
+        relative_error=9.69,
+    ),
+    _published(
+        "potatoes",
+        mesh_points=150,
+        triangles=276,
+        samples=36_700_000,
+        missing_percent=62.7,
+        minutes=50.8,
+        relative_error=11.15,
+    ),
+    Row(
+        scene="potatoes",
+        method="global-stereo",
+        minutes=22 * 60.0,
+        relative_error=17.34,
+        published=True,
+    ),
+)
+"""The figures printed for PiMPeR: 30 frames of 1600x1200 each, of real mugs, jars, balls and
+potatoes, in Matlab, 2014. The error is not defined there."""
+
+
+def with_published(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Put scenes together, and before each what was published on its namesake."""
+    scenes = dict.fromkeys(row.scene for row in rows)
+    return tuple(row for name in scenes for row in (*PUBLISHED, *rows) if row.scene == name)
+
+
+def write_json(table: Table, path: Path) -> None:
+    """Write a table with all its digits; figures that are not finite become ``null``.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    account = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "date": table.date,
+        "scale": table.scale,
+        "machine": to_mapping(table.machine),
+        "settings": dict(table.settings),
+        "rows": [to_mapping(row) for row in table.rows],
+    }
+    text = json.dumps(_finite(account), indent=1, ensure_ascii=False, allow_nan=False)
+    try:
+        path.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror}). Write elsewhere."
+        ) from error
+
+
+def read_json(path: Path | str) -> Table:
+    """Read a table that :func:`write_json` wrote.
+
+    Raises:
+        InputError: No such file, no such table, or a value of another type.
+    """
+    try:
+        account = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error}).") from error
+    if not isinstance(account, dict) or account.get("format") != _FORMAT:
+        raise InputError(f"{path}: is no table of `pimper bench`; needed: its JSON file.")
+    if account.get("version") != _VERSION:
+        raise InputError(
+            f"{path}: is of version {account.get('version')}; this pimper reads version "
+            f"{_VERSION}. Run the bench again."
+        )
+    try:
+        return Table(
+            rows=tuple(
+                build(Row, _mapping(row, f"{path}, row {index}"), f"{path}, row {index}")
+                for index, row in enumerate(account["rows"])
+            ),
+            machine=build(Machine, _mapping(account["machine"], f"{path}"), f"{path}"),
+            date=str(account["date"]),
+            scale=str(account["scale"]),
+            settings=_mapping(account["settings"], f"{path}, settings"),
+        )
+    except (ConfigError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: is no whole table ({error}). Run the bench again.") from error
+
+
+def _mapping(value: object, where: str) -> dict[str, object]:
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: holds {value!r}; needed: an object with fields.")
+    return value
+
+
+def _finite(value: object) -> object:
+    """Replace what JSON cannot hold, and nobody measured, by null."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value

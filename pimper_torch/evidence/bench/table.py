@@ -1,0 +1,230 @@
+"""Rows as a table, for a README in Markdown and for the terminal."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table as Grid
+from rich.text import Text
+
+from pimper_torch.evidence.bench.rows import Row, Table
+
+MISSING = "\N{EN DASH}"
+_NOTE_LENGTH = 60
+_PUBLISHED_MARK = "†"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """How one figure is shown.
+
+    Attributes:
+        heading: With the unit.
+        value: Takes the figure out of a row.
+        decimals: The same for all rows, so that points stand under one another.
+    """
+
+    heading: str
+    value: Callable[[Row], int | float | None]
+    decimals: int
+
+
+def _millions(samples: int | None) -> float | None:
+    return None if samples is None else samples / 1e6
+
+
+_COST = (
+    Column(heading="points", value=lambda row: row.mesh_points, decimals=0),
+    Column(heading="triangles", value=lambda row: row.triangles, decimals=0),
+    Column(heading="samples, M", value=lambda row: _millions(row.samples), decimals=2),
+    Column(heading="missing, %", value=lambda row: row.missing_percent, decimals=1),
+    Column(heading="minutes", value=lambda row: row.minutes, decimals=1),
+    Column(heading="SfM, min", value=lambda row: row.sfm_minutes, decimals=1),
+    Column(heading="memory, MB", value=lambda row: row.peak_memory_mb, decimals=0),
+)
+_RAYS = (
+    Column(heading="3D error, %", value=lambda row: row.relative_error, decimals=2),
+    Column(heading="covered, %", value=lambda row: row.coverage_percent, decimals=1),
+    Column(heading="normals, °", value=lambda row: row.mean_normal_deg, decimals=2),
+    Column(heading="median, °", value=lambda row: row.median_normal_deg, decimals=2),
+    Column(heading="shape, °", value=lambda row: row.mean_shape_normal_deg, decimals=2),
+    Column(
+        heading="shape median, °",
+        value=lambda row: row.median_shape_normal_deg,
+        decimals=2,
+    ),
+    Column(heading="pitted, %", value=lambda row: row.pitted_percent, decimals=2),
+)
+_COMMON = (
+    Column(heading="covered by all, %", value=lambda row: row.common_percent, decimals=1),
+    Column(heading="3D error there, %", value=lambda row: row.common_relative_error, decimals=2),
+    Column(heading="normals there, °", value=lambda row: row.common_mean_normal_deg, decimals=2),
+    Column(heading="median there, °", value=lambda row: row.common_median_normal_deg, decimals=2),
+    Column(
+        heading="shape there, °", value=lambda row: row.common_mean_shape_normal_deg, decimals=2
+    ),
+    Column(
+        heading="shape median there, °",
+        value=lambda row: row.common_median_shape_normal_deg,
+        decimals=2,
+    ),
+)
+_SURFACE = (
+    Column(heading="Chamfer, %", value=lambda row: row.chamfer, decimals=3),
+    Column(heading="accuracy, %", value=lambda row: row.accuracy, decimals=3),
+    Column(heading="complete, %", value=lambda row: row.completeness_seen, decimals=3),
+)
+
+
+def columns(rows: Sequence[Row]) -> dict[str, tuple[Column, ...]]:
+    """Give the columns that some row has a figure for, by what they are about."""
+
+    def known(columns: Sequence[Column]) -> tuple[Column, ...]:
+        return tuple(
+            column for column in columns if any(_is_known(column.value(row)) for row in rows)
+        )
+
+    thresholds = sorted({threshold for row in rows for threshold, _ in row.f_scores})
+    scores = tuple(
+        Column(
+            heading=f"F {threshold:g} %",
+            value=lambda row, threshold=threshold: dict(row.f_scores).get(threshold),  # type: ignore[misc]
+            decimals=1,
+        )
+        for threshold in thresholds
+    )
+    return {
+        "cost": known(_COST),
+        "along the rays of the reference view": known(_RAYS),
+        "where all methods cover the object": known(_COMMON),
+        "distances of surfaces": known((*_SURFACE, *scores)),
+    }
+
+
+def cell(value: int | float | None, decimals: int) -> str:
+    """Show a figure with so many decimals.
+
+    What is missing is a dash. What would be rounded to nothing but is more is said to be less
+    than the last digit: 0 is only shown for 0.
+
+    >>> cell(1234.5, 1), cell(0.004, 2), cell(0.0, 2), cell(None, 2)
+    ('1,234.5', '<0.01', '0.00', '–')
+    """
+    if value is None or not math.isfinite(value):
+        return MISSING
+    least = 10.0**-decimals
+    if 0 < value < least / 2:
+        return f"<{least:.{decimals}f}"
+    return f"{value:,.{decimals}f}"
+
+
+def markdown(table: Table) -> str:
+    """Write the table, what its columns mean, and what it was measured on."""
+    shown = [column for part in columns(table.rows).values() for column in part]
+    noted = any(row.note for row in table.rows)
+    head = ["scene", "method", *(column.heading for column in shown), *(["note"] * noted)]
+    lines = [
+        [
+            _plain(row.scene),
+            _plain(_method(row)),
+            *(cell(column.value(row), column.decimals) for column in shown),
+            *([_plain(short_note(row))] * noted),
+        ]
+        for row in table.rows
+    ]
+    right = [False, False, *([True] * len(shown)), *([False] * noted)]
+    widths = [max(3, *(len(line[index]) for line in (head, *lines))) for index in range(len(head))]
+    rule = ["-" * (width - to_right) + ":" * to_right for width, to_right in _pairs(widths, right)]
+    parts = ["\n".join(_line(line, widths, right) for line in (head, rule, *lines)), *legend(table)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _pairs(widths: Sequence[int], right: Sequence[bool]) -> list[tuple[int, bool]]:
+    return list(zip(widths, right, strict=True))
+
+
+def _line(words: Sequence[str], widths: Sequence[int], right: Sequence[bool]) -> str:
+    padded = [
+        word.rjust(width) if to_right else word.ljust(width)
+        for word, (width, to_right) in zip(words, _pairs(widths, right), strict=True)
+    ]
+    return f"| {' | '.join(padded)} |"
+
+
+def terminal(table: Table) -> Group:
+    """Make what the terminal shows: tables no wider than it, then why figures are missing.
+
+    A row without any figure of a table's kind is left out of that table.
+    """
+    parts: list[RenderableType] = []
+    for title, shown in columns(table.rows).items():
+        told = [row for row in table.rows if any(_is_known(one.value(row)) for one in shown)]
+        if told:
+            parts.append(_grid(f"{title}, scale {table.scale}", shown, told))
+    # Text, for a name in brackets is no markup.
+    parts += [Text(f"{row.scene}, {row.method}: {row.note}") for row in table.rows if row.note]
+    return Group(*parts)
+
+
+def _grid(title: str, shown: Sequence[Column], rows: Sequence[Row]) -> Grid:
+    grid = Grid(title=title, box=box.SIMPLE_HEAD, title_justify="left", padding=(0, 1, 0, 0))
+    grid.add_column("scene")
+    grid.add_column("method")
+    for column in shown:
+        narrow = "\n".join(column.heading.replace(",", "").split())
+        grid.add_column(narrow, justify="right", no_wrap=True)
+    for row, following in zip(rows, (*rows[1:], None), strict=True):
+        figures = (cell(column.value(row), column.decimals) for column in shown)
+        grid.add_row(
+            *(Text(word) for word in (row.scene, _method(row), *figures)),
+            style="dim" if row.published else None,
+            end_section=following is not None and following.scene != row.scene,
+        )
+    return grid
+
+
+def legend(table: Table) -> list[str]:
+    """Say in sentences what the columns mean, and what they were measured on."""
+    sentences = [
+        "Samples count every template's pixels times the views, missing ones included. Minutes "
+        "are of the method alone; structure from motion is shared and stands apart. The 3D error "
+        "is `100 ||S - S_hat|| / ||S - mean S||` along the rays of the reference view, over the "
+        "share of the true pixels that is covered; rays that meet a surface on the table, through "
+        "a hole in the object, are misses. There: over the pixels that all methods of the scene "
+        "cover that gave a surface. Normals are those that the vertices carry; "
+        "shape is the surface's own. Chamfer (the mean of accuracy and completeness), accuracy, "
+        "completeness and the thresholds of F are in % of the diagonal of the true bounding box, "
+        "over the part of the true surface that three views or more see. "
+        f"{MISSING}: not measured, or not applicable.",
+    ]
+    if any(row.published for row in table.rows):
+        sentences.append(
+            f"{_PUBLISHED_MARK} As published, on other photographs (real ones, 30 of 1600x1200) "
+            "and another machine; its error is not defined there."
+        )
+    settings = ", ".join(f"{name} {_plain(str(value))}" for name, value in table.settings.items())
+    measured = f"Scale {table.scale}, {table.date}, on {_plain(table.machine.summary)}"
+    sentences.append(f"{measured}{'; ' + settings if settings else ''}.")
+    return sentences
+
+
+def short_note(row: Row) -> str:
+    """Give the first line of a note, cut to a cell's width; the JSON file has the whole."""
+    lines = row.note.strip().splitlines()
+    first = lines[0] if lines else ""
+    return first if len(first) <= _NOTE_LENGTH else first[: _NOTE_LENGTH - 1].rstrip() + "…"
+
+
+def _method(row: Row) -> str:
+    return f"{row.method} {_PUBLISHED_MARK}" if row.published else row.method
+
+
+def _is_known(value: int | float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _plain(text: str) -> str:
+    """Keep a text from ending its cell or its row."""
+    return " ".join(text.split()).replace("|", "\\|")

@@ -1,0 +1,78 @@
+"""``pimper bench``: the table."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from pimper_torch.cli.bars import Bars
+from pimper_torch.cli.options import Flag
+from pimper_torch.evidence.bench.config import BenchConfig
+from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
+from pimper_torch.evidence.bench.table import terminal
+from pimper_torch.io.folders import prepare_output
+from pimper_torch.sfm.cache import user_cache
+
+_OUT, _QUICK = Path("pimper_bench"), BenchConfig()
+
+
+def run(command: str, arguments: Sequence[str]) -> None:
+    """Carry out ``bench``.
+
+    Raises:
+        PimperError: Before anything is written.
+    """
+    job = checked(command, arguments)
+    with Bars(Console(stderr=True)) as bars:
+        table = run_bench(
+            job.config, job.out, observer=bars, overwrite=job.overwrite, cache=job.cache
+        )
+    console = Console()
+    console.print(terminal(table))
+    console.print(
+        f"{job.out}/table.md is the table, {job.out}/sheet.png shows it.",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    out: Path
+    config: BenchConfig
+    cache: Path
+    overwrite: bool
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and refuse a folder that is taken.
+
+    Raises:
+        PimperError: An impossible setting, or the folder holds something else.
+        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+    """
+    kept = user_cache()
+
+    def bench(
+        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")] = _OUT,
+        config: Annotated[BenchConfig, tyro.conf.arg(name="")] = _QUICK,
+        cache: Annotated[Path, tyro.conf.arg(metavar="DIR")] = kept,
+        overwrite: Flag = False,
+    ) -> _Job:
+        """Run presets and rivals on scenes with known truth, and print and save the table.
+
+        Args:
+            out: Folder for the table, its figures and all surfaces; new or empty.
+            config: Scenes and methods.
+            cache: Folder where structure from motion is kept from run to run, so that a change
+                of a later stage costs only the later stages.
+            overwrite: Replace a former result in OUT.
+        """
+        return _Job(out=out, config=config, cache=cache, overwrite=overwrite)
+
+    job = tyro.cli(bench, prog=f"pimper {command}", args=list(arguments))
+    prepare_output(job.out, BENCH_NAMES, job.overwrite)
+    return job

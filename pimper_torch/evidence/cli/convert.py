@@ -1,0 +1,333 @@
+"""A data set of one layout to another."""
+
+import dataclasses
+import inspect
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+from torch import Tensor
+
+from pimper_torch.cli.bars import Bars
+from pimper_torch.cli.options import LEVELS, Flag
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets import (
+    read_colmap,
+    read_diligent,
+    read_diligent_mv,
+    read_dtu_mvs,
+    read_dtu_points,
+    read_idr,
+    read_llff,
+    read_meshroom,
+    read_metashape,
+    read_middlebury,
+    read_rendered,
+    read_transforms,
+    write_colmap,
+    write_idr,
+    write_transforms,
+)
+from pimper_torch.evidence.datasets.posed import shrink
+from pimper_torch.io.folders import prepare_output, written_whole
+from pimper_torch.progress import listening
+from pimper_torch.radiometry import Encoding
+from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
+from pimper_torch.records import Cameras, Capture, StageReport, Truth, Views
+from pimper_torch.reporting import peak_memory_mb
+
+Source = Literal[
+    "colmap",
+    "llff",
+    "middlebury",
+    "idr",
+    "transforms",
+    "meshroom",
+    "metashape",
+    "dtu-points",
+    "dtu-mvs",
+    "diligent-mv",
+    "diligent",
+    "rendered",
+]
+Target = Literal["colmap", "idr", "transforms"]
+
+# What the three layouts consist of together: one may replace another.
+RESULT_NAMES = (
+    "images",
+    "masks",
+    "sparse",
+    "image",
+    "mask",
+    "cameras.npz",
+    "cameras_sphere.npz",
+    "transforms.json",
+    "sparse_pc.ply",
+)
+# Enough to start from or to see the object's extent, and no more than viewers like.
+_MOST_POINTS = 100_000
+
+
+_PHOTOGRAPHS = ("response", "saturation", "black")
+
+
+def _named(name: str) -> object:
+    return tyro.conf.arg(name=f"photographs.{name}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadOptions:
+    """What a reader may be told; each goes with the layouts that know it.
+
+    Attributes:
+        scan: Number of the scene or scan; the DTU sets need one.
+        images: Folder of the photographs, if they do not lie where the layout has them.
+        masks: Folder with a mask for each photograph, of the same name; black off the object.
+        mesh: File of the true surface, in the data set's frame; the export's cloud or unit
+            sphere comes from it.
+        response: As photographs.response of `pimper reconstruct`; the layout's own unless given.
+        saturation: As photographs.saturation of `pimper reconstruct`.
+        black: As photographs.black of `pimper reconstruct`.
+        light_seed: Keep one light at each place, chosen by this seed.
+        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
+            leaves them.
+    """
+
+    scan: int | None = None
+    images: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    response: Annotated[ResponseChoice | None, _named("response")] = None
+    saturation: Annotated[SaturationChoice | None, _named("saturation")] = None
+    black: Annotated[float | None, _named("black")] = None
+    light_seed: int | None = None
+    max_size_px: int = 0
+
+
+_OPTIONS = tuple(field.name for field in dataclasses.fields(ReadOptions))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """All that a conversion is told."""
+
+    data: Path
+    out: Path
+    source: Source
+    target: Target
+    overwrite: bool
+    options: ReadOptions
+
+
+def run(command: str, arguments: Sequence[str]) -> None:
+    """Carry out ``convert``: read, write whole or not at all, and say what came.
+
+    Raises:
+        PimperError: Before anything is written.
+    """
+    job = checked(command, arguments)
+    with Bars(Console(stderr=True)) as bars:
+        bars.started("read")
+        began = time.perf_counter()
+        with listening(bars.progressed):
+            capture = read(job)
+        bars.finished(_report(capture, time.perf_counter() - began))
+    with written_whole(job.out, RESULT_NAMES, overwrite=job.overwrite) as staging:
+        write(capture, job.target, staging)
+    Console().print(describe(capture, job), highlight=False, soft_wrap=True)
+
+
+def checked(command: str, arguments: Sequence[str]) -> Job:
+    """Read the arguments, and refuse what can be told without reading DATA.
+
+    Raises:
+        PimperError: The folder for the result is taken, or there is no data.
+    """
+    job = parse(arguments)
+    prepare_output(job.out, RESULT_NAMES, job.overwrite)
+    if not job.data.exists():
+        raise InputError(f"{job.data}: found nothing; needed: the folder or file of a data set.")
+    return job
+
+
+def parse(arguments: Sequence[str]) -> Job:
+    """Read the arguments of ``convert``.
+
+    Raises:
+        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+    """
+
+    def convert(
+        data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")],
+        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],
+        source: Source,
+        target: Target,
+        overwrite: Flag = False,
+        options: Annotated[ReadOptions, tyro.conf.arg(name="")] = ReadOptions(),
+    ) -> Job:
+        """Read a data set of one layout and write its photographs and cameras in another.
+
+        Photographs are written as 8-bit sRGB, undistorted, with pinhole cameras.
+
+        Args:
+            data: The data set's folder; for some layouts its file of cameras.
+            out: Folder for the result; new or empty.
+            source: Layout of DATA.
+            target: Layout to write.
+            overwrite: Replace a former result in OUT.
+            options: What the reader is told.
+        """
+        return Job(
+            data=data,
+            out=out,
+            source=source,
+            target=target,
+            overwrite=overwrite,
+            options=options,
+        )
+
+    return tyro.cli(convert, prog="pimper convert", args=list(arguments), config=(LEVELS,))
+
+
+def readers() -> Mapping[Source, Callable[..., Capture]]:
+    """List the reader of each layout."""
+    return {
+        "colmap": read_colmap,
+        "llff": read_llff,
+        "middlebury": read_middlebury,
+        "idr": read_idr,
+        "transforms": read_transforms,
+        "meshroom": read_meshroom,
+        "metashape": read_metashape,
+        "dtu-points": read_dtu_points,
+        "dtu-mvs": read_dtu_mvs,
+        "diligent-mv": read_diligent_mv,
+        "diligent": read_diligent,
+        "rendered": read_scene,
+    }
+
+
+def read_scene(folder: Path, *, max_size_px: int = 0) -> Capture:
+    """Read a rendered scene without its maps, which no layout has a place for.
+
+    Raises:
+        InputError: As :func:`pimper_torch.evidence.datasets.read_rendered`.
+    """
+    if max_size_px < 0:
+        raise InputError(f"--max-size-px is {max_size_px}; needed: 0, or the longest side.")
+    capture = read_rendered(folder, maps=False)
+    assert capture.cameras is not None
+    views, cameras = shrink(capture.views, capture.cameras, max_size_px)
+    return capture.replace(views=views, cameras=cameras)
+
+
+def read(job: Job) -> Capture:
+    """Read the data set with the options that were given.
+
+    Raises:
+        InputError: An option that the reader does not know, or none where it needs one; and
+            whatever the reader refuses.
+    """
+    reader = readers()[job.source]
+    known = inspect.signature(reader).parameters
+    plain = ReadOptions()
+    given = {
+        name: getattr(job.options, name)
+        for name in _OPTIONS
+        if getattr(job.options, name) != getattr(plain, name)
+    }
+    photographs = {name: given.pop(name) for name in _PHOTOGRAPHS if name in given}
+    if photographs and "encoding" in known:
+        usual = known["encoding"].default
+        assert isinstance(usual, Encoding), "readers say what their layout's files hold"
+        given["encoding"] = dataclasses.replace(usual, **photographs)
+    elif photographs:
+        given |= photographs
+    strange = [_option(name) for name in given if name not in known]
+    if strange:
+        accepted = {*known, *(_PHOTOGRAPHS if "encoding" in known else ())}
+        goes = [_option(name) for name in _OPTIONS if name in accepted]
+        raise InputError(
+            f"{', '.join(strange)}: the reader of {job.source} does not know it; needed: some of "
+            f"{', '.join(goes)}, or another --source."
+        )
+    if "scan" in known and "scan" not in given:
+        raise InputError(f"--source {job.source} holds many scans; needed: --scan with a number.")
+    return reader(job.data, **given)
+
+
+def write(capture: Capture, target: Target, folder: Path) -> None:
+    """Write a capture's photographs and cameras in a layout.
+
+    Raises:
+        InputError: Its cameras are not known, or are none that the layout can hold.
+    """
+    if capture.cameras is None:
+        raise InputError(
+            "this data set says nothing about its cameras; needed: cameras to export. Use its "
+            "photographs as they are."
+        )
+    writers: Mapping[str, Callable[[Views, Cameras, Path, Tensor | None], None]] = {
+        "colmap": lambda *given: write_colmap(*given[:3], points_world=given[3]),
+        "idr": lambda *given: write_idr(*given[:3], points_world=given[3]),
+        "transforms": lambda *given: write_transforms(*given[:3], points_world=given[3]),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    writers[target](capture.views, capture.cameras, folder, cloud(capture.truth))
+
+
+def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
+    """Give points of the true surface, at most a hundred thousand, or ``None``."""
+    points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
+    if points is None or len(points) <= _MOST_POINTS:
+        return points
+    chosen = torch.linspace(0, len(points) - 1, _MOST_POINTS, dtype=torch.float64)
+    return points[chosen.round().long().to(points.device)]
+
+
+def describe(capture: Capture, job: Job) -> str:
+    """Tell what was read and where it is now."""
+    sizes = {f"{width} x {height}" for width, height in capture.views.sizes_px.tolist()}
+    size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
+    count, places, lights = (
+        len(set(numbers.tolist()))
+        for numbers in (torch.arange(capture.views.num_views), capture.position, capture.light)
+    )
+    light = (
+        "each taken to have its own light"
+        if lights == count
+        else f"under {_count(lights, 'light')}"
+    )
+    known = [
+        name.removesuffix("_world")
+        for name in ("mesh", "points_world", "depth", "normals_world", "albedo", "lights_world")
+        if getattr(capture.truth, name) is not None
+    ]
+    return (
+        f"{_count(count, 'photograph')} of {size} from {_count(places, 'place')}, {light}, "
+        f"{'with' if capture.views.masks is not None else 'without'} masks; truth: "
+        f"{', '.join(known) or 'none'}.\n{job.out} has them as {job.target}."
+    )
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _option(name: str) -> str:
+    return f"--{'photographs.' * (name in _PHOTOGRAPHS)}{name.replace('_', '-')}"
+
+
+def _report(capture: Capture, seconds: float) -> StageReport:
+    return StageReport(
+        name="read",
+        seconds=seconds,
+        peak_memory_mb=peak_memory_mb(),
+        figures={"photographs": capture.views.num_views},
+    )

@@ -1,0 +1,345 @@
+"""A result against the truth, on the terminal and as JSON."""
+
+import json
+import re
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from rich.console import Console
+from rich.text import Text
+
+from pimper_torch.config import to_mapping
+from pimper_torch.errors import InputError, OutputError
+from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
+from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
+from pimper_torch.evidence.datasets.rendered import read_rendered
+from pimper_torch.evidence.metrics.account import account, rows
+from pimper_torch.evidence.metrics.alignment import Method
+from pimper_torch.evidence.metrics.evaluate import (
+    EvaluateConfig,
+    Evaluation,
+    chosen_views,
+    evaluate,
+)
+from pimper_torch.evidence.metrics.icp import IcpConfig
+from pimper_torch.io.estimates import read_estimate
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.io.version import installed_version
+from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
+from pimper_torch.viz.calibration import draw_calibration
+
+Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
+
+# The place of the camera in the names of the DTU and DiLiGenT-MV sets.
+_PLACE = re.compile(r"(?:rect|view)_(\d+)")
+# Photographs of the DTU set are not compared with anything; small ones save a gigabyte.
+_THUMBNAIL_PX = 200
+# Columns that the explanation of a figure needs to stand beside it.
+_ROOM = 72
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateOptions:
+    """What is measured, against what.
+
+    Attributes:
+        truth_layout: What TRUTH is. `mesh`: a mesh file or point cloud in the result's frame;
+            `rendered`: a folder that `pimper render` wrote; `dtu-mvs`: the folder of the
+            DTU multi-view stereo set, with its protocol if ObsMask is there;
+            `diligent-mv`: an object's folder. `auto` tells the first two apart.
+        scan: Number of the scan of `dtu-mvs`.
+        alignment: Before measuring: `none`, `cameras` (similarity on the cameras both have),
+            `icp` (trimmed similarity between the surfaces, from the cameras on), or `auto`:
+            cameras if there are two on both sides, else none.
+        views: Names of the photographs to compare normals, albedo and relative error in; the
+            result's reference view unless given.
+        thresholds_percent: For precision, recall and F-score, in per cent of the diagonal of
+            the true object's bounding box.
+        seen_from: Completeness is given once more over the truth that this many places of the
+            camera see.
+        samples: Points drawn on each surface.
+        seed: Of every draw.
+        trimmed_share: Share of the result's samples that each step of `icp` leaves out.
+        icp_distance: What `icp` makes small: the distance to the true `plane` or `point`.
+    """
+
+    truth_layout: Layout = "auto"
+    scan: int | None = None
+    alignment: Method = "auto"
+    views: tuple[str, ...] = ()
+    thresholds_percent: tuple[float, ...] = (0.25, 0.5, 1.0)
+    seen_from: int = 3
+    samples: int = 200_000
+    seed: int = 0
+    trimmed_share: float = 0.2
+    icp_distance: Literal["plane", "point"] = "plane"
+
+    def config(self) -> EvaluateConfig:
+        """Give the settings of the evaluation.
+
+        Raises:
+            ConfigError: An impossible value.
+        """
+        return EvaluateConfig(
+            alignment=self.alignment,
+            views=self.views,
+            thresholds_percent=self.thresholds_percent,
+            seen_from=self.seen_from,
+            samples=self.samples,
+            seed=self.seed,
+            icp=IcpConfig(trimmed_share=self.trimmed_share, distance=self.icp_distance),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """All that an evaluation is told."""
+
+    result: Path
+    truth: Path
+    out: Path | None
+    calibration: Path | None = None
+    options: EvaluateOptions = field(default_factory=EvaluateOptions)
+
+
+def run(command: str, arguments: Sequence[str]) -> None:
+    """Carry out ``evaluate``.
+
+    Raises:
+        PimperError: Nothing is written then.
+    """
+    job = checked(command, arguments)
+    config = job.options.config()
+    estimate = read_estimate(job.result)
+    if job.calibration is not None and estimate.mesh.expected_error is None:
+        raise InputError(
+            f"{job.result}: tells no expected error, so there is nothing to calibrate; needed: a "
+            "result with `expected_error` at its vertices, as `pimper reconstruct` writes it "
+            "unless `fuse.error_draws` is 0."
+        )
+    truth = read_truth(job, estimate, config)
+    evaluation = evaluate(estimate, truth.capture, config, maps=truth.maps, dtu=truth.protocol)
+    console = Console()
+    show(evaluation, console)
+    if job.out is not None:
+        write_report(evaluation, job)
+        console.print(f"{job.out} has all figures.", highlight=False, soft_wrap=True)
+    if job.calibration is not None:
+        _draw(evaluation, job.calibration)
+        console.print(f"{job.calibration} is drawn.", highlight=False, soft_wrap=True)
+
+
+def checked(command: str, arguments: Sequence[str]) -> Job:
+    """Read the arguments, and refuse what can be told without reading RESULT and TRUTH.
+
+    Raises:
+        PimperError: An impossible setting, nothing to measure, or files that cannot be written.
+    """
+    job = parse(arguments)
+    job.options.config()
+    for path in (job.result, job.truth):
+        if not path.exists():
+            raise InputError(f"{path}: found nothing; needed: a result, and what it should be.")
+    for file in (job.out, job.calibration):
+        if file is not None:
+            _check_writable(file)
+    return job
+
+
+def parse(arguments: Sequence[str]) -> Job:
+    """Read the arguments of ``evaluate``.
+
+    Raises:
+        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+    """
+
+    def evaluate(
+        result: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULT")],
+        truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")],
+        out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
+        calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+        options: Annotated[EvaluateOptions, tyro.conf.arg(name="")] = EvaluateOptions(),
+    ) -> Job:
+        """Measure a result against the truth, each figure under its own named convention.
+
+        Args:
+            result: Folder that `pimper reconstruct` wrote, or a mesh of any method.
+            truth: Folder of a rendered scene or of a data set, or a mesh.
+            out: JSON file for all figures; a former one is replaced.
+            calibration: PNG file for the calibration curve of a result that tells its expected
+                error; a former one is replaced.
+            options: The measuring.
+        """
+        return Job(result=result, truth=truth, out=out, calibration=calibration, options=options)
+
+    return tyro.cli(evaluate, prog="pimper evaluate", args=list(arguments))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TruthRead:
+    """What was read of a truth.
+
+    Attributes:
+        capture: All its views, perhaps without maps.
+        maps: The views to compare in, with maps; ``None`` where ``capture`` has them.
+        protocol: Of the DTU set.
+    """
+
+    capture: Capture
+    maps: Capture | None = None
+    protocol: DtuProtocol | None = None
+
+
+def read_truth(job: Job, estimate: Estimate, config: EvaluateConfig) -> TruthRead:
+    """Read what the result is measured against.
+
+    Of a rendered scene no more maps are read than will be compared, so that memory does not
+    grow with the number of its views.
+
+    Raises:
+        InputError: TRUTH is not laid out as it was said to be, or ``--scan`` is missing.
+    """
+    layout, place = job.options.truth_layout, job.truth
+    if layout == "auto":
+        layout = "rendered" if (place / "truth").is_dir() else "mesh"
+        if layout == "mesh" and place.is_dir():
+            raise InputError(
+                f"{place}: a folder without truth/ in it; needed: a folder that `pimper render` "
+                "wrote, a mesh file, or the layout of a data set (--truth-layout)."
+            )
+    if layout == "mesh":
+        return TruthRead(capture=mesh_capture(place))
+    if layout == "rendered":
+        bare = read_rendered(place, maps=False, photographs=False)
+        chosen = chosen_views(estimate, bare, config)
+        return TruthRead(capture=bare, maps=read_rendered(place, views=chosen, photographs=False))
+    if layout == "diligent-mv":
+        return TruthRead(capture=named_as(read_diligent_mv(place, lights=[1]), estimate))
+    scan = job.options.scan
+    if scan is None:
+        raise InputError(f"{place}: holds many scans; needed: --scan with the number of one.")
+    capture = read_dtu_mvs(place, scan, lights=[0], max_size_px=_THUMBNAIL_PX)
+    return TruthRead(
+        capture=named_as(capture, estimate),
+        protocol=read_dtu_protocol(place, scan) if (place / "ObsMask").is_dir() else None,
+    )
+
+
+def named_as(capture: Capture, estimate: Estimate) -> Capture:
+    """Call views as the estimate calls those from the same place, under whatever light.
+
+    Names of these sets hold the place (``rect_007_3_r5000.png``, ``view_07/012.png``), and a
+    result may be made from any light of each. A place that the estimate has under several
+    lights, or not at all, keeps its name.
+    """
+    places = [_place_in(name) for name in estimate.names]
+    known = {
+        place: name
+        for place, name in zip(places, estimate.names, strict=True)
+        if place is not None and places.count(place) == 1
+    }
+    theirs = [(_place_in(name), name) for name in capture.views.names]
+    names = tuple(name if place is None else known.get(place, name) for place, name in theirs)
+    return capture.replace(views=capture.views.replace(names=names))
+
+
+def _place_in(name: str) -> int | None:
+    match = _PLACE.search(name)
+    return int(match[1]) if match else None
+
+
+def mesh_capture(path: Path) -> Capture:
+    """Read a mesh or a point cloud as a truth without photographs."""
+    mesh = read_mesh(path)
+    points = None if len(mesh.faces) else mesh.vertices_world
+    nobody = torch.zeros(0, dtype=torch.long)
+    return Capture(
+        views=Views(
+            images=torch.zeros(0, 3, 1, 1),
+            sizes_px=torch.zeros(0, 2, dtype=torch.long),
+            names=(),
+            focals_px=torch.zeros(0),
+        ),
+        cameras=None,
+        truth=Truth(mesh=mesh if points is None else None, points_world=points),
+        position=nobody,
+        light=nobody,
+    )
+
+
+def show(evaluation: Evaluation, console: Console) -> None:
+    """Print the figures section by section, with what each says beside or below it."""
+    sections = rows(evaluation)
+    lines = [row for _, found in sections for row in found]
+    first = 2 + max(len(row.name) for row in lines)
+    second = first + 2 + max(len(row.value) for row in lines)
+    beside = console.width >= second + _ROOM
+    for title, found in sections:
+        console.print(Text(title, style="bold"), soft_wrap=True)
+        for row in found:
+            text = Text(f"  {row.name}".ljust(first) + f"  {row.value}")
+            if beside:
+                text.pad_right(second + 2 - len(text))
+            else:
+                text.append("\n" + " " * (first + 2))
+            text.append(row.meaning, style="dim")
+            console.print(text, soft_wrap=True)
+
+
+def write_report(evaluation: Evaluation, job: Job) -> None:
+    """Write all figures and the settings they were made with as JSON, whole or not at all.
+
+    Raises:
+        OutputError: The disk refuses.
+    """
+    assert job.out is not None
+    content = {
+        "pimper_torch": installed_version(),
+        "result": str(job.result),
+        "truth": str(job.truth),
+        "settings": to_mapping(job.options),
+        **account(evaluation),
+    }
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    staging = job.out.with_name(f".{job.out.name}.new-{secrets.token_hex(4)}")
+    try:
+        staging.write_text(text, encoding="utf-8")
+        staging.replace(job.out)
+    except OSError as error:
+        staging.unlink(missing_ok=True)
+        raise OutputError(f"{job.out}: cannot be written ({error.strerror}).") from error
+
+
+def _draw(evaluation: Evaluation, path: Path) -> None:
+    """Draw expected against true error in per cent of the diagonal."""
+    surface = evaluation.surface
+    if surface is None or surface.calibration is None:
+        raise InputError(
+            "too little of the result belongs to the object to calibrate its expected error. "
+            "Check the alignment."
+        )
+    bins, percent = surface.calibration.bins, 100 / surface.diagonal
+    draw_calibration(
+        [percent * one.expected for one in bins],
+        [percent * one.root_mean_square for one in bins],
+        [percent * one.robust for one in bins],
+        "% of the diagonal",
+        path,
+    )
+
+
+def _check_writable(path: Path) -> None:
+    """Refuse, before the work, a file that cannot be written.
+
+    Raises:
+        OutputError: The path is a folder, or lies in none.
+    """
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; needed: the name of a file.")
+    if not path.resolve().parent.is_dir():
+        raise OutputError(f"{path}: its folder is not there. Make it, or write elsewhere.")

@@ -1,0 +1,180 @@
+"""COLMAP models beside their photographs: read and written."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.evidence.datasets.layout import expect, first_of, inside
+from pimper_torch.evidence.datasets.pictures import (
+    file_names,
+    refuse_skew,
+    write_mask,
+    write_picture,
+)
+from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble, mask_finder, read_views
+from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.records import Cameras, Capture, Lens, SparseScene, Views
+from pimper_torch.sfm.colmap import read_model, write_binary
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.reconstruct import Reconstruct
+
+_KIND = "a COLMAP model with its photographs"
+_PLACES = (".", "sparse/0", "sparse", "model", "0")
+
+
+def read_colmap(
+    folder: Path | str,
+    *,
+    images: Path | str | None = None,
+    masks: Path | str | None = None,
+    names: Sequence[str] | None = None,
+    mesh: Path | str | None = None,
+    encoding: Encoding = SRGB,
+    max_size_px: int = 0,
+) -> Capture:
+    """Read a COLMAP model, text or binary, and the photographs it was made from.
+
+    COLMAP counts pixels as we do (centre of the top-left one at (0.5, 0.5), "Camera models"
+    in its documentation) and has our camera axes. Lenses with distortion are undistorted.
+    Its cloud was found, not measured, so it is no truth; see :func:`read_colmap_scene`.
+
+    Args:
+        folder: With ``cameras``, ``images`` and ``points3D``, or with them in ``sparse/0``,
+            ``sparse``, ``model`` or ``0``.
+        images: Folder of the photographs; by default ``images`` beside or above the model.
+        masks: Folder of masks; by default ``masks`` beside that, if there is one.
+        names: Keep these photographs, as the model calls them, in this order.
+        mesh: File of the true surface, if it is known.
+        encoding: Response, saturation and black level of the files.
+        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+
+    Raises:
+        InputError: The folder is laid out otherwise, or a file is missing or damaged.
+    """
+    model_folder, photographs = _photographs(Path(folder), images, masks)
+    return assemble(
+        photographs,
+        model_folder,
+        _KIND,
+        names=names,
+        mesh=mesh,
+        encoding=encoding,
+        max_size_px=max_size_px,
+    )
+
+
+def read_colmap_scene(
+    folder: Path | str,
+    *,
+    images: Path | str | None = None,
+    masks: Path | str | None = None,
+    encoding: Encoding = SRGB,
+    max_size_px: int = 0,
+) -> SparseScene:
+    """Read a COLMAP model with its cloud and tracks, as structure from motion gives it.
+
+    See :func:`read_colmap` for the folder and the arguments.
+
+    Raises:
+        InputError: As :func:`read_colmap`.
+    """
+    model_folder, photographs = _photographs(Path(folder), images, masks)
+    missing = [one.name for one in photographs if not one.image.is_file()]
+    expect(not missing, model_folder, _KIND, "all its photographs", f"no {', '.join(missing[:5])}")
+    views = read_views(photographs, encoding=encoding, max_size_px=max_size_px)
+    return Reconstruct()(views, model_folder)
+
+
+def write_colmap(
+    views: Views,
+    cameras: Cameras,
+    folder: Path,
+    *,
+    points_world: Float[Tensor, "point 3"] | None = None,
+) -> None:
+    """Write photographs, masks and pinholes as COLMAP reads them.
+
+    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with another
+    ``.png`` behind, ``sparse/0/`` the model, binary.
+
+    Args:
+        views: Undistorted.
+        cameras: One a view.
+        folder: Made if it is not there.
+        points_world: A cloud to put in the model, without tracks and black.
+
+    Raises:
+        InputError: A camera has a skew, which COLMAP's pinhole cannot have.
+        OutputError: The model cannot be written.
+    """
+    refuse_skew(cameras, views.names, "a COLMAP model")
+    files = file_names(views.names)
+    for index, file in enumerate(files):
+        write_picture(views, index, folder / "images" / file)
+        if views.masks is not None:
+            write_mask(views, index, folder / "masks" / f"{file}.png")
+    points = torch.zeros(0, 3) if points_world is None else points_world.detach().cpu()
+    nothing = torch.zeros(0, dtype=torch.long)
+    model = SparseModel(
+        names=files,
+        lenses=_lenses(cameras),
+        cam_from_world=cameras.cam_from_world.detach().cpu().double(),
+        points_world=points.double(),
+        observation_point=nothing,
+        observation_view=nothing,
+        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
+    )
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    write_binary(model, colors, folder / "sparse" / "0")
+
+
+def _photographs(
+    folder: Path, images: Path | str | None, masks: Path | str | None
+) -> tuple[Path, list[PosedPhotograph]]:
+    """Find the model, and the files of its photographs."""
+    places = [folder / place for place in _PLACES]
+    endings = (".bin", ".txt")
+    found = [
+        place for place in places if any((place / f"cameras{end}").is_file() for end in endings)
+    ]
+    expect(bool(found), folder, _KIND, "cameras.bin or cameras.txt here or in sparse/0")
+    around = [found[0], found[0].parent, found[0].parent.parent, folder]
+    picture_folder = Path(images) if images else first_of([place / "images" for place in around])
+    expect(
+        picture_folder is not None and picture_folder.is_dir(),
+        folder,
+        _KIND,
+        "a folder `images` beside or above the model, or the folder of the photographs named",
+    )
+    assert picture_folder is not None
+    beside = picture_folder.parent / "masks"
+    mask_of = mask_finder(Path(masks) if masks else beside if beside.is_dir() else None, _KIND)
+    model = read_model(found[0])
+    paths = [inside(picture_folder, name, _KIND) for name in model.names]
+    photographs = [
+        PosedPhotograph(
+            name=name, image=path, mask=mask_of(path), lens=lens, cam_from_world=cam_from_world
+        )
+        for name, path, lens, cam_from_world in zip(
+            model.names, paths, model.lenses, model.cam_from_world, strict=True
+        )
+    ]
+    return found[0], photographs
+
+
+def _lenses(cameras: Cameras) -> tuple[Lens, ...]:
+    """Give every view its pinhole; views with equal ones share a camera."""
+    numbers: dict[tuple[float, ...], int] = {}
+    lenses = []
+    for K, (width, height) in zip(
+        cameras.intrinsics.detach().cpu().double(), cameras.sizes_px.tolist(), strict=True
+    ):
+        params = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        camera = numbers.setdefault((*params, width, height), len(numbers) + 1)
+        lenses.append(
+            Lens(camera=camera, model="PINHOLE", params=params, width=width, height=height)
+        )
+    return tuple(lenses)

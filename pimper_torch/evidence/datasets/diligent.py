@@ -1,0 +1,280 @@
+"""DiLiGenT: objects under 96 lights from one viewpoint; and its normal maps with depth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets.layout import contents, expect, inside, read_text
+from pimper_torch.evidence.datasets.layout import numbers as numbers_of
+from pimper_torch.evidence.datasets.matlab import read_matlab
+from pimper_torch.evidence.datasets.raster import (
+    intrinsics_from_indices,
+    nearest,
+    read_photographs,
+    there,
+)
+from pimper_torch.evidence.datasets.sampling import choose_photographs
+from pimper_torch.io.decode import decode
+from pimper_torch.io.photographs import read_mask
+from pimper_torch.radiometry import LINEAR
+from pimper_torch.records import Capture, Record, Truth
+
+KIND = "DiLiGenT"
+# Photometric stereo's axes are x right, y up, z towards the viewer; this turns them to ours.
+FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+_SHORTEST = 0.5  # a decoded normal shorter than this is background
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class LampFiles(Record):
+    """The photographs of one viewpoint and their lights, in the files' own axes.
+
+    Attributes:
+        paths: One photograph a light.
+        directions: Unit, from the object to the lamp; x right, y up, z to the viewer.
+        intensities: Red, green, blue.
+    """
+
+    paths: tuple[Path, ...]
+    directions: Float[Tensor, "light 3"]
+    intensities: Float[Tensor, "light 3"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class NormalMap(Record):
+    """A normal map to integrate, with what is known about the surface behind it.
+
+    Attributes:
+        normals: Unit, facing the viewer (``n_z < 0``), camera frame; zero off the mask.
+        mask: True on the object.
+        intrinsics: ``K`` in our pixels; ``None`` for an orthographic map.
+        depth: True depth along the camera's z, millimetres; infinite where nobody knows;
+            ``None`` if the set has none.
+    """
+
+    normals: Float[Tensor, "height width 3"]
+    mask: Bool[Tensor, "height width"]
+    intrinsics: Float[Tensor, "3 3"] | None
+    depth: Float[Tensor, "height width"] | None
+
+
+def read_diligent(
+    folder: Path | str,
+    *,
+    lights: Sequence[int] | None = None,
+    light_seed: int | None = None,
+    max_size_px: int = 0,
+    divide_by_intensity: bool = False,
+) -> Capture:
+    """Read an object of DiLiGenT: one viewpoint, 96 lights, true normals.
+
+    ``folder`` is the object's, such as ``pmsData/bearPNG``::
+
+        001.png ... 096.png              16 bits, linear
+        filenames.txt                    their order; 001.png and so on where it is absent
+        light_directions.txt, light_intensities.txt, mask.png
+        Normal_gt.mat                    or Normal_gt.png, 8 or 16 bits
+
+    The camera was far away and is taken for orthographic, so there are no cameras, and the
+    world is the camera's frame: x right, y down, z forward. The files' light directions and
+    normals have y up and z towards the viewer and are turned. The first 20 photographs of
+    ``bearPNG`` are known to be faulty; leave them out by ``lights=range(21, 97)``.
+
+    Args:
+        folder: Of one object.
+        lights: Read these lights only, from 1.
+        light_seed: Read one light, chosen by this seed; ``None`` reads all.
+        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+        divide_by_intensity: Divide photographs by the intensity of their lights, colour by
+            colour, as the benchmark does. Then 1 is no longer the level of saturation.
+
+    Raises:
+        InputError: Another layout; says what was expected and what is there.
+
+    Source: Shi, Mo, Wu, Duan, Yeung & Tan, A Benchmark Dataset and Evaluation for Non-Lambertian
+    and Uncalibrated Photometric Stereo, PAMI 41(2), 2019.
+    """
+    root = Path(folder)
+    files = lamp_files(root, KIND)
+    count = len(files.paths)
+    kept = choose_photographs(
+        [1] * count,
+        list(range(1, count + 1)),
+        positions=None,
+        lights=lights,
+        light_seed=light_seed,
+        place=root,
+        kind=KIND,
+    )
+    intensity = files.intensities[kept]
+    views = read_photographs(
+        [files.paths[index] for index in kept],
+        [files.paths[index].name for index in kept],
+        encoding=LINEAR,
+        max_size_px=max_size_px,
+        masks=[root / "mask.png"] * len(kept),
+        divide_by=intensity if divide_by_intensity else None,
+    )
+    width, height = (int(side) for side in views.sizes_px[0])
+    normals = read_normals(root, KIND)
+    if normals is not None:
+        turned = nearest(normals, width, height)
+        normals = turned[None].expand(len(kept), -1, -1, -1)
+    strength = torch.ones(len(kept)) if divide_by_intensity else intensity.mean(dim=1)
+    return Capture(
+        views=views,
+        cameras=None,
+        truth=Truth(
+            normals_world=normals,
+            foreground=views.masks,
+            lights_world=directed_lights(files.directions[kept] * FLIP, strength),
+        ),
+        position=torch.ones(len(kept), dtype=torch.long),
+        light=torch.tensor(kept) + 1,
+    )
+
+
+def read_normal_map(folder: Path | str) -> NormalMap:
+    """Read a normal map as the bilateral-integration set distributes it.
+
+    ``normal_map.png`` (8 or 16 bits a channel) holds ``(n + 1) / 2`` with y up and z towards
+    the viewer, ``mask.png`` the object; ``K.txt`` and ``depth_gt.npz`` (``depth_gt``, NaN where
+    unknown) are optional. On the five DiLiGenT objects the turned normals agree with those of
+    the true depth to 0.8 to 3.9 degrees in the mean, and with no other choice of signs to
+    better than 38. ``K`` counts pixel centres from 0.
+
+    Args:
+        folder: Of one object.
+
+    Raises:
+        InputError: Another layout; says what was expected and what is there.
+
+    Source: Cao, Santo, Shi, Okura & Matsushita, Bilateral Normal Integration, ECCV 2022.
+    """
+    root, kind = Path(folder), "a normal map to integrate"
+    for name in ("normal_map.png", "mask.png"):
+        expect((root / name).is_file(), root, kind, name)
+    mask = read_mask(there(root / "mask.png"))
+    normals = decoded_normals(root / "normal_map.png", kind)
+    _same_shape(normals.shape[:2], mask.shape, root, kind, "normal_map.png")
+    K_path, depth_path = root / "K.txt", root / "depth_gt.npz"
+    K = None
+    if K_path.is_file():
+        K = numbers_of(read_text(K_path, kind), 9, "K", K_path, kind).reshape(3, 3)
+        K = intrinsics_from_indices(K)
+    depth = _read_depth(depth_path, kind) if depth_path.is_file() else None
+    if depth is not None:
+        _same_shape(depth.shape, mask.shape, root, kind, "depth_gt.npz")
+    return NormalMap(
+        normals=torch.where(mask[..., None], normals, 0), mask=mask, intrinsics=K, depth=depth
+    )
+
+
+def lamp_files(folder: Path, kind: str) -> LampFiles:
+    """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``.
+
+    Raises:
+        InputError: Texts are missing, or photographs and lights differ in number.
+    """
+    for name in ("light_directions.txt", "light_intensities.txt"):
+        expect((folder / name).is_file(), folder, kind, name)
+    directions = _rows_of_three(folder / "light_directions.txt", kind)
+    intensities = _rows_of_three(folder / "light_intensities.txt", kind)
+    listed = folder / "filenames.txt"
+    if listed.is_file():
+        names = read_text(listed, kind).split()
+    else:
+        names = [f"{lamp + 1:03d}.png" for lamp in range(len(directions))]
+    expect(
+        len(names) == len(directions) == len(intensities) > 0,
+        folder,
+        kind,
+        "as many photographs as light directions and intensities",
+        f"{len(names)}, {len(directions)} and {len(intensities)}",
+    )
+    expect(bool((intensities > 0).all()), folder, kind, "intensities above 0", "others")
+    return LampFiles(
+        paths=tuple(inside(folder, name, kind) for name in names),
+        directions=normalize(directions, dim=-1),
+        intensities=intensities,
+    )
+
+
+def read_normals(folder: Path, kind: str) -> Float[Tensor, "height width 3"] | None:
+    """Read ``Normal_gt`` in our camera frame (facing the viewer is ``n_z < 0``).
+
+    Zero where the file knows none; ``None`` without such a file.
+    """
+    matlab, picture = folder / "Normal_gt.mat", folder / "Normal_gt.png"
+    if matlab.is_file():
+        array = read_matlab(matlab, ("Normal_gt",), kind)["Normal_gt"]
+        expect(
+            array.ndim == 3 and array.shape[2] == 3,
+            matlab,
+            kind,
+            "Normal_gt of height x width x 3",
+            f"shape {' x '.join(str(side) for side in array.shape)}",
+        )
+        return _faced(torch.from_numpy(array.astype(np.float32)))
+    return decoded_normals(picture, kind) if picture.is_file() else None
+
+
+def decoded_normals(path: Path, kind: str) -> Float[Tensor, "height width 3"]:
+    """Read normals kept as colours ``(n + 1) / 2``, y up, into our camera frame."""
+    samples = decode(path).samples
+    expect(samples.shape[0] == 3, path, kind, "normals as red, green and blue", "one channel")
+    return _faced(samples.movedim(0, -1) * 2 - 1)
+
+
+def directed_lights(
+    directions_world: Float[Tensor, "view 3"], strength: Float[Tensor, " view"]
+) -> Float[Tensor, "view 4"]:
+    """Give the first-order light of distant lamps without any ambient light."""
+    directed = strength[:, None] * directions_world
+    return torch.cat([torch.zeros_like(directed[:, :1]), directed], dim=1).float()
+
+
+def _faced(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
+    turned = normals.nan_to_num(0) * FLIP.float()
+    known = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > _SHORTEST
+    return torch.where(known, normalize(turned, dim=-1), 0)
+
+
+def _rows_of_three(path: Path, kind: str) -> Float[Tensor, "row 3"]:
+    words = read_text(path, kind).split()
+    expect(
+        len(words) % 3 == 0 and bool(words), path, kind, "rows of three numbers", f"{len(words)}"
+    )
+    return numbers_of(words, len(words), "rows of three", path, kind).reshape(-1, 3)
+
+
+def _read_depth(path: Path, kind: str) -> Float[Tensor, "height width"]:
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            array = held["depth_gt"].astype(np.float32)
+    except Exception as error:  # numpy's readers raise whatever a damaged file leads to
+        raise InputError(
+            f"{path}: cannot be read ({error}); needed: an array depth_gt. Copy the file again."
+        ) from error
+    expect(array.ndim == 2, path, kind, "depth_gt of height x width", f"{array.ndim} axes")
+    depth = torch.from_numpy(array)
+    return torch.where(depth.isfinite() & (depth > 0), depth, torch.inf)
+
+
+def _same_shape(
+    shape: Sequence[int], expected: Sequence[int], root: Path, kind: str, name: str
+) -> None:
+    expect(
+        tuple(shape) == tuple(expected),
+        root,
+        kind,
+        f"{name} of the mask's {expected[1]} x {expected[0]}",
+        f"{shape[1]} x {shape[0]}; the folder holds {contents(root)}",
+    )

@@ -1,0 +1,61 @@
+"""What the two DTU sets share: one camera, one calibrated size, several lamps a place."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, read_photographs
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.radiometry import Encoding
+from pimper_torch.records import Cameras, Capture, Truth
+
+CALIBRATED_WIDTH = 1600  # of 1600 x 1200; copies of half the size exist
+
+
+def dtu_capture(
+    paths: Sequence[Path],
+    places: Sequence[int],
+    lamps: Sequence[int],
+    cameras: tuple[Float[Tensor, "place 3 3"], Float[Tensor, "place 4 4"]],
+    truth: Truth,
+    *,
+    encoding: Encoding,
+    max_size_px: int,
+) -> Capture:
+    """Read photographs and give each the camera of its place.
+
+    Args:
+        paths: Of the photographs.
+        places: Of each.
+        lamps: Of each.
+        cameras: Intrinsics, whose pixels count from the centre of the first one, and poses of
+            the different places in ascending order.
+        truth: Of the scene.
+        encoding: Response, saturation and black level of the files.
+        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+
+    Raises:
+        InputError: A photograph cannot be read, or their sizes differ.
+    """
+    order = sorted(set(places))
+    index = torch.tensor([order.index(place) for place in places])
+    views = read_photographs(
+        paths, [path.name for path in paths], encoding=encoding, max_size_px=max_size_px
+    )
+    K, cam_from_world = cameras
+    factor = float(views.sizes_px[0, 0]) / CALIBRATED_WIDTH
+    K = scale_intrinsics(intrinsics_from_indices(K), factor, factor)
+    return Capture(
+        views=views,
+        cameras=Cameras(
+            intrinsics=K[index].float(),
+            cam_from_world=cam_from_world[index].float(),
+            sizes_px=views.sizes_px,
+        ),
+        truth=truth,
+        position=torch.tensor(places),
+        light=torch.tensor(lamps),
+    )

@@ -1,0 +1,278 @@
+"""IDR and NeuS: ``cameras.npz`` beside ``image/`` and ``mask/``; read and written."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets.layout import expect, first_of, numbers
+from pimper_torch.evidence.datasets.pictures import write_mask, write_picture
+from pimper_torch.evidence.datasets.posed import (
+    PosedPhotograph,
+    assemble,
+    image_files,
+    pinhole_lens,
+)
+from pimper_torch.evidence.datasets.projections import decompose_projections
+from pimper_torch.geometry.pixels import indices_from_pixels, pixels_from_indices
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.decode import read_header
+from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.records import Cameras, Capture, Views
+
+_KIND = "an IDR or NeuS set"
+_CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz", "cameras_large.npz")
+# The object takes this share of the unit sphere, so that nothing of it touches the rim.
+_SHARE = 0.9
+
+
+def read_idr(
+    folder: Path | str,
+    *,
+    camera_file: str | None = None,
+    names: Sequence[str] | None = None,
+    mesh: Path | str | None = None,
+    encoding: Encoding = SRGB,
+    max_size_px: int = 0,
+) -> Capture:
+    """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
+
+    ``world_mat_i`` is ``K [R t]`` as a 4x4 matrix, from the world to pixels, with our camera
+    axes; ``scale_mat_i``, from the unit sphere round the object to the world, is left out
+    here (:func:`read_scale_mats` gives it): cameras and truth are in the world's units.
+    Arrays belong to the images in plain order of their names. IDR and NeuS cast rays through
+    whole numbers (``uv`` of ``mgrid``, ``pixels_x`` of ``arange``): they count centres from
+    0, so half a pixel is added.
+
+    Args:
+        folder: Of the set.
+        camera_file: Its name; by default ``cameras.npz``, ``cameras_sphere.npz`` or
+            ``cameras_large.npz``.
+        names: Keep these photographs, in this order.
+        mesh: File of the true surface, if it is known, in the world's units.
+        encoding: Response, saturation and black level of the files.
+        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+
+    Raises:
+        InputError: The folder is laid out otherwise, or a file is missing or damaged.
+    """
+    folder = Path(folder)
+    path = _camera_file(folder, camera_file)
+    files = image_files(folder / "image", _KIND)
+    masks: list[Path | None] = [None] * len(files)
+    if (folder / "mask").is_dir():
+        masks = list(image_files(folder / "mask", _KIND))
+    expect(
+        len(masks) == len(files),
+        folder / "mask",
+        _KIND,
+        f"{len(files)} masks, one for each image",
+        f"{len(masks)}",
+    )
+    matrices = _matrices(path, "world_mat", len(files))
+    photographs = [
+        _photograph(image, mask, matrix, f"world_mat_{index}", path)
+        for index, (image, mask, matrix) in enumerate(zip(files, masks, matrices, strict=True))
+    ]
+    return assemble(
+        photographs,
+        folder,
+        _KIND,
+        names=names,
+        mesh=mesh,
+        encoding=encoding,
+        max_size_px=max_size_px,
+    )
+
+
+def read_scale_mats(
+    folder: Path | str, *, camera_file: str | None = None
+) -> Float[Tensor, "view 4 4"]:
+    """Read ``scale_mat_i``: ``world_from_unit``, from the unit sphere to the world.
+
+    Args:
+        folder: Of the set.
+        camera_file: As for :func:`read_idr`.
+
+    Raises:
+        InputError: The file is not there or has none.
+    """
+    path = _camera_file(Path(folder), camera_file)
+    return _matrices(path, "scale_mat", len(image_files(Path(folder) / "image", _KIND)))
+
+
+def write_idr(
+    views: Views,
+    cameras: Cameras,
+    folder: Path,
+    *,
+    points_world: Float[Tensor, "point 3"] | None = None,
+) -> None:
+    """Write ``image/``, ``mask/`` and ``cameras.npz`` (and the same as ``cameras_sphere.npz``).
+
+    Images are numbered in the order of the views. Their masks are white all over where there
+    are none: the programs want some.
+
+    Args:
+        views: Undistorted.
+        cameras: One a view.
+        folder: Made if it is not there.
+        points_world: On the object: ``scale_mat`` puts them into the unit sphere. Without
+            them the sphere is guessed from masks and cameras, see :func:`unit_sphere`.
+
+    Raises:
+        InputError: There is nothing to guess the sphere from.
+    """
+    digits = max(3, len(str(views.num_views - 1)))
+    for index in range(views.num_views):
+        write_picture(views, index, folder / "image" / f"{index:0{digits}d}.png")
+        write_mask(views, index, folder / "mask" / f"{index:0{digits}d}.png")
+    K = cameras.intrinsics.detach().cpu().double().clone()
+    K[:, :2, 2] = indices_from_pixels(K[:, :2, 2])
+    pose = cameras.cam_from_world.detach().cpu().double()
+    world_mat = pose.clone()
+    world_mat[:, :3] = K @ pose[:, :3]
+    scale_mat = unit_sphere(cameras, points_world, views.masks)
+    arrays: dict[str, np.ndarray] = {}
+    for index, matrix in enumerate(world_mat):
+        arrays[f"world_mat_{index}"] = matrix.numpy()
+        arrays[f"scale_mat_{index}"] = scale_mat.numpy()
+    for name in _CAMERA_FILES[:2]:
+        np.savez(folder / name, allow_pickle=False, **arrays)
+
+
+def unit_sphere(
+    cameras: Cameras,
+    points_world: Float[Tensor, "point 3"] | None = None,
+    masks: Bool[Tensor, "view height width"] | None = None,
+) -> Float[Tensor, "4 4"]:
+    """Give ``world_from_unit`` of a sphere that holds the object.
+
+    With points it is centred on their bounding box, and nine tenths of its radius reach the
+    farthest. Without, it is centred where the optical axes come nearest to one another (in
+    the least-squares sense); there it reaches as far as the masks do in the view that shows
+    most, by nine tenths, or else as the corners of the median view.
+
+    Args:
+        cameras: Not all looking the same way, unless there are points.
+        points_world: On the object; at least two different ones.
+        masks: True on the object.
+
+    Raises:
+        InputError: The points are one and the same, the axes are parallel, or the cameras
+            look away from where they meet.
+    """
+    if points_world is not None:
+        points = points_world.detach().cpu().double()
+        center = (points.amin(dim=0) + points.amax(dim=0)) / 2
+        radius = float((points - center).norm(dim=-1).max()) / _SHARE
+    else:
+        center = _looked_at(cameras)
+        reaches = torch.tensor(
+            [_reach(cameras, center, masks, v) for v in range(len(cameras.sizes_px))]
+        )
+        radius = float(reaches.median() if masks is None else reaches.max() / _SHARE)
+    if not radius > 0:
+        raise InputError(
+            "the sphere round the object has no size; needed: points on the object, or cameras "
+            "that look at it from several sides."
+        )
+    world_from_unit = torch.eye(4, dtype=torch.float64)
+    world_from_unit[:3] *= radius
+    world_from_unit[:3, 3] = center
+    return world_from_unit
+
+
+def _looked_at(cameras: Cameras) -> Float[Tensor, "3"]:
+    """Find the point nearest to all optical axes."""
+    axes = cameras.cam_from_world[:, 2, :3].detach().cpu().double()
+    centers = cameras.centers_world.detach().cpu().double()
+    # A point's squared distance from an axis is |(I - a a^T) (x - c)|^2.
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    system, right = across.sum(dim=0), (across @ centers[..., None]).sum(dim=0)[:, 0]
+    if float(torch.linalg.eigvalsh(system)[0]) < 1e-6 * len(axes):
+        raise InputError(
+            "the cameras all look the same way, so nothing tells where the object is; needed: "
+            "points on it (a mesh), or cameras that look at it from several sides."
+        )
+    return torch.linalg.solve(system, right)
+
+
+def _reach(
+    cameras: Cameras,
+    center: Float[Tensor, "3"],
+    masks: Bool[Tensor, "view height width"] | None,
+    view: int,
+) -> float:
+    """Tell how far a view's mask, or image, reaches from a point, at the depth of the point."""
+    pose = cameras.cam_from_world[view].detach().cpu().double()
+    K = cameras.intrinsics[view].detach().cpu().double()
+    width, height = (float(side) for side in cameras.sizes_px[view])
+    if masks is None:
+        pixels = K.new_tensor([[0, 0], [width, 0], [0, height], [width, height]])
+    else:
+        pixels = torch.nonzero(masks[view].cpu()).flip(-1) + 0.5
+        pixels = pixels.to(K)
+    here, depth = project(center[None], pose, K)
+    if not len(pixels) or float(depth) <= 0:
+        return 0.0
+    return float(((pixels - here) / K.diagonal()[:2]).norm(dim=-1).max() * depth)
+
+
+def _camera_file(folder: Path, name: str | None) -> Path:
+    names = _CAMERA_FILES if name is None else (name,)
+    path = first_of([folder / one for one in names])
+    expect(path is not None, folder, _KIND, f"a file {' or '.join(names)}")
+    assert path is not None
+    return path
+
+
+def _matrices(path: Path, key: str, count: int) -> Float[Tensor, "view 4 4"]:
+    """Read ``key_0`` and so on, and refuse more or fewer than there are images."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            expect(isinstance(file, Mapping), path, _KIND, "an .npz archive", "a lone array")
+            held = sorted(name for name in file.files if name.startswith(f"{key}_"))
+            arrays = {name: np.asarray(file[name]) for name in held if "inv" not in name}
+    except (OSError, ValueError, EOFError, BadZipFile, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({error}); needed: an archive of arrays as numpy.savez "
+            "writes it. Copy it again."
+        ) from error
+    wanted = [f"{key}_{index}" for index in range(count)]
+    expect(
+        set(arrays) == set(wanted) and bool(wanted),
+        path,
+        _KIND,
+        f"{key}_0 to {key}_{count - 1}, one for each file in image/",
+        f"{len(arrays)} of them",
+    )
+    return torch.stack(
+        [numbers(arrays[name], 16, name, path, _KIND).reshape(4, 4) for name in wanted]
+    )
+
+
+def _photograph(
+    image: Path, mask: Path | None, world_mat: Float[Tensor, "4 4"], what: str, path: Path
+) -> PosedPhotograph:
+    try:
+        intrinsics, poses = decompose_projections(world_mat[None, :3])
+    except ValueError as error:
+        expect(False, path, _KIND, f"K [R t] in {what}", str(error))
+        raise
+    K = intrinsics[0].clone()
+    K[:2, 2] = pixels_from_indices(K[:2, 2])
+    header = read_header(image)
+    return PosedPhotograph(
+        name=image.name,
+        image=image,
+        mask=mask,
+        lens=pinhole_lens(K, (header.width, header.height)),
+        skew_px=float(K[0, 1]),
+        cam_from_world=poses[0],
+    )

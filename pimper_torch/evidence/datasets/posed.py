@@ -1,0 +1,333 @@
+"""Photographs whose cameras are known: from files to a capture."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets.layout import expect
+from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.io.decode import SUFFIXES, decode, read_header
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.io.photographs import shrunk_size, some
+from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
+from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.records import Cameras, Capture, Lens, Record, Truth, Views
+from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
+from pimper_torch.sfm.undistort import pinhole_for, undistort
+
+_HALF = 0.5
+# Files round a rotation to some digits; more than this is a scale or a reflection.
+_MOST_FROM_ROTATION = 1e-2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PosedPhotograph(Record):
+    """What a data set says about one photograph.
+
+    Attributes:
+        name: Unique in the set.
+        image: Its file.
+        mask: File of its mask; ``None`` where there is none. Of any size: it is stretched
+            over the photograph.
+        cam_from_world: Rigid, in float64.
+        lens: In our pixels (top-left centre at (0.5, 0.5)), for a size of its own; the file
+            may be a smaller copy.
+        skew_px: ``K[0, 1]``; only a lens without distortion may have one.
+    """
+
+    name: str
+    image: Path
+    cam_from_world: Float[Tensor, "4 4"]
+    lens: Lens
+    skew_px: float = 0.0
+    mask: Path | None = None
+
+
+def assemble(
+    photographs: Sequence[PosedPhotograph],
+    place: Path,
+    kind: str,
+    *,
+    names: Sequence[str] | None = None,
+    mesh: Path | str | None = None,
+    encoding: Encoding = SRGB,
+    max_size_px: int = 0,
+    one_light: bool = False,
+) -> Capture:
+    """Read photographs, undistort them and put them beside their cameras.
+
+    A photograph without a mask file shows the object where its alpha channel, if it has one
+    that is somewhere transparent, is opaque; else everywhere.
+
+    Args:
+        photographs: All that the data set has.
+        place: Its file or folder, for messages.
+        kind: Its name, for messages.
+        names: Keep these, in this order; ``None`` for all.
+        mesh: File of the true surface, in the data set's frame.
+        encoding: Response, saturation and black level of the files.
+        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
+            leaves them as they are.
+        one_light: All were taken under the same light; else each is taken to have its own.
+
+    Returns:
+        Photographs in float32, cameras and truth in float64, on the CPU.
+
+    Raises:
+        InputError: A name that is not there or there twice, a missing or damaged file, or a
+            photograph whose shape is not its camera's.
+    """
+    if max_size_px < 0:
+        raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
+    chosen = _select(photographs, names, place, kind)
+    views = read_views(chosen, encoding=encoding, max_size_px=max_size_px)
+    lenses = fitted_lenses(chosen, views)
+    undistorted, _ = undistort(views, lenses)
+    count = views.num_views
+    return Capture(
+        views=undistorted,
+        cameras=Cameras(
+            intrinsics=torch.stack(
+                [_intrinsics(one, lens) for one, lens in zip(chosen, lenses, strict=True)]
+            ),
+            cam_from_world=torch.stack([one.cam_from_world for one in chosen]),
+            sizes_px=undistorted.sizes_px,
+        ),
+        truth=Truth(mesh=None if mesh is None else read_mesh(mesh)),
+        position=torch.arange(count),
+        light=torch.zeros(count, dtype=torch.long) if one_light else torch.arange(count),
+    )
+
+
+def read_views(
+    photographs: Sequence[PosedPhotograph], *, encoding: Encoding = SRGB, max_size_px: int = 0
+) -> Views:
+    """Read photographs as their lenses saw them, linear, padded to one raster.
+
+    Args:
+        photographs: At least one.
+        encoding: Response, saturation and black level of the files.
+        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+
+    Raises:
+        InputError: Names a file that is damaged, or a mask without anything in it.
+    """
+    headers = [read_header(one.image) for one in photographs]
+    sizes = [shrunk_size(header, max_size_px) for header in headers]
+    paths = [one.image for one in photographs]
+    pictures = read_pictures(paths, headers, sizes, encoding)
+    images = pictures.images
+    masks = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
+    has_masks = False
+    for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
+        mask = photographs[index].mask
+        has_masks = has_masks or opaque is not None or mask is not None
+        if mask is None and opaque is not None:
+            masks[index] = opaque
+        else:
+            drawn = None if mask is None else _read_mask(mask)
+            masks[index, :high, :wide] = resized_mask(drawn, wide, high)
+    focals = [
+        header.focal_px * max(size) / max(header.width, header.height)
+        for header, size in zip(headers, sizes, strict=True)
+    ]
+    return Views(
+        images=images,
+        sizes_px=torch.tensor(sizes),
+        names=tuple(one.name for one in photographs),
+        masks=masks if has_masks else None,
+        focals_px=torch.tensor(focals, dtype=torch.float32),
+    )
+
+
+def shrink(views: Views, cameras: Cameras, max_size_px: int) -> tuple[Views, Cameras]:
+    """Shrink photographs whose longer side is longer, and let their pinholes follow.
+
+    Args:
+        views: Any; padding stays zero.
+        cameras: One a view.
+        max_size_px: The longest side; 0 leaves all as they are.
+    """
+    full = views.sizes_px.tolist()
+    shares = [min(1.0, max_size_px / max(size)) if max_size_px else 1.0 for size in full]
+    sizes = [
+        (max(1, round(share * width)), max(1, round(share * height)))
+        for share, (width, height) in zip(shares, full, strict=True)
+    ]
+    width, height = (max(sides) for sides in zip(*sizes, strict=True))
+    images = views.images.new_zeros(*views.images.shape[:2], height, width)
+    masks = torch.zeros(len(sizes), height, width, dtype=torch.bool)
+    for index, ((wide, high), (w, h)) in enumerate(zip(full, sizes, strict=True)):
+        images[index, :, :h, :w] = resized_radiance(views.images[index, :, :high, :wide], w, h)
+        if views.masks is not None:
+            masks[index, :h, :w] = resized_mask(views.masks[index, :high, :wide].float(), w, h)
+    intrinsics = [
+        scale_intrinsics(K, w / wide, h / high)
+        for K, (wide, high), (w, h) in zip(cameras.intrinsics, full, sizes, strict=True)
+    ]
+    sizes_px = torch.tensor(sizes)
+    small = views.replace(
+        images=images,
+        sizes_px=sizes_px,
+        masks=None if views.masks is None else masks,
+        focals_px=views.focals_px * torch.tensor(shares).to(views.focals_px),
+    )
+    return small, cameras.replace(intrinsics=torch.stack(intrinsics), sizes_px=sizes_px)
+
+
+def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple[Lens, ...]:
+    """Let each lens follow its photograph to the size it was read at.
+
+    Raises:
+        InputError: A photograph of another shape than its lens is for.
+    """
+    lenses = []
+    for one, (width, height) in zip(photographs, views.sizes_px.tolist(), strict=True):
+        lens = one.lens
+        if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height):
+            raise InputError(
+                f"{one.image}: has the shape {width} x {height}, but its camera is for "
+                f"{lens.width} x {lens.height}. Needed: the photograph that the camera belongs to, "
+                "or a smaller copy of it, not cropped and not turned (EXIF orientation is applied)."
+            )
+        same = (width, height) == (lens.width, lens.height)
+        lenses.append(lens if same else rescale_lens(lens, width, height))
+    return tuple(lenses)
+
+
+def pinhole_lens(
+    intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int], camera: int = 1
+) -> Lens:
+    """Give the lens of a pinhole's ``K``, but for its skew."""
+    fx, fy, cx, cy = (float(intrinsics[row, column]) for row, column in _PINHOLE)
+    return Lens(
+        camera=camera, model="PINHOLE", params=(fx, fy, cx, cy), width=size_px[0], height=size_px[1]
+    )
+
+
+_PINHOLE = ((0, 0), (1, 1), (0, 2), (1, 2))
+
+
+def rigid_or_refuse(
+    rotation: Float[Tensor, "3 3"],
+    translation: Float[Tensor, "3"],
+    what: str,
+    place: Path,
+    kind: str,
+) -> Float[Tensor, "4 4"]:
+    """Put a file's rotation and translation together, the rotation made exact.
+
+    Raises:
+        InputError: The matrix is further from a rotation than rounding explains.
+    """
+    U, _, Vh = torch.linalg.svd(rotation)
+    nearest = U @ Vh
+    off = float((rotation - nearest).abs().max())
+    mirrored = bool(torch.linalg.det(nearest) < 0)
+    expect(
+        off <= _MOST_FROM_ROTATION and not mirrored,
+        place,
+        kind,
+        f"a rotation in {what}",
+        "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation",
+    )
+    return rigid(nearest, translation)
+
+
+def image_files(folder: Path, kind: str) -> list[Path]:
+    """List a folder's images in plain order of their names, as Python's ``sorted`` has it.
+
+    Data sets that number their cameras, not name them, mean this order: ``10`` before ``2``.
+
+    Raises:
+        InputError: No such folder, no images in it, or a link that leads out of it.
+    """
+    expect(folder.is_dir(), folder, kind, "a folder of images")
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    paths = sorted(path for path in paths if not path.name.startswith(".") and path.is_file())
+    expect(bool(paths), folder, kind, f"images ({', '.join(SUFFIXES)})")
+    outside = [path.name for path in paths if path.resolve().parent != folder.resolve()]
+    expect(not outside, folder, kind, "images, not links out of the folder", some(outside))
+    return paths
+
+
+def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]:
+    """Give a function that finds the mask of a photograph in a folder.
+
+    A mask is called as its photograph but for the suffix, as COLMAP has it (``17.jpg.png``),
+    or begins with that name and goes on with ``-``, ``_`` or a dot (``17-mask.png``).
+
+    Raises:
+        InputError: The folder holds no images; the function raises it for a photograph
+            without a mask or with several.
+    """
+    if folder is None:
+        return lambda photograph: None
+    paths = image_files(folder, kind)
+
+    def find(photograph: Path) -> Path | None:
+        stem = photograph.stem
+        exact = [path for path in paths if path.stem in (stem, photograph.name)]
+        longer = [path for path in paths if path.name.startswith((f"{stem}-", f"{stem}_"))]
+        found = exact or longer
+        expect(
+            len(found) == 1,
+            folder,
+            kind,
+            f"one mask for {photograph.name}, such as {stem}.png",
+            some([path.name for path in found or paths]),
+        )
+        return found[0]
+
+    return find
+
+
+def _select(
+    photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, place: Path, kind: str
+) -> list[PosedPhotograph]:
+    by_name = {one.name: one for one in photographs}
+    repeated = sorted({one.name for one in photographs if by_name[one.name] is not one})
+    expect(not repeated, place, kind, "photographs of unlike names", f"several {some(repeated)}")
+    expect(bool(photographs), place, kind, "photographs with cameras", "none")
+    wanted = list(by_name) if names is None else list(names)
+    unknown = [name for name in wanted if name not in by_name]
+    if unknown or not wanted or len(set(wanted)) < len(wanted):
+        raise InputError(
+            f"{place}: asked for {some(unknown or wanted) or 'no photographs'}; needed: some of "
+            f"its {len(by_name)} photographs, each once: {some(list(by_name))}."
+        )
+    chosen = [by_name[name] for name in wanted]
+    missing = [one.image.name for one in chosen if not one.image.is_file()]
+    expect(not missing, place, kind, "the files of its photographs", f"no {some(missing)}")
+    return chosen
+
+
+def _intrinsics(one: PosedPhotograph, lens: Lens) -> Float[Tensor, "3 3"]:
+    assert one.skew_px == 0 or is_pinhole(lens), "skew and distortion together are undefined here"
+    K = pinhole_for(lens).clone()
+    K[0, 1] = one.skew_px * lens.width / one.lens.width
+    return K
+
+
+def _read_mask(path: Path) -> Float[Tensor, "height width"]:
+    """Give 1 on the object: where a mask is opaque, or at least half as bright as it gets."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; needed: the mask of a photograph.")
+    decoded = decode(path)
+    if decoded.alpha is not None and bool((decoded.alpha < _HALF).any()):
+        drawn = decoded.alpha >= _HALF
+    else:
+        brightness = decoded.samples.amax(dim=0)
+        drawn = (brightness > 0) & (brightness >= _HALF * brightness.max())
+    if not bool(drawn.any()):
+        raise InputError(
+            f"{path}: marks no pixel as object; needed: bright (or opaque) on the object, black "
+            "off it. Draw it again, or leave the photograph out."
+        )
+    return drawn.float()

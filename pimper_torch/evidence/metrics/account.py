@@ -1,0 +1,261 @@
+"""An evaluation in words and numbers: rows for the terminal, plain mappings for JSON."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from pimper_torch.evidence.metrics.calibration import Calibration
+from pimper_torch.evidence.metrics.distances import DistanceFigures, SurfaceComparison, TwoSided
+from pimper_torch.evidence.metrics.dtu import CAP_MM, THINNING_MM, DtuFigures
+from pimper_torch.evidence.metrics.evaluate import Evaluation
+from pimper_torch.evidence.metrics.in_view import ViewFigures
+from pimper_torch.evidence.metrics.lights import LightFigures
+from pimper_torch.evidence.metrics.poses import CameraFigures
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """A figure as a person reads it.
+
+    Attributes:
+        name: Of the convention, as in the JSON.
+        value: With its unit.
+        meaning: What it says, and over what.
+    """
+
+    name: str
+    value: str
+    meaning: str
+
+
+def account(evaluation: Evaluation) -> dict[str, object]:
+    """Give all figures as plain mappings, lists and numbers; what is not finite is ``None``.
+
+    Names are those of the records; those that end in ``_percent``, ``_deg`` are in these
+    units, the other lengths in scene units of the truth, and those of ``dtu`` in millimetres.
+    """
+    plain = _plain(evaluation)
+    assert isinstance(plain, dict)
+    return plain
+
+
+def rows(evaluation: Evaluation) -> list[tuple[str, list[Row]]]:
+    """Give the figures as a table: its sections with their rows, none of them empty."""
+    sections: list[tuple[str, Iterator[Row]]] = [("alignment", _alignment_rows(evaluation))]
+    if evaluation.surface is not None:
+        sections.append(("surface", _surface_rows(evaluation.surface)))
+    sections += [(f"along the rays of {view.name}", _view_rows(view)) for view in evaluation.views]
+    if evaluation.lights is not None:
+        sections.append(("lights", _light_rows(evaluation.lights)))
+    if evaluation.cameras is not None:
+        sections.append(("cameras", _camera_rows(evaluation.cameras)))
+    if evaluation.dtu is not None:
+        sections.append(("DTU protocol", _dtu_rows(evaluation.dtu)))
+    return [(title, found) for title, lines in sections if (found := list(lines))]
+
+
+def _alignment_rows(evaluation: Evaluation) -> Iterator[Row]:
+    alignment = evaluation.alignment
+    yield Row(name="method", value=alignment.method, meaning=alignment.description)
+    yield Row(
+        name="scale, rotation",
+        value=f"{_number(alignment.scale)}, {alignment.rotation_deg:.2f}°",
+        meaning="of the similarity that carries the result to the truth",
+    )
+    if alignment.residual is not None:
+        state = "came to rest" if alignment.converged else "stopped by the limit of iterations"
+        yield Row(
+            name="residual",
+            value=_number(alignment.residual),
+            meaning=f"root mean square of the samples kept, scene units; {state}",
+        )
+
+
+def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
+    yield Row(
+        name="diagonal",
+        value=_number(surface.diagonal),
+        meaning="of the true object's bounding box, scene units; % below are of it",
+    )
+    if surface.accuracy is not None:
+        yield _distance_row("accuracy", surface.accuracy, "result to truth: mean; median")
+    if surface.surroundings_share > 0:
+        yield Row(
+            name="surroundings_share",
+            value=_share(surface.surroundings_share),
+            meaning="of the result lies nearer to the surroundings; left out of the accuracy",
+        )
+    if surface.whole is not None:
+        yield from _two_sided_rows(surface.whole, "", "the whole truth")
+    if surface.seen is not None and surface.seen_share is not None:
+        part = f"the {_share(surface.seen_share)} of it seen from {surface.seen_from} places"
+        yield from _two_sided_rows(surface.seen, " (seen)", part)
+    if surface.calibration is not None:
+        yield from _calibration_rows(surface.calibration, surface.diagonal)
+
+
+def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[Row]:
+    yield Row(
+        name="expected_error",
+        value=f"{found.ratio:.2f}; {_share(found.within_one)}, {_share(found.within_two)}; "
+        f"{found.rank_correlation:.2f}",
+        meaning="true over expected error, 1 if calibrated; true error within one and two "
+        "expected, 68 and 95 % if calibrated; rank correlation",
+    )
+    for which, one in (("surest", found.bins[0]), ("least sure", found.bins[-1])):
+        yield Row(
+            name=f"{which} tenth",
+            value=f"{_number(100 * one.expected / diagonal)} %; "
+            f"{_number(100 * one.root_mean_square / diagonal)} %",
+            meaning="expected error; true error, root mean squares",
+        )
+
+
+def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[Row]:
+    yield _distance_row(
+        f"completeness{mark}", figures.completeness, f"truth to result, over {part}: mean; median"
+    )
+    for name, length, percent, meaning in (
+        ("chamfer_mean", figures.chamfer_mean, figures.chamfer_mean_percent, "mean"),
+        ("chamfer_sum", figures.chamfer_sum, figures.chamfer_sum_percent, "sum"),
+    ):
+        yield Row(
+            name=name + mark,
+            value=f"{_number(length)} ({_number(percent)} %)",
+            meaning=f"{meaning} of mean accuracy and mean completeness{mark}",
+        )
+    for at in figures.thresholds:
+        yield Row(
+            name=f"f_score{mark} at {at.threshold_percent:g} %",
+            value=_share(at.f_score),
+            meaning=f"precision {_share(at.precision)}, recall{mark} {_share(at.recall)}, nearer "
+            f"than {_number(at.threshold)}",
+        )
+
+
+def _view_rows(view: ViewFigures) -> Iterator[Row]:
+    yield Row(
+        name="relative_error",
+        value=f"{_number(view.relative_error)} %",
+        meaning="100 ||S - S'|| / ||S - mean S|| where both are met",
+    )
+    yield Row(
+        name="coverage",
+        value=_share(view.coverage),
+        meaning=f"of {view.pixels} true pixels are met by the result",
+    )
+    for name, angles, meaning in (
+        ("shape_normals", view.shape_normals, "normals of the mesh's shape: mean; median; pitted"),
+        ("carried_normals", view.carried_normals, "normals the mesh carries: mean; median; pitted"),
+    ):
+        if angles is not None:
+            value = (
+                f"{angles.mean_deg:.2f}°; {angles.median_deg:.2f}°; {angles.pitted_percent:.2f} %"
+            )
+            yield Row(name=name, value=value, meaning=meaning)
+    if view.albedo is not None:
+        yield Row(
+            name="albedo",
+            value=f"{view.albedo.one_scale_percent:.1f} %; "
+            f"{view.albedo.one_scale_median_percent:.1f} %",
+            meaning="after one scale: root mean square, least squares; median, median ratio",
+        )
+        yield Row(
+            name="albedo, channel scales",
+            value=f"{view.albedo.channel_scales_percent:.1f} %",
+            meaning="after a scale for each channel: root mean square, least squares",
+        )
+
+
+def _light_rows(lights: LightFigures) -> Iterator[Row]:
+    yield Row(
+        name="direction",
+        value=f"{lights.mean_deg:.2f}°; {lights.median_deg:.2f}°",
+        meaning=f"of {lights.lights} lights, in the frame of the truth: mean; median",
+    )
+    yield Row(
+        name="direction, rotated",
+        value=f"{lights.mean_rotated_deg:.2f}°; {lights.median_rotated_deg:.2f}°",
+        meaning=f"up to one rotation of all, by {lights.rotation_deg:.2f}°: mean; median",
+    )
+
+
+def _camera_rows(cameras: CameraFigures) -> Iterator[Row]:
+    yield Row(
+        name="missing",
+        value=f"{cameras.missing} of {cameras.views}",
+        meaning="photographs without a camera in the result",
+    )
+    yield Row(
+        name="rotation",
+        value=f"{cameras.mean_rotation_deg:.3f}°; {cameras.median_rotation_deg:.3f}°",
+        meaning="after the similarity on cameras: mean; median",
+    )
+    percent = cameras.mean_center_percent
+    away = "" if math.isnan(percent) else f", {_number(percent)} % of the way to the object"
+    yield Row(
+        name="center",
+        value=f"{_number(cameras.mean_center)}; {_number(cameras.median_center)}",
+        meaning=f"after the similarity on cameras, scene units: mean; median{away}",
+    )
+    yield Row(
+        name="focal",
+        value=f"{_number(cameras.mean_focal_percent)} %",
+        meaning="mean of the absolute differences of the focal length",
+    )
+    if not math.isnan(cameras.mean_place_percent):
+        yield Row(
+            name="places",
+            value=f"{cameras.mean_place_percent:.4f} %; {cameras.mean_bend_percent:.4f} %",
+            meaning="of the diagonal, that exact rays put points off: after the similarity on "
+            "cameras; after the best one",
+        )
+
+
+def _dtu_rows(dtu: DtuFigures) -> Iterator[Row]:
+    cap = f"{CAP_MM:g} mm or more"
+    yield Row(
+        name="accuracy",
+        value=f"{dtu.mean_accuracy:.4f} mm; {dtu.median_accuracy:.4f} mm",
+        meaning=f"{dtu.judged} points in the mask, thinned to {THINNING_MM:g} mm: mean; median; "
+        f"{_share(dtu.capped_share)} {cap}",
+    )
+    yield Row(
+        name="completeness",
+        value=f"{dtu.mean_completeness:.4f} mm; {dtu.median_completeness:.4f} mm",
+        meaning=f"{dtu.judged_true} points of the scan above the table: mean; median; "
+        f"{_share(dtu.capped_share_true)} {cap}",
+    )
+    yield Row(name="overall", value=f"{dtu.overall:.4f} mm", meaning="mean of the two means")
+
+
+def _distance_row(name: str, figures: DistanceFigures, meaning: str) -> Row:
+    value = (
+        f"{_number(figures.mean)} ({_number(figures.mean_percent)} %); "
+        f"{_number(figures.median)} ({_number(figures.median_percent)} %)"
+    )
+    return Row(name=name, value=value, meaning=meaning)
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}"
+
+
+def _share(value: float) -> str:
+    return f"{100 * value:.1f} %"
+
+
+def _plain(value: object) -> object:
+    if dataclasses.is_dataclass(value):
+        fields = dataclasses.fields(value)
+        return {field.name: _plain(getattr(value, field.name)) for field in fields}
+    if isinstance(value, Tensor):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

@@ -1,0 +1,80 @@
+"""Scenes ready to be photographed."""
+
+import torch
+
+from pimper_torch.evidence.scenes.bodies import Body
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.lights import wandering_lights
+from pimper_torch.evidence.scenes.meshes import potato, table
+from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.render import render_bodies
+from pimper_torch.evidence.scenes.rendered import RenderedScene
+from pimper_torch.evidence.scenes.sensor import SensorConfig
+
+
+def potato_on_table(
+    seed: int = 0,
+    *,
+    num_views: int = 12,
+    width: int = 640,
+    height: int = 480,
+    span_deg: float = 50.0,
+    flash: float = 0.0,
+    gloss: float = 0.0,
+    contrast: float = 1.5,
+    sensor: SensorConfig | None = None,
+) -> RenderedScene:
+    """Photograph a bumpy, textured potato under a lamp that moves between photographs.
+
+    The lamp is two to three times the potato's length away, so its light falls off over
+    the object, and the potato shadows itself and the table.
+
+    Args:
+        seed: Decides form, texture, lights and noise.
+        num_views: On an arc at about 35 degrees over the table.
+        width: Pixels.
+        height: Pixels.
+        span_deg: Of the arc.
+        flash: Irradiance of a lamp on the camera itself.
+        gloss: Share of light that the potato mirrors; 0.04 is varnish.
+        contrast: Of the texture; see :func:`random_speckle`.
+        sensor: ``None`` is the default one.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    bodies = (
+        Body(
+            mesh=potato(generator),
+            texture=random_speckle(generator, contrast=contrast),
+            specular=gloss,
+            roughness=0.35,
+        ),
+        Body(
+            mesh=table(),
+            texture=random_speckle(
+                generator, cells=(0.53, 0.23, 0.097, 0.043, 0.019), contrast=contrast
+            ),
+            surroundings=True,
+        ),
+    )
+    middle = (0.0, 0.0, 0.7)
+    cameras = arc_cameras(
+        num_views,
+        width=width,
+        height=height,
+        focal_px=1.25 * width,
+        distance=4.6,
+        span_deg=span_deg,
+        elevation_deg=35.0,
+        target=middle,
+        front=(0.0, -1.0, 0.0),
+        up=(0.0, 0.0, 1.0),
+    )
+    lights = wandering_lights(
+        num_views,
+        generator,
+        distance=6.0,
+        flash=flash,
+        target=middle,
+        toward=(0.0, -0.6, 0.8),
+    )
+    return render_bodies(bodies, cameras, lights, generator, sensor)

@@ -1,0 +1,150 @@
+"""Settings of rendered scenes."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pimper_torch.config import require
+from pimper_torch.evidence.scenes.sensor import SensorConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneConfig:
+    """How a scene is photographed.
+
+    Attributes:
+        num_views: Photographs.
+        width: Pixels.
+        height: Pixels.
+        seed: Of everything random: form, texture, lamp, hand and noise.
+        path: Of the camera: along an arc, once round at one height (the object turned), or
+            carried all round at three heights.
+        span_deg: Of the arc.
+        elevation_deg: Mean height of the camera over the table's plane.
+        sway_deg: How far the camera goes up and down along the arc.
+        fill: Share of the picture that the object takes, along the tighter side.
+        fixed_lamp: The lamp stands still beside the camera, as where the object turns; only with
+            the turntable. Else it goes to another place for every photograph.
+        fixed_room: A patterned floor and wall behind the object, which stand still before the
+            camera; only with the turntable. Else there is nothing beyond the table.
+        fixed_table: The table stands still before the camera, too, and the object alone turns;
+            only with the turntable. Else it turns with the object.
+        light: A near lamp, whose light falls off over the object, or one far away.
+        lamp_distance: Of the near lamp, in object sizes; up to a quarter nearer or farther.
+        irradiance: Of the lamp, as the radiance of white facing it; a quarter more or less.
+        ambient: Light from everywhere, as the radiance of white; a quarter more or less.
+        flash: Of a second lamp on the camera, like irradiance; 0 is none.
+        bounces: Of light between surfaces, on its way to the one that is seen.
+        exposure: Radiance is multiplied by it; what exceeds 1 saturates.
+        read_noise: Standard deviation of the sensor in the dark; 1 is saturation.
+        shot_noise: Variance that light adds, as a share of its radiance.
+        supersample: Rays a pixel, along each side, where pixels differ from their neighbours.
+        bits: Of a sample in the photographs.
+        encoding: sRGB as cameras write it, or samples proportional to radiance.
+        table: Its texture: cloth is modest, patterned has plenty of features all over.
+        up: Which axis of a mesh file points up.
+        turn_deg: Of the object about the upright axis, counter-clockwise seen from above.
+        albedo: Linear red, green and blue, uniform over the object; by default its texture.
+        specular: Share of light that the object mirrors head on, 0 is matte; by default the
+            scene's own, for a mesh file 0.
+        roughness: Of the highlight, 0.1 polished to 0.5 satin; by default the scene's own, for
+            a mesh file 0.3.
+        conductor: A metal that the object is made of: it has no matte part, and mirrors the
+            table, itself and the environment.
+        environment: A picture infinitely far away that the ambient light comes from: the same
+            in all photographs, or changing from one to the next. By default constant round a
+            conductor, else none.
+    """
+
+    num_views: int = 30
+    width: int = 1600
+    height: int = 1200
+    seed: int = 0
+    path: Literal["arc", "turntable", "handheld"] = "arc"
+    span_deg: float = 50.0
+    elevation_deg: float = 30.0
+    sway_deg: float = 4.0
+    fill: float = 0.94
+    fixed_lamp: bool = False
+    fixed_room: bool = False
+    fixed_table: bool = False
+    light: Literal["point", "directional"] = "point"
+    lamp_distance: float = 2.5
+    irradiance: float = 0.85
+    ambient: float = 0.1
+    flash: float = 0.0
+    bounces: int = 0
+    exposure: float = 1.0
+    read_noise: float = 0.002
+    shot_noise: float = 0.0001
+    supersample: int = 2
+    bits: Literal[8, 16] = 8
+    encoding: Literal["srgb", "linear"] = "srgb"
+    table: Literal["cloth", "patterned"] = "cloth"
+    up: Literal["x", "y", "z"] = "z"
+    turn_deg: float = 0.0
+    albedo: tuple[float, float, float] | None = None
+    specular: float | None = None
+    roughness: float | None = None
+    conductor: Literal["none", "copper", "gold", "silver"] = "none"
+    environment: Literal["none", "constant", "changing"] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be photographed."""
+        require(self.num_views >= 1, "num_views", self.num_views, "1 or more")
+        require(self.width >= 8, "width", self.width, "8 or more")
+        require(self.height >= 8, "height", self.height, "8 or more")
+        require(self.seed >= 0, "seed", self.seed, "0 or more")
+        require(0 < self.span_deg <= 360, "span_deg", self.span_deg, "above 0, at most 360")
+        lowest, highest = self.elevation_deg - self.sway_deg, self.elevation_deg + self.sway_deg
+        require(
+            self.sway_deg >= 0 and lowest >= 2 and highest <= 85,
+            "elevation_deg",
+            self.elevation_deg,
+            f"between 2 and 85 with {self.sway_deg} (sway_deg) taken from it or added",
+        )
+        require(0.1 <= self.fill <= 1, "fill", self.fill, "between 0.1 and 1")
+        for name in ("fixed_lamp", "fixed_room", "fixed_table"):
+            fixed = getattr(self, name)
+            require(
+                not fixed or self.path == "turntable",
+                name,
+                fixed,
+                f"path turntable instead of {self.path}, for what stands still before the camera",
+            )
+        require(self.lamp_distance >= 1, "lamp_distance", self.lamp_distance, "1 or more")
+        for name in ("irradiance", "ambient", "flash"):
+            value = getattr(self, name)
+            require(0 <= value < float("inf"), name, value, "0 or more")
+        require(
+            self.irradiance + self.ambient + self.flash > 0,
+            "irradiance",
+            self.irradiance,
+            "some light: irradiance, ambient or flash",
+        )
+        for channel in self.albedo or ():
+            require(0 <= channel <= 1, "albedo", self.albedo, "between 0 and 1 in every channel")
+        require(
+            self.conductor == "none" or (self.albedo is None and self.specular is None),
+            "conductor",
+            self.conductor,
+            "none with albedo or specular: a metal has no matte part, and its own reflectance",
+        )
+        require(0 <= self.bounces <= 8, "bounces", self.bounces, "between 0 and 8")
+        _ = self.sensor  # refuses its own
+
+    @property
+    def surrounded(self) -> Literal["none", "constant", "changing"]:
+        """The environment asked for, or that of the conductor."""
+        if self.environment is not None:
+            return self.environment
+        return "none" if self.conductor == "none" else "constant"
+
+    @property
+    def sensor(self) -> SensorConfig:
+        """The part that is the sensor's."""
+        return SensorConfig(
+            supersample=self.supersample,
+            read_noise=self.read_noise,
+            shot_noise=self.shot_noise,
+            exposure=self.exposure,
+        )

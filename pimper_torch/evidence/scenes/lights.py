@@ -1,0 +1,208 @@
+"""The light of each photograph of a rendered scene."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.evidence.scenes.environment import Environment
+from pimper_torch.records import Record
+
+# Farther by this factor, falloff over an object is below what float32 tells.
+_FAR = 1e5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Lamp(Record):
+    """The light of one photograph, in float32; see :class:`Lights`."""
+
+    position: Float[Tensor, " 3"]
+    target: Float[Tensor, " 3"]
+    irradiance: float
+    ambient: float
+    flash: float
+    environment: Environment | None = None
+
+    def surroundings(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Give the radiance that arrives from where there is no body; 0 without environment."""
+        if self.environment is None:
+            return torch.zeros_like(directions)
+        return self.ambient * self.environment(directions)
+
+    def arriving(
+        self, points: Float[Tensor, "*batch 3"], place: Float[Tensor, " 3"], irradiance: float
+    ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
+        """Give the direction to a light, and the irradiance across it, at points.
+
+        Args:
+            points: World.
+            place: Of the light.
+            irradiance: Of the light at the target.
+        """
+        toward = place - points
+        distance = toward.norm(dim=-1)
+        falloff = ((place - self.target).norm() / distance) ** 2
+        return toward / distance[..., None], irradiance * falloff
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Lights(Record):
+    """A point light and an even ambient light for each view.
+
+    A point of albedo 1 facing the point light at ``target_world`` has radiance
+    ``irradiance + ambient``; elsewhere the former falls off with the square of the
+    distance. A light placed very far away is a directional one.
+
+    Attributes:
+        positions_world: Of the point lights.
+        irradiance: Of the point lights at the target.
+        ambient: Radiance of a white point in shadow.
+        target_world: Where irradiance is stated.
+        flash: Irradiance at the target of a second light in the camera's own place, one a
+            view, without shadows.
+        environments: The picture that the ambient light comes from, one a view. Matte surfaces
+            get its mean; mirrors and the background show it.
+    """
+
+    positions_world: Float[Tensor, "view 3"]
+    irradiance: Float[Tensor, " view"]
+    ambient: Float[Tensor, " view"]
+    target_world: Float[Tensor, " 3"]
+    flash: Float[Tensor, " view"]
+    environments: tuple[Environment, ...] | None = None
+
+    def lamp(self, view: int) -> Lamp:
+        """Pick the light of one photograph."""
+        return Lamp(
+            position=self.positions_world[view].float(),
+            target=self.target_world.float(),
+            irradiance=float(self.irradiance[view]),
+            ambient=float(self.ambient[view]),
+            flash=float(self.flash[view]),
+            environment=None if self.environments is None else self.environments[view],
+        )
+
+    def harmonics_world(
+        self, eyes_world: Float[Tensor, "view 3"] | None = None
+    ) -> Float[Tensor, "view 4"]:
+        """Give the first-order light ``l`` at the target: radiance is albedo * l . (1, n).
+
+        Args:
+            eyes_world: The cameras' centres, needed for the flash only.
+        """
+        toward = normalize(self.positions_world - self.target_world, dim=-1)
+        directed = self.irradiance[:, None] * toward
+        if eyes_world is not None:
+            toward_eye = normalize(eyes_world - self.target_world, dim=-1)
+            directed = directed + self.flash[:, None] * toward_eye
+        return torch.cat([self.ambient[:, None], directed], dim=-1)
+
+
+def wandering_lights(
+    num_views: int,
+    generator: torch.Generator,
+    *,
+    distance: float,
+    spread_deg: float = 65.0,
+    least_tilt_deg: float = 15.0,
+    irradiance: float = 0.8,
+    ambient: float = 0.12,
+    flash: float = 0.0,
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    toward: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> Lights:
+    """Carry a lamp to another place for every photograph; float64.
+
+    Args:
+        num_views: How many photographs.
+        generator: Decides where the lamp goes, and how bright it is.
+        distance: From the target, scene units; drawn up to a quarter nearer or farther.
+        spread_deg: Greatest angle from ``toward``.
+        least_tilt_deg: Smallest angle from ``toward``.
+        irradiance: Mean over the views; drawn up to a quarter less or more.
+        ambient: The same.
+        flash: The same for every view.
+        target: What is lit.
+        toward: Axis of the cone the lamp moves in.
+    """
+    axis = normalize(torch.tensor(toward, dtype=torch.float64), dim=0)
+    aside = torch.linalg.svd(axis[None]).Vh[1:]
+    square = _even_square(num_views, generator)
+    turn = 2 * torch.pi * square[:, 0]
+    lowest, highest = torch.deg2rad(torch.tensor([spread_deg, least_tilt_deg])).cos().tolist()
+    cosine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
+    sine = (1 - cosine**2).sqrt()
+    across = turn.cos()[:, None] * aside[0] + turn.sin()[:, None] * aside[1]
+    direction = cosine[:, None] * axis + sine[:, None] * across
+    target_world = torch.tensor(target, dtype=torch.float64)
+    return Lights(
+        positions_world=target_world
+        + (distance * _about_one(num_views, generator))[:, None] * direction,
+        irradiance=irradiance * _about_one(num_views, generator),
+        ambient=ambient * _about_one(num_views, generator),
+        target_world=target_world,
+        flash=torch.full((num_views,), flash, dtype=torch.float64),
+    )
+
+
+def lights_round(
+    azimuths: Float[Tensor, " view"],
+    generator: torch.Generator,
+    *,
+    distance: float,
+    target: Float[Tensor, " 3"],
+    irradiance: float,
+    ambient: float,
+    flash: float = 0.0,
+    far: bool = False,
+    sweep_deg: float = 160.0,
+    elevations_deg: tuple[float, float] = (18.0, 72.0),
+) -> Lights:
+    """Carry a lamp round an object on a table, on the side that is photographed; float64.
+
+    Args:
+        azimuths: Radians about the world's z, counter-clockwise from -y: the middle of the
+            lamp's sweep in each photograph.
+        generator: Decides where the lamp goes, and how bright it is.
+        distance: From the target, scene units; drawn up to a quarter nearer or farther.
+        target: What is lit.
+        irradiance: Mean over the views; drawn up to a quarter less or more.
+        ambient: The same.
+        flash: The same for every view.
+        far: The lamp is so far away that its light comes from one direction and does not
+            fall off.
+        sweep_deg: How far round the object the lamp goes.
+        elevations_deg: Lowest and highest place of the lamp over the table's plane.
+    """
+    count = len(azimuths)
+    square = _even_square(count, generator)
+    turn = azimuths + torch.deg2rad(sweep_deg * (square[:, 0] - 0.5))
+    lowest, highest = torch.deg2rad(torch.tensor(elevations_deg)).sin().tolist()
+    sine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
+    cosine = (1 - sine**2).sqrt()
+    direction = torch.stack([cosine * turn.sin(), -cosine * turn.cos(), sine], dim=-1)
+    away = distance * _about_one(count, generator)
+    return Lights(
+        positions_world=target + (_FAR if far else 1) * away[:, None] * direction,
+        irradiance=irradiance * _about_one(count, generator),
+        ambient=ambient * _about_one(count, generator),
+        target_world=target,
+        flash=torch.full((count,), flash, dtype=torch.float64),
+    )
+
+
+def _about_one(count: int, generator: torch.Generator) -> Float[Tensor, " view"]:
+    return 0.75 + 0.5 * torch.rand(count, generator=generator, dtype=torch.float64)
+
+
+def _even_square(count: int, generator: torch.Generator) -> Float[Tensor, "view 2"]:
+    """Spread points over the unit square.
+
+    The plastic number's sequence fills it evenly however few its points are, so that a dozen
+    photographs already have lights from all sides (Roberts, 2018).
+    """
+    steps = torch.arange(count, dtype=torch.float64)[:, None]
+    start = torch.rand(2, generator=generator, dtype=torch.float64)
+    return torch.remainder(start + steps * start.new_tensor([0.7548776662, 0.5698402910]), 1)

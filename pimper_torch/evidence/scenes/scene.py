@@ -1,0 +1,268 @@
+"""A whole scene, ready to be photographed: bodies, cameras and lamps."""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.scenes.bodies import (
+    Body,
+    albedo_at_vertices,
+    carried,
+    normals_at_vertices,
+)
+from pimper_torch.evidence.scenes.cameras import (
+    UP,
+    aim_to_fit,
+    arc_directions,
+    handheld_directions,
+    look_at,
+    pinholes,
+    turntable_directions,
+)
+from pimper_torch.evidence.scenes.conductors import CONDUCTORS
+from pimper_torch.evidence.scenes.config import SceneConfig
+from pimper_torch.evidence.scenes.environment import Environment, random_environment
+from pimper_torch.evidence.scenes.lights import Lights, lights_round
+from pimper_torch.evidence.scenes.meshes import join
+from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.objects import RECIPES, TABLES
+from pimper_torch.evidence.scenes.room import fixed_light, room, turned_about, turntable
+from pimper_torch.evidence.scenes.textures import Uniform
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.records import Cameras, Mesh
+
+OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
+_MARGIN = 1.15  # of the turntable's radius over the object's reach from the axis
+_ENVIRONMENT = 1 << 20  # numbers of environments; those of photographs' noise are smaller
+_FOCAL = 1.6  # widths of the picture: a normal to short telephoto lens
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """Everything that photographs are computed from.
+
+    Attributes:
+        name: Of the object, or the path of its mesh.
+        config: How it is photographed.
+        bodies: At rest in the world: the object's first, then its table, if that turns along.
+        cameras: One a photograph; float64.
+        lights: One a photograph.
+        fixed: Bodies that are at rest before the camera while the object turns, in the frame of
+            :mod:`pimper_torch.evidence.scenes.room`.
+        world_from_room: Where that frame is in each photograph.
+    """
+
+    name: str
+    config: SceneConfig
+    bodies: tuple[Body, ...]
+    cameras: Cameras
+    lights: Lights
+    fixed: tuple[Body, ...]
+    world_from_room: Float[Tensor, "view 4 4"]
+
+    def bodies_in(self, view: int) -> tuple[Body, ...]:
+        """Give all bodies where one photograph has them."""
+        return (*self.bodies, *(carried(body, self.world_from_room[view]) for body in self.fixed))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """File names of the photographs."""
+        return tuple(f"view_{view:03d}.png" for view in range(self.config.num_views))
+
+    @property
+    def object_mesh(self) -> Mesh:
+        """The object alone, with albedo and normals at the vertices."""
+        return _dressed([body for body in self.bodies if not body.surroundings])
+
+    @property
+    def surroundings_mesh(self) -> Mesh | None:
+        """The table, if it turns with the object."""
+        around = [body for body in self.bodies if body.surroundings]
+        return _dressed(around) if around else None
+
+    def noise(self, view: int) -> torch.Generator:
+        """Give the random numbers of one photograph, whoever renders it."""
+        return _generator(self.config.seed, view)
+
+
+def _generator(seed: int, number: int) -> torch.Generator:
+    """Give random numbers of their own to each part of a scene."""
+    state = np.random.SeedSequence((seed, number)).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+
+def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
+    """Put an object on a table, and place cameras and lamps round it.
+
+    Args:
+        name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
+            file, which is scaled to the size of the others. Its vertex colours are its texture;
+            without any it gets one. Its normals are those of its faces, averaged at the vertices.
+        config: How it is photographed.
+
+    Raises:
+        InputError: No such scene and no such file, or a mesh that has no surface.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    recipe = RECIPES.get(str(name_or_path))
+    bodies = recipe(generator) if recipe else (_read_body(name_or_path, config, generator),)
+    bodies = tuple(_finished(body, config) for body in bodies)
+    points = join(*(body.mesh for body in bodies)).vertices_world
+    lowest, highest = points.amin(dim=0), points.amax(dim=0)
+    toward = _toward(config, generator)
+    focal_px = _FOCAL * config.width
+    target, distance = aim_to_fit(
+        toward,
+        points,
+        focal_px=focal_px,
+        width=config.width,
+        height=config.height,
+        fill=config.fill,
+    )
+    eyes = target + distance * toward
+    poses = look_at(eyes, target, target.new_tensor(UP))
+    azimuths = torch.atan2(toward[:, 0], -toward[:, 1])
+    world_from_room = turned_about(target, azimuths)
+    lights = _lights(config, generator, azimuths, target, (lowest, highest))
+    reach = float((points - target)[:, :2].norm(dim=-1).amax())
+    environments = _environments(config, world_from_room)
+    turning, fixed = _surroundings(config, generator, target, _MARGIN * reach)
+    return Scene(
+        name=str(name_or_path),
+        config=config,
+        bodies=(*bodies, *turning),
+        cameras=pinholes(poses, focal_px, config.width, config.height),
+        lights=lights.replace(environments=environments),
+        fixed=fixed,
+        world_from_room=world_from_room,
+    )
+
+
+def _lights(
+    config: SceneConfig,
+    generator: torch.Generator,
+    azimuths: Float[Tensor, " view"],
+    aim: Float[Tensor, " 3"],
+    box: tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]],
+) -> Lights:
+    lowest, highest = box
+    target = aim * aim.new_tensor(UP) if config.fixed_lamp else (lowest + highest) / 2
+    ahead = torch.zeros_like(azimuths) if config.path == "arc" else azimuths
+    lights = lights_round(
+        torch.zeros_like(azimuths[:1]) if config.fixed_lamp else ahead,
+        generator,
+        distance=config.lamp_distance * float((highest - lowest).amax()),
+        target=target,
+        irradiance=config.irradiance,
+        ambient=config.ambient,
+        flash=config.flash,
+        far=config.light == "directional",
+    )
+    return fixed_light(lights, turned_about(aim, azimuths)) if config.fixed_lamp else lights
+
+
+def _environments(
+    config: SceneConfig, world_from_room: Float[Tensor, "view 4 4"]
+) -> tuple[Environment, ...] | None:
+    """Draw the environment of every photograph; with a fixed room, it is at rest there."""
+    if config.surrounded == "none":
+        return None
+    drawn = []
+    for view in range(config.num_views):
+        number = view if config.surrounded == "changing" else 0
+        one = random_environment(_generator(config.seed, _ENVIRONMENT + number))
+        if config.fixed_room:
+            one = replace(one, own_from_world=world_from_room[view, :3, :3].mT)
+        drawn.append(one)
+    return tuple(drawn)
+
+
+def _surroundings(
+    config: SceneConfig, generator: torch.Generator, axis: Float[Tensor, " 3"], radius: float
+) -> tuple[tuple[Body, ...], tuple[Body, ...]]:
+    """Give what turns with the object, in the world, and what is fixed, in the room."""
+    table = TABLES[config.table](generator)
+    if not (config.fixed_room or config.fixed_table):
+        return (table,), ()
+    table = turntable(table, radius)
+    fixed = room(generator) if config.fixed_room else ()
+    if config.fixed_table:
+        return (), (table, *fixed)
+    return (carried(table, turned_about(axis, torch.zeros_like(axis[:1]))[0]),), fixed
+
+
+def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "view 3"]:
+    if config.path == "turntable":
+        return turntable_directions(config.num_views, elevation_deg=config.elevation_deg)
+    if config.path == "handheld":
+        return handheld_directions(config.num_views, generator, elevation_deg=config.elevation_deg)
+    return arc_directions(
+        config.num_views,
+        span_deg=config.span_deg,
+        elevation_deg=config.elevation_deg,
+        sway_deg=config.sway_deg,
+    )
+
+
+def _finished(body: Body, config: SceneConfig) -> Body:
+    specular = body.specular if config.specular is None else config.specular
+    roughness = body.roughness if config.roughness is None else config.roughness
+    conductor = CONDUCTORS.get(config.conductor)
+    albedo = (0.0, 0.0, 0.0) if conductor else config.albedo
+    made = Body(
+        mesh=body.mesh,
+        texture=body.texture if albedo is None else Uniform(albedo=albedo),
+        specular=specular,
+        roughness=roughness,
+        conductor=conductor,
+    )
+    origin = body.mesh.vertices_world.new_zeros(3)
+    turn = torch.deg2rad(origin.new_tensor([config.turn_deg]))
+    return carried(made, turned_about(origin, turn)[0]) if config.turn_deg else made
+
+
+def _read_body(path: str | Path, config: SceneConfig, generator: torch.Generator) -> Body:
+    if not Path(path).exists() and isinstance(path, str) and Path(path).suffix == "":
+        raise InputError(
+            f"there is no scene {path!r} and no such file. Scenes: {', '.join(RECIPES)}; or give "
+            "the path of a mesh, such as bunny.ply."
+        )
+    mesh = read_mesh(path)
+    if len(mesh.faces) == 0:
+        raise InputError(f"{path}: holds points without faces; needed: a triangle mesh.")
+    mesh = _placed(mesh, config.up, path)
+    if mesh.albedo is not None:
+        return Body(mesh=mesh, roughness=0.3)
+    return Body(mesh=mesh, texture=random_speckle(generator, contrast=1.5), roughness=0.3)
+
+
+def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
+    """Turn the axis ``up`` to z, scale to the usual size and stand on the table's middle."""
+    first = {"x": 1, "y": 2, "z": 0}[up]  # a cyclic change of axes keeps it right-handed
+    order = [first, (first + 1) % 3, (first + 2) % 3]
+    vertices = mesh.vertices_world[:, order]
+    lowest, highest = vertices.amin(dim=0), vertices.amax(dim=0)
+    longest = float((highest - lowest).amax())
+    if longest <= 0 or not math.isfinite(longest):
+        raise InputError(f"{path}: all its vertices are in one place; needed: a surface.")
+    foot = torch.stack([*((lowest + highest) / 2)[:2], lowest[2]])
+    vertices = (vertices - foot) * (OBJECT_SIZE / longest)
+    # OBJ knows normals of corners; read one a vertex, those of flat faces contradict the shape.
+    # Averaged from the faces instead, over vertices that a seam of the texture doubles, too.
+    places, own = torch.unique(vertices, dim=0, return_inverse=True)
+    normals = vertex_normals(places, own[mesh.faces])[own]
+    return mesh.replace(vertices_world=vertices, normals_world=normals)
+
+
+def _dressed(bodies: list[Body]) -> Mesh:
+    return join(*(body.mesh for body in bodies)).replace(
+        normals_world=torch.cat([normals_at_vertices(body) for body in bodies]),
+        albedo=torch.cat([albedo_at_vertices(body) for body in bodies]),
+    )

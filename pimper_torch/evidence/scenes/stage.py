@@ -1,0 +1,225 @@
+"""Bodies, ready to be looked at and lit: every ray is cast here."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.evidence.scenes.bodies import Body, albedo_at_vertices, normals_at_vertices
+from pimper_torch.evidence.scenes.lights import Lamp
+from pimper_torch.evidence.scenes.meshes import join
+from pimper_torch.evidence.scenes.shading import reflect
+from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.records import Record
+
+# Clear of the surface in embree's float32, yet below what a pixel shows.
+_CLEARANCE = 2e-4
+# Conductors that mirror one another; what is mirrored once more is left out.
+_MIRRORS = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Spots(Record):
+    """What rays meet; depth is infinite, normal and albedo zero, body -1 for a miss.
+
+    Attributes:
+        hits: Faces and places in them.
+        points: World.
+        normals: Unit, interpolated over the face.
+        albedo: Linear.
+        body: Number of the body.
+    """
+
+    hits: Hits
+    points: Float[Tensor, "ray 3"]
+    normals: Float[Tensor, "ray 3"]
+    albedo: Float[Tensor, "ray channel"]
+    body: Int[Tensor, " ray"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Shaded(Record):
+    """What spots send to the eye.
+
+    Attributes:
+        matte: Radiance of the matte part.
+        mirrored: Radiance of the highlight, and of what a conductor mirrors.
+        lit: True where the lamp reaches.
+    """
+
+    matte: Float[Tensor, "ray channel"]
+    mirrored: Float[Tensor, "ray channel"]
+    lit: Bool[Tensor, " ray"]
+
+
+class Stage:
+    """Bodies in one ray caster; float32.
+
+    Args:
+        bodies: Their faces, in this order, are those of ``mesh``.
+    """
+
+    def __init__(self, bodies: Sequence[Body]) -> None:
+        self.bodies = tuple(bodies)
+        self.mesh = join(*(body.mesh for body in bodies))
+        vertices = self.mesh.vertices_world
+        self._caster = RayCaster(vertices, self.mesh.faces)
+        self._normals = torch.cat([normals_at_vertices(body) for body in bodies])
+        counts = torch.tensor([len(body.mesh.faces) for body in bodies])
+        self._ends = torch.cumsum(counts, dim=0)
+        self._starts = self._ends - counts
+        # A conductor's share of mirrored light is Fresnel's own; 1 leaves the lobe alone.
+        self._specular = torch.tensor([1.0 if body.conductor else body.specular for body in bodies])
+        self._metal = torch.tensor([body.conductor is not None for body in bodies])
+        self._roughness = torch.tensor([body.roughness for body in bodies])
+        self.outside = torch.tensor([body.surroundings for body in bodies])
+        extent = vertices.amax(dim=0) - vertices.amin(dim=0)
+        self.clearance = _CLEARANCE * float(extent.norm())
+
+    def cast(self, origins: Float[Tensor, "ray 3"], along: Float[Tensor, "ray 3"]) -> Hits:
+        """Find what rays meet first."""
+        return self._caster.cast(origins, along)
+
+    def trace(self, eye: Float[Tensor, "*origin 3"], rays: Float[Tensor, "ray 3"]) -> Spots:
+        """Look along rays from one place, or from one each, and see what is there."""
+        hits = self._caster.cast(eye, rays)
+        hit = hits.face >= 0
+        points = eye + torch.where(hit, hits.distance, 1)[:, None] * rays
+        body = torch.where(hit, torch.bucketize(hits.face, self._ends, right=True), -1)
+        return Spots(
+            hits=hits,
+            points=points,
+            normals=normalize(hits.interpolate(self._normals, self.mesh.faces), dim=-1),
+            albedo=self._albedo(hits, points, body),
+            body=body,
+        )
+
+    def lit(
+        self,
+        points: Float[Tensor, "ray 3"],
+        normals: Float[Tensor, "ray 3"],
+        position: Float[Tensor, " 3"],
+    ) -> Bool[Tensor, " ray"]:
+        """Tell where a lamp is above a surface's horizon and no body is in between."""
+        start = points + self.clearance * normals
+        toward = position - start
+        (facing,) = torch.nonzero((normals * toward).sum(dim=-1) > 0, as_tuple=True)
+        distance = toward[facing].norm(dim=-1, keepdim=True)
+        met = self._caster.cast(start[facing], toward[facing] / distance).distance
+        lit = torch.zeros(len(points), dtype=torch.bool)
+        return lit.index_copy(0, facing, met >= distance[:, 0])
+
+    def shade(
+        self,
+        spots: Spots,
+        eye: Float[Tensor, "*origin 3"],
+        lamp: Lamp,
+        indirect: Float[Tensor, "vertex channel"] | None = None,
+        *,
+        flash: Float[Tensor, " 3"] | None = None,
+        bounces: int = _MIRRORS,
+    ) -> Shaded:
+        """Give the radiance that reaches the eye.
+
+        Args:
+            spots: What it sees.
+            eye: Where it is, or where each ray comes from.
+            lamp: The light.
+            indirect: What other surfaces send to each vertex, as irradiance.
+            flash: Where the flash is, and casts shadows from; by default at the eye, which sees
+                none of them.
+            bounces: Of conductors that mirror one another.
+        """
+        specular, roughness = self._specular[spots.body], self._roughness[spots.body]
+        to_eye = normalize(eye - spots.points, dim=-1)
+        lit = self.lit(spots.points, spots.normals, lamp.position)
+        place_of_flash = eye if flash is None else flash
+        flashed = spots.body >= 0
+        if flash is not None and lamp.flash > 0:
+            flashed = self.lit(spots.points, spots.normals, flash)
+        received = torch.full_like(specular, lamp.ambient)
+        mirrored = torch.zeros_like(spots.points)
+        for place, irradiance, reached in (
+            (lamp.position, lamp.irradiance, lit),
+            (place_of_flash, lamp.flash, flashed),
+        ):
+            if irradiance == 0:
+                continue
+            toward, arriving = lamp.arriving(spots.points, place, irradiance)
+            matte, lobe = reflect(spots.normals, toward, to_eye, specular, roughness)
+            half = normalize(toward + to_eye, dim=-1)
+            tint = self._tint(spots.body, (half * toward).sum(dim=-1))
+            received = received + torch.where(reached, arriving * matte, 0)
+            mirrored = mirrored + torch.where(reached, arriving * lobe, 0)[:, None] * tint
+        total = received[:, None]
+        if indirect is not None:
+            total = total + spots.hits.interpolate(indirect, self.mesh.faces)
+        (metal,) = torch.nonzero(self._metal[spots.body] & (spots.body >= 0), as_tuple=True)
+        if len(metal) and bounces > 0:
+            seen = self._mirrored(
+                spots, metal, to_eye[metal], lamp, indirect, place_of_flash, bounces - 1
+            )
+            mirrored = mirrored.index_add(0, metal, seen)
+        return Shaded(matte=spots.albedo * total, mirrored=mirrored, lit=lit)
+
+    def _mirrored(
+        self,
+        spots: Spots,
+        metal: Int[Tensor, " metal"],
+        to_eye: Float[Tensor, "metal 3"],
+        lamp: Lamp,
+        indirect: Float[Tensor, "vertex channel"] | None,
+        flash: Float[Tensor, " 3"],
+        bounces: int,
+    ) -> Float[Tensor, "metal channel"]:
+        """Give what smooth conductors show of other bodies and of the environment."""
+        normals = spots.normals[metal]
+        cosine = (normals * to_eye).sum(dim=-1, keepdim=True)
+        along = normalize(2 * cosine * normals - to_eye, dim=-1)
+        start = spots.points[metal] + self.clearance * normals
+        there = self.trace(start, along)
+        shaded = self.shade(there, start, lamp, indirect, flash=flash, bounces=bounces)
+        hit = (there.body >= 0)[:, None]
+        radiance = torch.where(hit, shaded.matte + shaded.mirrored, lamp.surroundings(along))
+        return self._tint(spots.body[metal], cosine[:, 0]) * radiance
+
+    def _tint(
+        self, body: Int[Tensor, " ray"], cosine: Float[Tensor, " ray"]
+    ) -> Float[Tensor, "ray 3"]:
+        """Give Fresnel's factor of conductors, 1 of all others."""
+        tint = cosine.new_ones(len(cosine), 3)
+        for index, one in enumerate(self.bodies):
+            if one.conductor is not None:
+                own = (body == index)[:, None]
+                tint = torch.where(own, one.conductor.reflectance(cosine), tint)
+        return tint
+
+    def vertex_albedo(self) -> Float[Tensor, "vertex channel"]:
+        """Evaluate every body's texture at its vertices."""
+        return torch.cat([albedo_at_vertices(body) for body in self.bodies])
+
+    @property
+    def vertex_normals(self) -> Float[Tensor, "vertex 3"]:
+        """Unit, outward, in the order of ``mesh``."""
+        return self._normals
+
+    def _albedo(
+        self, hits: Hits, points: Float[Tensor, "ray 3"], body: Int[Tensor, " ray"]
+    ) -> Float[Tensor, "ray channel"]:
+        albedo = points.new_zeros(len(points), 3)
+        for index, one in enumerate(self.bodies):
+            (own,) = torch.nonzero(body == index, as_tuple=True)
+            if len(own) == 0:
+                continue
+            if one.texture is not None:
+                found = one.texture(points[own])
+            else:
+                assert one.mesh.albedo is not None
+                corners = one.mesh.faces[hits.face[own] - self._starts[index]]
+                weights = hits.barycentric[own][..., None]
+                found = (weights * one.mesh.albedo.float()[corners]).sum(dim=1)
+            albedo = albedo.index_copy(0, own, found.to(albedo).expand(-1, 3))
+        return albedo

@@ -1,0 +1,230 @@
+"""A rendered scene as a folder: photographs, and the truth beside them.
+
+==============================  ====================================================
+file                            what
+==============================  ====================================================
+`photos/view_000.png` ...       the photographs
+`masks/view_000.png` ...        white on the object
+`truth/scene.json`              every setting, the photographs' names, the version
+`truth/sparse/`                 COLMAP model: exact cameras, true points, their tracks
+`truth/lights.json`             lamps of every photograph, and first-order harmonics
+`truth/mesh.ply`                the object
+`truth/surroundings.ply`        its table, if that turns with the object
+`truth/maps/view_000.npz` ...   depth, normals, albedo and masks of every pixel; see
+                                :func:`pimper_torch.evidence.scenes.maps.write_maps`
+==============================  ====================================================
+"""
+
+import json
+import multiprocessing
+import pickle
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from pimper_torch.config import require, to_mapping
+from pimper_torch.evidence.scenes.config import SceneConfig
+from pimper_torch.evidence.scenes.frame import render_frame
+from pimper_torch.evidence.scenes.interreflection import Interreflection
+from pimper_torch.evidence.scenes.maps import write_maps
+from pimper_torch.evidence.scenes.meshes import join
+from pimper_torch.evidence.scenes.scene import Scene, build_scene
+from pimper_torch.evidence.scenes.stage import Stage
+from pimper_torch.evidence.scenes.tracks import true_model
+from pimper_torch.io.decode import write_deep_png
+from pimper_torch.io.folders import prepare_output, written_whole
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.version import installed_version
+from pimper_torch.progress import report
+from pimper_torch.radiometry import srgb_from_linear, to_bytes
+from pimper_torch.sfm.colmap import write_binary
+
+SCENE_NAMES = ("photos", "masks", "truth")
+FORMAT, FORMAT_VERSION = "pimper_torch rendered scene", 1
+_FAST = 1  # level of PNG's compression: noise does not shrink much further at any
+
+
+def render_scene(
+    name_or_path: str | Path,
+    folder: Path | str,
+    config: SceneConfig | None = None,
+    *,
+    processes: int = 2,
+    overwrite: bool = False,
+) -> Path:
+    """Photograph a scene, and write photographs and truth to a folder.
+
+    The folder is there whole or not at all; what lies in it is told in
+    :mod:`pimper_torch.evidence.scenes.write`. The same settings give the same files, whatever the
+    number of processes.
+
+    Args:
+        name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
+            file.
+        folder: New or empty; its parents are made.
+        config: ``None`` is the default one.
+        processes: That render at the same time. More than 1 start Python anew, so that a
+            script that calls this must guard its top level by ``__name__ == "__main__"``.
+        overwrite: Replace a former rendering.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: No such scene, or a mesh that cannot be read.
+        OutputError: The folder holds something else, or cannot be written.
+    """
+    require(processes >= 1, "processes", processes, "1 or more")
+    folder = Path(folder)
+    prepare_output(folder, SCENE_NAMES, overwrite)
+    config = SceneConfig() if config is None else config
+    scene = build_scene(name_or_path, config)
+    with written_whole(folder, SCENE_NAMES, overwrite=overwrite) as staging:
+        for part in ("photos", "masks", "truth/maps"):
+            (staging / part).mkdir(parents=True)
+        _write_truth(scene, staging / "truth")
+        _render_all(scene, staging, min(processes, config.num_views))
+    return folder
+
+
+def _render_all(scene: Scene, folder: Path, processes: int) -> None:
+    total = scene.config.num_views
+    if processes == 1:
+        with _one_thread():
+            studio = _Studio(scene, folder)
+            for view in range(total):
+                studio.take(view)
+                report(view + 1, total)
+        return
+    # Pickled here, for torch would pass tensors through shared memory, of which containers
+    # have little. Spawned, for a forked torch may hang.
+    packed = pickle.dumps((scene, folder))
+    with ProcessPoolExecutor(
+        processes,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_open_studio,
+        initargs=(packed,),
+    ) as pool:
+        taken = [pool.submit(_take, view) for view in range(total)]
+        try:
+            for done, one in enumerate(as_completed(taken), start=1):
+                one.result()
+                report(done, total)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+class _Studio:
+    """A scene set up in one process."""
+
+    def __init__(self, scene: Scene, folder: Path) -> None:
+        self._scene, self._folder = scene, folder
+        self._set = _stage_in(scene, 0)
+
+    def take(self, view: int) -> None:
+        """Render one photograph and write it with its truth."""
+        scene, name = self._scene, self._scene.names[view]
+        stage, between = _stage_in(scene, view) if scene.fixed else self._set
+        frame = render_frame(
+            stage,
+            scene.cameras,
+            scene.lights,
+            view,
+            scene.noise(view),
+            scene.config.sensor,
+            between,
+        )
+        _write_photograph(frame.image, scene.config, self._folder / "photos" / name)
+        mask = Image.fromarray(255 * frame.foreground.numpy().astype(np.uint8))
+        mask.save(self._folder / "masks" / name)
+        write_maps(frame, (self._folder / "truth" / "maps" / name).with_suffix(".npz"))
+
+
+def _stage_in(scene: Scene, view: int) -> tuple[Stage, Interreflection | None]:
+    stage = Stage(scene.bodies_in(view))
+    bounces, seed = scene.config.bounces, scene.config.seed
+    return stage, Interreflection(stage, bounces, seed=seed) if bounces else None
+
+
+_studio: _Studio | None = None  # of this process
+
+
+def _open_studio(packed: bytes) -> None:
+    global _studio
+    torch.set_num_threads(1)
+    _studio = _Studio(*pickle.loads(packed))  # our own, from the parent process
+
+
+def _take(view: int) -> None:
+    assert _studio is not None
+    _studio.take(view)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute as the processes of a pool do, to the last bit."""
+    former = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(former)
+
+
+def _write_photograph(
+    image: Float[Tensor, "channel height width"], config: SceneConfig, path: Path
+) -> None:
+    trailing = image.movedim(0, -1)
+    encoded = srgb_from_linear(trailing) if config.encoding == "srgb" else trailing
+    if config.bits == 16:
+        write_deep_png((65535 * encoded).round().numpy().astype(np.uint16), path)
+    else:
+        samples = (255 * encoded).round().numpy().astype(np.uint8)
+        Image.fromarray(samples).save(path, compress_level=_FAST)
+
+
+def _write_truth(scene: Scene, folder: Path) -> None:
+    surface, around = scene.object_mesh, scene.surroundings_mesh
+    write_ply(surface, folder / "mesh.ply")
+    if around is not None:
+        write_ply(around, folder / "surroundings.ply")
+    generator = torch.Generator().manual_seed(scene.config.seed)
+    blockers = surface if around is None else join(surface, around)
+    model, albedo = true_model(surface, blockers, scene.cameras, scene.names, generator)
+    write_binary(model, to_bytes(albedo), folder / "sparse")
+    _write_json(_lights_account(scene), folder / "lights.json")
+    account = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "pimper_torch": installed_version(),
+        "scene": scene.name,
+        "names": list(scene.names),
+        "settings": to_mapping(scene.config),
+    }
+    _write_json(account, folder / "scene.json")
+
+
+def _lights_account(scene: Scene) -> dict[str, object]:
+    lights = scene.lights
+    return {
+        "names": list(scene.names),
+        "positions_world": lights.positions_world.tolist(),
+        "irradiance": lights.irradiance.tolist(),
+        "ambient": lights.ambient.tolist(),
+        "flash": lights.flash.tolist(),
+        "target_world": lights.target_world.tolist(),
+        "harmonics_world": lights.harmonics_world(scene.cameras.centers_world).tolist(),
+    }
+
+
+def _write_json(account: Mapping[str, object], path: Path) -> None:
+    text = json.dumps(account, indent=1, allow_nan=False, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")

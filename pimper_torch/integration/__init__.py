@@ -1,6 +1,0 @@
-"""Normals to surface: of one map, and of every patch."""
-
-from pimper_torch.integration.discontinuities import Continuity, DiscontinuityConfig
-from pimper_torch.integration.normal_map import IntegratedMap, integrate_normal_map
-
-__all__ = ["Continuity", "DiscontinuityConfig", "IntegratedMap", "integrate_normal_map"]

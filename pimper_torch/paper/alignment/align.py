@@ -1,0 +1,394 @@
+"""Alignment: bas-relief transforms that make neighbouring patches agree."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.config import require
+from pimper_torch.paper.alignment.anchors import (
+    Anchors,
+    anchor_certainty,
+    point_anchors,
+    vertex_anchors,
+)
+from pimper_torch.paper.alignment.overlaps import (
+    Seams,
+    find_seams,
+    meet_overlaps,
+    transformed,
+)
+from pimper_torch.paper.alignment.system import (
+    PointPulls,
+    Pulls,
+    curvature_along,
+    mismatches,
+    seam_stiffness,
+    solve_transforms,
+)
+from pimper_torch.paper.alignment.trust import (
+    common_distance,
+    judge_patches,
+    overlapping_seams,
+    reliable_seams,
+    trust_by_distance,
+)
+from pimper_torch.progress import report
+from pimper_torch.records import AlignVerdict, DepthPatches, Depths, PatchSet, Record
+from pimper_torch.stage import Stage
+
+# An arc over an edge whose middle stands out by 0.7 % of its length has this C; flatter
+# reliefs are not told apart.
+_FLAT = 3e-3
+
+# Vertices that were filled in between points of the cloud are guesses.
+_FILLED_VERTEX = 0.1
+
+# Solves within the first round, so that weights that depend on the answer settle; later
+# rounds begin nearer to it and take one less.
+_REWEIGHTINGS = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignConfig:
+    """How patches are brought together.
+
+    Attributes:
+        offset: Also let each patch move along its normal: 4 unknowns a patch instead of the
+            published 3.
+        curvature: Weight seams by the published ``k``; without it all weigh alike.
+        rounds: How often the overlaps are met anew, as transformed so far, and solved.
+        rows: Lines of samples across each overlap.
+        columns: Samples along each line.
+        reach_samples: Distance of the outermost lines from the edge, in template samples;
+            about ``decompose.overlap_samples``.
+        anchor: Weight of a facet's vertex, where the surface is known to pass, next to the
+            agreement of a seam. Vertices that are points of the cloud count the less the
+            less certain they are next to the disagreement at the seams.
+        points: The same of each further point of the cloud that lies on a facet; one far
+            off, as an outlier, counts less.
+        prior: Weight that holds each transform at the identity. Where neighbours agree but
+            for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
+            4 %; where they agree in nothing, 1e-4 lets them be flattened.
+        scale_limit: No relief is flattened or stretched by more than this factor.
+        outlier: Samples that disagree by this many times the median lose three quarters of
+            their weight, and quickly more beyond; depth edges run through some overlaps.
+    """
+
+    offset: bool = True
+    curvature: bool = True
+    rounds: int = 3
+    rows: int = 3
+    columns: int = 12
+    reach_samples: float = 5.0
+    anchor: float = 1.0
+    points: float = 1.0
+    prior: float = 3e-4
+    scale_limit: float = 4.0
+    outlier: float = 5.0
+
+    def __post_init__(self) -> None:
+        require(self.rounds >= 1, "rounds", self.rounds, "1 or more")
+        require(self.rows >= 2, "rows", self.rows, "2 or more")
+        require(self.columns >= 3, "columns", self.columns, "3 or more")
+        require(self.reach_samples > 0, "reach_samples", self.reach_samples, "above 0")
+        require(self.anchor >= 0, "anchor", self.anchor, "0 or more")
+        require(self.points >= 0, "points", self.points, "0 or more")
+        require(self.prior > 0, "prior", self.prior, "above 0")
+        require(self.scale_limit > 1, "scale_limit", self.scale_limit, "above 1")
+        require(self.outlier > 0, "outlier", self.outlier, "above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Problem(Record):
+    """What stays the same from round to round; lengths in scene units."""
+
+    patches: PatchSet
+    seams: Seams
+    vertices: Anchors
+    points: Anchors
+    unit: Float[Tensor, ""]
+
+    @property
+    def in_scene(self) -> Float[Tensor, " 4"]:
+        """What carries transforms from units of the edge length to scene units."""
+        return torch.stack([torch.ones_like(self.unit)] * 3 + [self.unit])
+
+
+class Align(Stage):
+    r"""Undo the bas-relief transform that photometry leaves each patch with.
+
+    The relief z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z, 1)`
+    in its own frame, without contradicting its photographs. All h are found together, from
+    what neighbours say about the strip around the edge they share. Rays along the bisector
+    of the two normals meet both reliefs, as transformed so far, and
+
+    .. math::
+        \min_h \sum_{seams} k \, \overline{| P_\mu + N_\mu h_\mu^T S_\mu
+        - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'} |^2}
+
+    with P the foot points on the facets' planes and N their normals. Each round meets the
+    overlaps anew and solves one sparse linear system.
+
+    *The curvature term.* :math:`k = 1 / \sum (C_\mu + C_{\mu'})` is read so: C is the mean
+    square of the relief's curvature along the seam times the edge's length, under the
+    current transform, so it grows as :math:`h_z^2`. Then :math:`k |r|^2` is a disagreement
+    relative to the reliefs that disagree, and flattening both does not make it smaller. A
+    linear solve holds k, and would not know; so the derivative of k enters the right-hand
+    side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve. Where
+    reliefs agree it vanishes.
+
+    *The gauge.* Seams alone leave some of h free. Over coplanar facets all is homogeneous:
+    any common affine change, :math:`h_z` and all, of their reliefs leaves them in agreement,
+    and :math:`h = 0` is a solution without error: the flattening one. Between facets at an
+    angle the foot points differ, which no multiple of the reliefs but the right one bridges:
+    folds tell scales, the better the sharper they are. Anchors fix what tilts and shifts the
+    surface: each relief is to pass through its facet's vertices, and through the points of
+    the cloud on the facet, with weights by their uncertainty. Vertices say nothing of scales,
+    points off the plane do. The prior toward the identity decides what nothing else does:
+    without folds and points, the common scale of coplanar facets. Without anchors it also
+    holds the common tilt and shift; without a prior, ``scale_limit`` alone would stop the
+    flattening where reliefs have nothing in common.
+
+    *Who stays.* A patch that meets no neighbour stays on the mesh, where its own anchors
+    alone put it, and so does one whose relief lies elsewhere than that of every neighbour it
+    meets even after all; their verdicts tell, an :class:`~pimper_torch.records.AlignVerdict`
+    each. One without relief stays as it is.
+
+    Rigid motions and the scale of the world change nothing. Differentiable in the depths
+    through all rounds; which samples meet, and what they and the anchors weigh by distance,
+    is decided along the way like the rest, verdicts without gradient.
+
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; Milano, Chung,
+    Blum, Siegwart, Ott: continuous components of normal integration, 2025, for joint relative
+    scales with robust weights; offset, anchors and rounds are ours.
+    """
+
+    def __init__(self, config: AlignConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or AlignConfig()
+
+    def forward(self, depths: DepthPatches) -> DepthPatches:
+        """Align all patches.
+
+        Returns:
+            Changed depths with the transforms that changed them, a verdict each, and how far
+            neighbours were apart before and after each round. Where no patch meets a
+            neighbour, what came in.
+
+        Raises:
+            SingularSystemError: Depths that are not finite.
+        """
+        config, patches = self.config, depths.patches
+        seams = find_seams(patches, config.rows, config.columns, config.reach_samples)
+        if len(seams.facets) == 0:
+            return depths
+        problem = _Problem(
+            patches=patches,
+            seams=seams,
+            vertices=vertex_anchors(patches, depths.buckets),
+            points=point_anchors(patches, depths.buckets),
+            unit=seams.edge_lengths.median(),
+        )
+        # h_0 is in units of the edge length here, so that no term of the system has a unit.
+        identity = problem.unit.new_tensor([0, 0, 1, 0])
+        transforms = identity.expand(patches.num_patches, 4)
+        apart = []
+        for done in range(config.rounds):
+            pulls = self._met(problem, depths, transforms)
+            if not bool((pulls.weight > 0).any()):
+                return depths
+            apart.append(_root_mean_square(pulls, transforms))
+            transforms = self._solve_round(pulls, transforms, fresh=done == 0)
+            report(done + 1, config.rounds)
+        with torch.no_grad():
+            pulls = self._met(problem, depths, transforms)
+            verdict = self._judged(pulls, transforms)
+        borne_out = (verdict == int(AlignVerdict.ALIGNED))[:, None]
+        if not bool(borne_out.all()):
+            on_mesh = self._on_mesh(problem, pulls, transforms)
+            transforms = torch.where(borne_out, transforms, on_mesh)
+            with torch.no_grad():
+                pulls = self._met(problem, depths, transforms)
+        with torch.no_grad():
+            mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * problem.unit
+        return depths.replace(
+            buckets=_apply(depths, transforms * problem.in_scene, verdict),
+            mismatch=mismatch.detach().to(depths.buckets[0].depth),
+        )
+
+    def _judged(self, pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Int[Tensor, " face"]:
+        met = pulls.weight > 0
+        distance = mismatches(pulls, transforms).norm(dim=-1)
+        reliable = reliable_seams(trust_by_distance(distance, met, self.config.outlier), met)
+        return judge_patches(pulls.facets, overlapping_seams(met), reliable, len(transforms))
+
+    def _on_mesh(
+        self, problem: _Problem, pulls: Pulls, transforms: Float[Tensor, "face 4"]
+    ) -> Float[Tensor, "face 4"]:
+        """Put every relief where its own anchors alone have it, whatever its neighbours say."""
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
+        everyone = torch.ones_like(transforms[:, 0])
+        held = self._anchored(pulls, problem, _noise(pulls, distance), everyone)
+        nothing = torch.zeros_like(distance[:, 0]), torch.zeros_like(pulls.curvature)
+        found = torch.zeros_like(transforms).index_fill(1, everyone.new_tensor([2]).long(), 1)
+        for solve in range(_REWEIGHTINGS):
+            believed = held if solve == 0 else self._believed(held, found, distance)
+            found = solve_transforms(believed, found, *nothing)
+            found = _limit_scales(found, self.config.scale_limit)
+        return found
+
+    def _met(
+        self, problem: _Problem, depths: DepthPatches, transforms: Float[Tensor, "face 4"]
+    ) -> Pulls:
+        """Meet the overlaps as transformed so far, and list what follows from that."""
+        seams, unit = problem.seams, problem.unit
+        overlaps = meet_overlaps(
+            seams, problem.patches, depths.buckets, transforms * problem.in_scene
+        )
+        met = overlaps.met.flatten(1)
+        prior = unit.new_full((4,), self.config.prior)
+        if not self.config.offset:
+            prior[3] = torch.inf
+        count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
+        corners = _with_one(problem.vertices.samples / unit).reshape(-1, 3, 4)
+        pulls = Pulls(
+            facets=seams.facets,
+            normals=seams.normals,
+            samples=_with_one(overlaps.samples.flatten(2, 3) / unit),
+            gap=(overlaps.feet[:, 0] - overlaps.feet[:, 1]).flatten(1, 2) / unit,
+            weight=met.to(unit) / count[:, None],
+            curvature=curvature_along(overlaps.samples[..., 2], overlaps.met, seams.edge_lengths),
+            corners=corners,
+            corner_weight=torch.zeros_like(corners[..., 0]),
+            prior_weight=prior,
+        )
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
+        touching = seams.facets[met.any(dim=1)].flatten()
+        moves = torch.zeros_like(corners[:, 0, 0]).index_fill(0, touching, 1)
+        return self._anchored(pulls, problem, _noise(pulls, distance), moves)
+
+    def _anchored(
+        self,
+        pulls: Pulls,
+        problem: _Problem,
+        noise: Float[Tensor, ""],
+        moves: Float[Tensor, " face"],
+    ) -> Pulls:
+        """Add what holds reliefs to vertices and points, for the patches that may move."""
+        unit, vertices, points = problem.unit, problem.vertices, problem.points
+        coarse = problem.patches.coarse
+        is_point = coarse.is_point[coarse.mesh.faces.flatten()]
+        certain = anchor_certainty(vertices.variance / unit.square(), noise)
+        weight = torch.where(is_point, certain, _FILLED_VERTEX) * vertices.known
+        variance = points.variance / unit.square()
+        return pulls.replace(
+            corner_weight=self.config.anchor * weight.reshape(-1, 3) * moves[:, None],
+            points=PointPulls(
+                facet=points.facet,
+                samples=_with_one(points.samples / unit),
+                heights=points.heights / unit,
+                weight=self.config.points
+                * anchor_certainty(variance, noise)
+                * points.known
+                * moves[points.facet],
+                spread=(noise.square() + variance).sqrt(),
+            ),
+        )
+
+    def _solve_round(
+        self, pulls: Pulls, transforms: Float[Tensor, "face 4"], fresh: bool
+    ) -> Float[Tensor, "face 4"]:
+        for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
+            distance = mismatches(pulls, transforms).norm(dim=-1)
+            # Before scales have been tried no disagreement is an outlier's fault.
+            system = pulls if fresh and solve < 2 else self._believed(pulls, transforms, distance)
+            terms = self._curvature_terms(system, transforms, distance)
+            # What tilts and shifts can mend says nothing about scales.
+            only_level = fresh and solve == 0
+            transforms = solve_transforms(
+                _with_scales_held(system) if only_level else system, transforms, *terms
+            )
+            limited = _limit_scales(transforms, self.config.scale_limit)
+            if not torch.equal(limited, transforms):
+                transforms = solve_transforms(_with_scales_held(system), limited, *terms)
+        return transforms
+
+    def _believed(
+        self,
+        pulls: Pulls,
+        transforms: Float[Tensor, "face 4"],
+        distance: Float[Tensor, "seam ray"],
+    ) -> Pulls:
+        """Lower the weight of samples and points that the transforms so far contradict."""
+        config, met = self.config, pulls.weight > 0
+        trust = trust_by_distance(distance, met, config.outlier)
+        points = pulls.points
+        if points is not None:
+            missed = (points.samples * transforms[points.facet]).sum(dim=-1) - points.heights
+            held = (1 + (missed / config.outlier / points.spread).square()) ** -2
+            points = points.replace(weight=points.weight * held)
+        return pulls.replace(weight=pulls.weight * trust, points=points)
+
+    def _curvature_terms(
+        self,
+        pulls: Pulls,
+        transforms: Float[Tensor, "face 4"],
+        distance: Float[Tensor, "seam ray"],
+    ) -> tuple[Float[Tensor, " seam"], Float[Tensor, "seam 2"]]:
+        if not self.config.curvature:
+            return torch.ones_like(distance[:, 0]), torch.zeros_like(pulls.curvature)
+        scales = transforms[pulls.facets, 2]
+        stiffness = seam_stiffness(pulls.curvature, scales, _FLAT)
+        apart = (pulls.weight * distance.square()).sum(dim=1)
+        return stiffness, (stiffness.square() * apart)[:, None] * pulls.curvature * scales
+
+
+def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
+    """Estimate by how much one relief is off, from how far two are apart."""
+    met = pulls.weight > 0
+    return (
+        common_distance(distance, met) / 2**0.5
+        if bool(met.any())
+        else torch.ones_like(distance.sum())
+    )
+
+
+def _with_scales_held(pulls: Pulls) -> Pulls:
+    held = pulls.prior_weight.clone()
+    held[2] = torch.inf
+    return pulls.replace(prior_weight=held)
+
+
+def _limit_scales(transforms: Float[Tensor, "face 4"], limit: float) -> Float[Tensor, "face 4"]:
+    hx, hy, hz, h0 = transforms.unbind(dim=-1)
+    return torch.stack([hx, hy, hz.clamp(1 / limit, limit), h0], dim=-1)
+
+
+def _with_one(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    return torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
+
+
+def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, ""]:
+    square = mismatches(pulls, transforms).square().sum(dim=-1)
+    return square[pulls.weight > 0].mean().sqrt()
+
+
+def _apply(
+    depths: DepthPatches, transforms: Float[Tensor, "face 4"], verdict: Int[Tensor, " face"]
+) -> tuple[Depths, ...]:
+    buckets = []
+    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+        own = transforms[templates.facet]
+        depth = transformed(templates.points_patch.double(), relief.depth.double(), own)
+        # Transforms chain: whoever aligns twice still learns the way from the first relief.
+        chained = own[:, 2:3] * relief.transform + own * own.new_tensor([1, 1, 0, 1])
+        buckets.append(
+            relief.replace(
+                depth=depth.to(relief.depth),
+                transform=chained.to(relief.transform),
+                verdict=verdict[templates.facet],
+            )
+        )
+    return tuple(buckets)

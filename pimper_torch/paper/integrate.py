@@ -1,0 +1,151 @@
+"""Integration: normals of every patch become its relief."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.config import require
+from pimper_torch.geometry.filling import fill_smoothly
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.reliefs import sample_raster
+from pimper_torch.geometry.surfaces import slopes_from_normals
+from pimper_torch.linalg.poisson import integrate_weighted
+from pimper_torch.progress import track
+from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
+from pimper_torch.records.patches import Photometry, Templates
+from pimper_torch.stage import Stage
+
+# What filled slopes weigh next to measured ones. Small enough to leave the measured ones
+# alone, large enough to decide where nothing else does.
+_FILLED_WEIGHT = 1e-4
+
+# Uncertain slopes weigh no less than this: their neighbours are hardly better.
+_LEAST_CONFIDENCE = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntegrateConfig:
+    """How slopes become heights.
+
+    Attributes:
+        max_tilt_deg: Normals farther from the facet's own are brought to this angle; such a
+            sample lies on the rim or is wrong, and one alone can bend its whole patch.
+        iterations: Rounds of weighted least squares after the published integration, so
+            that filled slopes stop pulling at measured ones and uncertain ones count less.
+            0 is the published method.
+    """
+
+    max_tilt_deg: float = 75.0
+    iterations: int = 8
+
+    def __post_init__(self) -> None:
+        require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
+        require(self.iterations >= 0, "iterations", self.iterations, "0 or more")
+
+
+class Integrate(Stage):
+    """Integrate the normals of every patch on its template.
+
+    Frankot and Chellappa's projection in the cosine basis, bucket by bucket. Samples without
+    normals, and the raster outside the enlarged triangle, get slopes filled in smoothly from
+    the samples around them; a patch without any normals stays its facet's plane. The free
+    constant is chosen so that the relief passes, on average, through the facet's corners.
+
+    Differentiable in normals and confidence.
+
+    Source: Frankot & Chellappa, A method for enforcing integrability in shape from shading
+    algorithms, PAMI 10(4), 1988.
+    """
+
+    def __init__(self, config: IntegrateConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or IntegrateConfig()
+
+    def forward(self, photometric: PhotometricPatches) -> DepthPatches:
+        """Give every patch its relief; ``valid`` inside enlarged triangles that have data."""
+        steepest = math.tan(math.radians(self.config.max_tilt_deg))
+        pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
+        buckets = []
+        for templates, photometry in track(pairs):
+            relief = integrate_normals(
+                photometry.normals_patch,
+                photometry.valid,
+                photometry.confidence,
+                templates.spacing,
+                steepest,
+                self.config.iterations,
+            )
+            depth = through_corners(relief, templates, photometric.patches.coarse)
+            buckets.append(_depths(depth, templates, photometry))
+        return DepthPatches(photometric=photometric, buckets=tuple(buckets))
+
+
+def integrate_normals(
+    normals: Float[Tensor, "patch height width 3"],
+    valid: Bool[Tensor, "patch height width"],
+    confidence: Float[Tensor, "patch height width"],
+    spacing: Float[Tensor, " patch"],
+    steepest: float,
+    iterations: int,
+) -> Float[Tensor, "patch height width"]:
+    """Find the relief, of mean zero over its raster, whose slopes are the normals'.
+
+    Args:
+        normals: Unit, ``n_z < 0``; anything where not valid.
+        valid: Where the normals are to be followed.
+        confidence: In [0, 1]; how closely, if ``iterations`` is not 0.
+        spacing: Between samples, in the units of the depth.
+        steepest: Limit of a slope's size.
+        iterations: Of the weighted refinement.
+    """
+    slopes = _slopes(normals, valid, steepest).movedim(-1, 1)
+    slopes = fill_smoothly(slopes, valid.to(slopes)).double() * spacing[:, None, None, None]
+    # Half-way between samples the mean of the two is right to second order.
+    right = (slopes[:, 0, :, 1:] + slopes[:, 0, :, :-1]) / 2
+    down = (slopes[:, 1, 1:] + slopes[:, 1, :-1]) / 2
+    weight = torch.where(valid, confidence.double().clamp(_LEAST_CONFIDENCE, 1), _FILLED_WEIGHT)
+    relief = integrate_weighted(
+        right,
+        down,
+        torch.minimum(weight[:, :, 1:], weight[:, :, :-1]),
+        torch.minimum(weight[:, 1:], weight[:, :-1]),
+        iterations,
+    )
+    return relief.to(normals)
+
+
+def _slopes(
+    normals: Float[Tensor, "patch height width 3"],
+    valid: Bool[Tensor, "patch height width"],
+    steepest: float,
+) -> Float[Tensor, "patch height width 2"]:
+    """Give the slopes of valid normals, at most so steep, and 0 elsewhere."""
+    upright = torch.zeros_like(normals)
+    upright[..., 2] = -1
+    return slopes_from_normals(torch.where(valid[..., None], normals, upright), steepest)
+
+
+def through_corners(
+    relief: Float[Tensor, "patch height width"], templates: Templates, coarse: CoarseMesh
+) -> Float[Tensor, "patch height width"]:
+    """Shift reliefs along z so that they pass, on average, through their facets' corners."""
+    vertices = coarse.mesh.vertices_world[coarse.mesh.faces[templates.facet]]
+    corners = transform(templates.patch_from_world, vertices)
+    found = sample_raster(relief[:, None], corners[..., :2], templates.origin, templates.spacing)
+    offset = (found[:, 0] - corners[..., 2]).mean(dim=1)
+    return relief - offset[:, None, None]
+
+
+def _depths(
+    depth: Float[Tensor, "patch height width"], templates: Templates, photometry: Photometry
+) -> Depths:
+    has_data = photometry.valid.flatten(1).any(dim=1)
+    identity = depth.new_tensor([0, 0, 1, 0]).expand(len(depth), 4)
+    return Depths(
+        depth=depth,
+        valid=templates.inside & has_data[:, None, None],
+        transform=identity,
+    )

@@ -1,5 +1,0 @@
-"""Photometric stereo from one viewpoint: lights known or not, and one call for all methods."""
-
-from pimper_torch.photometric_stereo.stereo import Finding, PhotometricStereo, photometric_stereo
-
-__all__ = ["Finding", "PhotometricStereo", "photometric_stereo"]

@@ -1,0 +1,1 @@
+"""One viewpoint, many lights: photometric stereo, normal integration, response curves."""

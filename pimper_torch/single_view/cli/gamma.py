@@ -1,0 +1,89 @@
+"""``pimper gamma``: the response of photographs from a fixed camera under several lights."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from pimper_torch.cli.bars import Bars
+from pimper_torch.errors import InputError
+from pimper_torch.io.photographs import list_images, load_views, read_mask
+from pimper_torch.photometry.gamma import GammaEstimate, gamma_of_photographs
+from pimper_torch.progress import listening
+from pimper_torch.radiometry import LINEAR
+
+# Residuals so near the best one are as good.
+_AS_GOOD = 1.05
+
+
+def run(command: str, arguments: Sequence[str]) -> None:
+    """Carry out ``gamma``: read, estimate, and say what to tell `pimper reconstruct`.
+
+    Raises:
+        PimperError: Photographs that cannot be read, or too few under too few lights.
+    """
+    job = checked(command, arguments)
+    with Bars(Console(stderr=True)) as bars:
+        bars.started("read")
+        with listening(bars.progressed):
+            views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
+    drawn = None if job.mask is None else read_mask(job.mask, job.max_size_px)
+    found = gamma_of_photographs(views, mask=drawn, rank=job.rank)
+    Console().print(f"{found}{advice(found)}", highlight=False, soft_wrap=True, markup=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    photos: Path
+    mask: Path | None
+    rank: Literal[3, 4]
+    max_size_px: int
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and refuse photographs and a mask that are not there.
+
+    Raises:
+        InputError: The folder of photographs, or the mask.
+        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+    """
+
+    def gamma(
+        photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")],
+        mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+        rank: Literal[3, 4] = 4,
+        max_size_px: int = 0,
+    ) -> _Job:
+        """Find the gamma of photographs that a fixed camera took of one object under many lights.
+
+        Args:
+            photos: Folder of JPEG, PNG or TIFF files; the camera did not move.
+            mask: Image that is bright on the object and dark off it, of the photographs' size.
+            rank: 3 if lamps are far away and the room is dark, 4 with ambient light.
+            max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+        """
+        return _Job(photos=photos, mask=mask, rank=rank, max_size_px=max_size_px)
+
+    job = tyro.cli(gamma, prog=f"pimper {command}", args=list(arguments))
+    list_images(job.photos)
+    if job.mask is not None and not job.mask.is_file():
+        raise InputError(
+            f"{job.mask}: there is no such file; needed: a mask, bright on the object, for all "
+            "photographs."
+        )
+    return job
+
+
+def advice(found: GammaEstimate) -> str:
+    """Say which response to tell `pimper reconstruct`; nothing if none is known."""
+    if not found.determined:
+        return ""
+    response = f"{found.gamma:.2f}"
+    if found.residual_linear <= _AS_GOOD * found.residual:
+        response = "linear"
+    elif found.residual_srgb <= _AS_GOOD * found.residual:
+        response = "srgb"
+    return f"\n  pimper reconstruct PHOTOS -o RESULT --photographs.response {response}"

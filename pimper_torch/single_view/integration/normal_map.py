@@ -1,0 +1,263 @@
+"""One normal map to one depth map: parallel rays or a pinhole, masks, weights, known depths."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.pixels import crop_intrinsics
+from pimper_torch.linalg.rasters import Method as Solver
+from pimper_torch.linalg.rasters import RasterSystem
+from pimper_torch.records import Record
+from pimper_torch.single_view.integration.discontinuities import (
+    Continuity,
+    DiscontinuityConfig,
+    find_discontinuities,
+)
+from pimper_torch.single_view.integration.frankot_chellappa import integrate_fourier
+from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
+
+Integration = Literal["discontinuities", "weighted", "cosine", "frankot-chellappa"]
+
+# Steps over pixels without a normal tie, and no more: their slopes were filled in.
+_FILLED_WEIGHT = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class IntegratedMap(Record):
+    """A surface over a raster.
+
+    Attributes:
+        depth: Along z; 0 outside. Under a pinhole up to one factor for each part of the mask,
+            whose depths have the geometric mean 1, and under parallel rays up to a constant,
+            with the mean 0, unless depths of the part were given.
+        valid: True where a normal was given and could be used; the mask's other pixels bridge.
+        continuity: Which steps between pixels the surface takes; ``None`` where all are.
+    """
+
+    depth: Float[Tensor, "height width"]
+    valid: Bool[Tensor, "height width"]
+    continuity: Continuity | None = None
+
+
+def integrate_normal_map(
+    normals: Float[Tensor, "height width 3"],
+    mask: Bool[Tensor, "height width"] | None = None,
+    *,
+    intrinsics: Float[Tensor, "3 3"] | None = None,
+    spacing: tuple[float, float] = (1.0, 1.0),
+    weight: Float[Tensor, "height width"] | None = None,
+    known_depth: Float[Tensor, "height width"] | None = None,
+    known_weight: Float[Tensor, "height width"] | None = None,
+    method: Integration = "discontinuities",
+    config: DiscontinuityConfig | None = None,
+    solver: Solver = "auto",
+) -> IntegratedMap:
+    """Find the surface that has the normals.
+
+    Args:
+        normals: x right, y down, z forward into the surface; facing the viewer. Of any length;
+            where not finite, zero or turned away the surface is bridged.
+        mask: Pixels of the surface; all if not given.
+        intrinsics: Of the pinhole, in pixels from the corner of the top-left one; without it
+            rays are parallel.
+        spacing: Distance of neighbouring pixels in a row and in a column, under parallel rays.
+        weight: How far each normal is to be trusted; 1 if not given, 0 like not finite.
+        known_depth: Where not NaN, the depth there.
+        known_weight: Of the known depths, next to that of one normal; 1 if not given.
+        method: ``"discontinuities"`` lets depth jump; see
+            :mod:`.discontinuities`. ``"weighted"`` is least squares,
+            under masks and weights. ``"cosine"`` and ``"frankot-chellappa"`` take the
+            rectangle round the mask, normals outside it filled in smoothly: published, quick,
+            and for rectangles without mask and weights.
+        config: When a step is given up.
+        solver: Of the linear systems: ``"cholesky"``, ``"multigrid"`` or ``"auto"``.
+
+    Raises:
+        InputError: Shapes that differ, a mask without pixels, weights that are negative, a
+            method that does not take what was given.
+
+    Differentiable in normals, weights and known depths, by one more solve; which steps are
+    continuous is constant.
+
+    >>> up = torch.tensor([0.0, 0.0, -1.0]).expand(4, 5, 3)
+    >>> float(integrate_normal_map(up).depth.abs().max())
+    0.0
+    """
+    _refuse(normals, mask, weight, known_depth, known_weight, spacing)
+    if mask is None:
+        mask = torch.ones_like(normals[..., 0], dtype=torch.bool)
+    box = _box(mask)
+    if mask[box].shape != mask.shape:
+        part = integrate_normal_map(
+            normals[box],
+            mask[box],
+            intrinsics=None if intrinsics is None else _from_corner(intrinsics, box),
+            spacing=spacing,
+            weight=None if weight is None else weight[box],
+            known_depth=None if known_depth is None else known_depth[box],
+            known_weight=None if known_weight is None else known_weight[box],
+            method=method,
+            config=config,
+            solver=solver,
+        )
+        return _placed(part, box, *mask.shape)
+    unit = _usable(normals, mask, weight)
+    whole = method in ("cosine", "frankot-chellappa")
+    inside = torch.ones_like(mask) if whole else mask
+    if intrinsics is None:
+        steps = orthographic_steps(unit, inside, spacing)
+    else:
+        steps = perspective_steps(unit, inside, intrinsics)
+    continuity = None
+    if whole:
+        _refuse_given(method, weight, known_depth)
+        found = _whole_rectangle(steps, method)
+    else:
+        anchor, unknown = _known(known_depth, known_weight, mask, steps, intrinsics)
+        weights = _weights(steps, weight)
+        if method == "discontinuities":
+            settings = config or DiscontinuityConfig()
+            continuity = find_discontinuities(steps, *weights, anchor, unknown, settings, solver)
+            weights = weights[0] * continuity.right, weights[1] * continuity.down
+        system = RasterSystem(*weights, anchor, method=solver, what="the integration")
+        found = system.fit_steps(*steps.wanted, unknown)
+    depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
+    return IntegratedMap(depth=depth.to(normals), valid=steps.valid & mask, continuity=continuity)
+
+
+Box = tuple[slice, slice]
+
+
+def _box(mask: Bool[Tensor, "height width"]) -> Box:
+    """Give the rows and columns that have pixels: work and memory are spent on those only."""
+    rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def _from_corner(intrinsics: Float[Tensor, "3 3"], box: Box) -> Float[Tensor, "3 3"]:
+    return crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
+
+
+def _placed(part: IntegratedMap, box: Box, height: int, width: int) -> IntegratedMap:
+    """Put what was found in a box back where the box was."""
+    rows, columns = box
+    frame = (columns.start, width - columns.stop, rows.start, height - rows.stop)
+    continuity = part.continuity
+    if continuity is not None:
+        continuity = continuity.replace(
+            right=pad(continuity.right, frame), down=pad(continuity.down, frame)
+        )
+    return IntegratedMap(
+        depth=pad(part.depth, frame), valid=pad(part.valid, frame), continuity=continuity
+    )
+
+
+def _usable(
+    normals: Float[Tensor, "height width 3"],
+    mask: Bool[Tensor, "height width"],
+    weight: Float[Tensor, "height width"] | None,
+) -> Float[Tensor, "height width 3"]:
+    """Give unit normals, NaN where there is none to be used."""
+    length = normals.norm(dim=-1)
+    usable = mask & (length > 0) & length.isfinite()
+    if weight is not None:
+        usable = usable & (weight > 0)
+    safe = torch.where(usable, length, 1)[..., None]
+    return torch.where(usable[..., None], normals / safe, torch.nan)
+
+
+def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> tuple[Tensor, Tensor]:
+    """Give the weights of squared differences of the unknown, zero outside the mask."""
+    inside = steps.inside
+    trust = torch.where(steps.valid, 1.0 if weight is None else weight.double(), 0).double()
+    parts = []
+    for axis, known, unit in (
+        (1, steps.known_right, steps.unit_right),
+        (0, steps.known_down, steps.unit_down),
+    ):
+        last = trust.shape[axis] - 1
+        both = inside.narrow(axis, 1, last) & inside.narrow(axis, 0, last)
+        least = torch.minimum(trust.narrow(axis, 1, last), trust.narrow(axis, 0, last))
+        parts.append(both * torch.where(known, least, _FILLED_WEIGHT) / unit**2)
+    return parts[0], parts[1]
+
+
+def _known(
+    depth: Float[Tensor, "height width"] | None,
+    weight: Float[Tensor, "height width"] | None,
+    mask: Bool[Tensor, "height width"],
+    steps: Steps,
+    intrinsics: Float[Tensor, "3 3"] | None,
+) -> tuple[Tensor | None, Tensor | None]:
+    """Give anchors and the unknowns there."""
+    if depth is None:
+        return None, None
+    given = depth.isfinite() & mask
+    if intrinsics is not None and bool((depth[given] <= 0).any()):
+        raise InputError(
+            f"known_depth has {int((depth[given] <= 0).sum())} values that are not positive; "
+            "under a pinhole all must be. Mark pixels of unknown depth with NaN."
+        )
+    strength = torch.where(given, 1.0 if weight is None else weight.double(), 0).double()
+    safe = torch.where(given, depth.double(), 1)
+    unknown = safe if intrinsics is None else safe.log()
+    return strength / (steps.unit_right * steps.unit_down), unknown
+
+
+def _whole_rectangle(steps: Steps, method: Integration) -> Float[Tensor, "height width"]:
+    if method == "frankot-chellappa":
+        right, down = steps.slopes.unbind(dim=-1)
+        return integrate_fourier(right, down, steps.unit_right, steps.unit_down)
+    right = torch.full_like(steps.right, steps.unit_right**-2)
+    down = torch.full_like(steps.down, steps.unit_down**-2)
+    return RasterSystem(right, down, method="cosine").fit_steps(*steps.wanted)
+
+
+def _refuse(
+    normals: Float[Tensor, "height width 3"],
+    mask: Bool[Tensor, "height width"] | None,
+    weight: Float[Tensor, "height width"] | None,
+    known_depth: Float[Tensor, "height width"] | None,
+    known_weight: Float[Tensor, "height width"] | None,
+    spacing: tuple[float, float],
+) -> None:
+    size = normals.shape[:2]
+    rasters = {
+        "mask": mask,
+        "weight": weight,
+        "known_depth": known_depth,
+        "known_weight": known_weight,
+    }
+    for name, raster in rasters.items():
+        if raster is not None and raster.shape != size:
+            raise InputError(
+                f"{name} is {raster.shape[0]} x {raster.shape[1]} pixels, the normals "
+                f"{size[0]} x {size[1]}; both must be of one size."
+            )
+        if name.endswith("weight") and raster is not None and not bool((raster >= 0).all()):
+            raise InputError(
+                f"{name} has {int((~(raster >= 0)).sum())} values that are negative or NaN; "
+                "each must be 0 or more."
+            )
+    if mask is not None and not bool(mask.any()):
+        raise InputError("mask has no pixel; at least one must be inside.")
+    if known_weight is not None and known_depth is None:
+        raise InputError("known_weight was given without known_depth; give both.")
+    if not all(0 < step < math.inf for step in spacing):
+        raise InputError(f"spacing is {spacing}; both distances must be above 0.")
+
+
+def _refuse_given(
+    method: Integration,
+    weight: Float[Tensor, "height width"] | None,
+    known_depth: Float[Tensor, "height width"] | None,
+) -> None:
+    if weight is not None or known_depth is not None:
+        name = "weight" if weight is not None else "known_depth"
+        raise InputError(f"method {method!r} takes no {name}; use 'weighted' or 'discontinuities'.")

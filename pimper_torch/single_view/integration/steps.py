@@ -1,0 +1,238 @@
+r"""What normals say of the step from one pixel to the next.
+
+The unknown is the depth along z for parallel rays, and its logarithm for rays through a
+pinhole: then, with :math:`x` the unknown and the ray :math:`(u, v, 1)`,
+
+.. math:: \frac{\partial x}{\partial u} = -\frac{n_u}{n \cdot (u, v, 1)},
+
+as for parallel rays :math:`\partial z / \partial u = -n_u / n_z`. Both are slopes without a
+unit; times the distance of neighbouring pixels (``unit``: their spacing, or one over the focal
+length) they are steps of the unknown.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from pimper_torch.geometry.filling import fill_smoothly
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.records import Record
+
+# Cosine between ray and normal below which a slope is nothing but rounding.
+_GRAZING = 1e-3
+
+# The cubic through four slopes is followed where it bends no more than this from the chord,
+# and where no crease (a slope that changes by so much more than beside it) is near.
+_SMOOTH_BEND, _SMOOTH_EXCESS = 0.5, 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Steps(Record):
+    """Wanted differences between neighbouring pixels, in units of ``unit_right, unit_down``.
+
+    Attributes:
+        slopes: At every pixel of the raster, right and down; filled in smoothly where not valid.
+        right: From each pixel to the next in its row; 0 outside.
+        down: From each pixel to that below.
+        known_right: True where both pixels are inside with normals to be trusted.
+        known_down: Likewise.
+        kink_right: By how much more the slope along the step changes on it than on those before
+            and after: 0 on smooth surface, the size of the kink at a crease or an edge of depth.
+        kink_down: Likewise.
+        twist_right: Likewise of the slope across the step, which changes where the surface
+            tears: the sides of a step that rise differently meet in one point at most.
+        twist_down: Likewise.
+        unit_right: Change of the unknown on a step of slope 1.
+        unit_down: Likewise.
+        inside: The pixels.
+        valid: Those of them with a normal to be trusted.
+    """
+
+    slopes: Float[Tensor, "height width 2"]
+    right: Float[Tensor, "height steps_right"]
+    down: Float[Tensor, "steps_down width"]
+    known_right: Bool[Tensor, "height steps_right"]
+    known_down: Bool[Tensor, "steps_down width"]
+    kink_right: Float[Tensor, "height steps_right"]
+    kink_down: Float[Tensor, "steps_down width"]
+    twist_right: Float[Tensor, "height steps_right"]
+    twist_down: Float[Tensor, "steps_down width"]
+    unit_right: float
+    unit_down: float
+    inside: Bool[Tensor, "height width"]
+    valid: Bool[Tensor, "height width"]
+
+    @property
+    def wanted(
+        self,
+    ) -> tuple[Float[Tensor, "height steps_right"], Float[Tensor, "steps_down width"]]:
+        """The differences in units of the unknown."""
+        return self.right * self.unit_right, self.down * self.unit_down
+
+
+def orthographic_steps(
+    normals: Float[Tensor, "height width 3"],
+    mask: Bool[Tensor, "height width"],
+    spacing: tuple[float, float] = (1.0, 1.0),
+) -> Steps:
+    """Give the steps of depth under parallel rays.
+
+    Args:
+        normals: Unit, ``n_z < 0``; where they are not finite, or turned away, inside the mask
+            slopes are filled in smoothly and the steps not known.
+        mask: Pixels of the surface.
+        spacing: Distance of neighbouring pixels in a row and in a column.
+
+    Differentiable in the normals. Fourth order in the spacing where the surface is smooth.
+    """
+    known = normals.isfinite().all(dim=-1)
+    valid = mask & known & (normals[..., 2] < -_GRAZING)
+    safe = torch.where(valid[..., None], normals, normals.new_tensor([0, 0, -1])).double()
+    slopes = _filled(-safe[..., :2] / safe[..., 2:], valid)
+    return _steps(slopes, (_between_planes, _between_planes), mask, valid, spacing)
+
+
+def perspective_steps(
+    normals: Float[Tensor, "height width 3"],
+    mask: Bool[Tensor, "height width"],
+    intrinsics: Float[Tensor, "3 3"],
+) -> Steps:
+    r"""Give the steps of the logarithm of depth under rays through a pinhole.
+
+    On a step the tangent planes of both pixels meet at the ray half-way, which is exact for
+    planes:
+
+    .. math:: x_b - x_a = \log \frac{(n_a \cdot r_a)(n_b \cdot r_m)}
+                                    {(n_a \cdot r_m)(n_b \cdot r_b)}.
+
+    Args:
+        normals: As for :func:`orthographic_steps`, in the camera's frame.
+        mask: Pixels of the surface.
+        intrinsics: Without skew.
+
+    Source: Milano, Lopez-Rodriguez, Ott, Siegwart & Chung, Discontinuity-aware normal
+    integration for generic central camera models, 2025, for the planes that meet.
+    """
+    height, width = mask.shape
+    K = intrinsics.to(normals).double()
+    centers = pixel_centers(width, height, like=K)
+    rays = torch.stack(
+        [
+            (centers[..., 0] - K[0, 2]) / K[0, 0],
+            (centers[..., 1] - K[1, 2]) / K[1, 1],
+            torch.ones_like(centers[..., 0]),
+        ],
+        dim=-1,
+    )
+    known = normals.isfinite().all(dim=-1)
+    facing = -(torch.where(known[..., None], normals, 0).double() * rays).sum(dim=-1)
+    valid = mask & known & (facing > _GRAZING)
+    safe = torch.where(valid[..., None], normals.double(), -rays)
+    facing = -(safe * rays).sum(dim=-1)
+    slopes = _filled(safe[..., :2] / facing[..., None], valid)
+    unit = 1 / float(K[0, 0]), 1 / float(K[1, 1])
+    between = (
+        partial(_between_planes_seen, unit=unit[0]),
+        partial(_between_planes_seen, unit=unit[1]),
+    )
+    return _steps(slopes, between, mask, valid, unit)
+
+
+# From slopes before and after each step: the step between the pixels' tangent planes, and by
+# how much the second plane turns from the first.
+Between = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def _between_planes(
+    first: Float[Tensor, "*batch"], second: Float[Tensor, "*batch"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    return (first + second) / 2, second - first
+
+
+def _between_planes_seen(
+    first: Float[Tensor, "*batch"], second: Float[Tensor, "*batch"], unit: float
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    # With r_m half-way, n . r_m / n . r_a = 1 - (slope at a) unit / 2.
+    ahead = (1 + unit / 2 * second).clamp_min(_GRAZING).log()
+    behind = (1 - unit / 2 * first).clamp_min(_GRAZING).log()
+    # The logarithm of a plane's depth bends: its slope changes by the square of itself.
+    turn = second - first - unit * first * second
+    return (ahead - behind) / unit + unit / 24 * (first + second) * turn, turn
+
+
+def _steps(
+    slopes: Float[Tensor, "height width 2"],
+    between: tuple[Between, Between],
+    mask: Bool[Tensor, "height width"],
+    valid: Bool[Tensor, "height width"],
+    unit: tuple[float, float],
+) -> Steps:
+    known = valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]
+    inside = mask[:, 1:] & mask[:, :-1], mask[1:] & mask[:-1]
+    across, along = slopes.unbind(dim=-1)
+    right, kink_right = _curved(*between[0](across[:, :-1], across[:, 1:]), known[0])
+    down, kink_down = _curved(*between[1](along.mT[:, :-1], along.mT[:, 1:]), known[1].mT)
+    twist_right = _excess(along.diff(dim=1), known[0])
+    twist_down = _excess(across.diff(dim=0).mT, known[1].mT).mT
+    return Steps(
+        slopes=slopes,
+        right=torch.where(inside[0], right, 0),
+        down=torch.where(inside[1], down.mT, 0),
+        known_right=known[0],
+        known_down=known[1],
+        kink_right=kink_right,
+        kink_down=kink_down.mT,
+        twist_right=twist_right,
+        twist_down=twist_down,
+        unit_right=unit[0],
+        unit_down=unit[1],
+        inside=mask,
+        valid=valid,
+    )
+
+
+def _curved(
+    step: Float[Tensor, "line step"],
+    turn: Float[Tensor, "line step"],
+    known: Bool[Tensor, "line step"],
+) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
+    """Bend steps along the cubic through four slopes, and tell kinks.
+
+    The step between tangent planes is wrong by a twelfth of the surface's third derivative,
+    which on a sphere adds up from pixel to pixel; how planes turn before and after tells it.
+    """
+    before, after = _beside(turn, known)
+    has_before, has_after = _beside(known.to(turn), known)
+    kink = _excess(turn, known)
+    bend = after - before
+    smooth = known & (has_before * has_after > 0)
+    smooth = smooth & (bend.abs() < _SMOOTH_BEND) & (kink < _SMOOTH_EXCESS)
+    return step - torch.where(smooth, bend, 0) / 24, kink
+
+
+def _excess(
+    change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
+) -> Float[Tensor, "line step"]:
+    """Tell by how much more a slope changes on a step than beside it; no gradient."""
+    before, after = _beside(change.detach(), known)
+    beside = torch.maximum(before.abs(), after.abs())
+    return torch.where(known, (change.detach().abs() - beside).clamp_min(0), 0)
+
+
+def _beside(
+    change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
+) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
+    """Give the changes on the steps before and after each; 0 where those are not known."""
+    wide = pad(torch.where(known, change, 0), (1, 1))
+    return wide[:, :-2], wide[:, 2:]
+
+
+def _filled(
+    slopes: Float[Tensor, "height width 2"], valid: Bool[Tensor, "height width"]
+) -> Float[Tensor, "height width 2"]:
+    return fill_smoothly(slopes.movedim(-1, 0)[None], valid.to(slopes)[None])[0].movedim(0, -1)

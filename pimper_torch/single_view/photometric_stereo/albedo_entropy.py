@@ -1,0 +1,199 @@
+r"""Bas-relief resolved by the surface having few albedos.
+
+A wrong relief spreads the albedo of a region of one paint over many values, by how its normals
+lean. The right one is where the histogram of albedo has the least entropy.
+
+Source: Alldrin, Mallick & Kriegman, Resolving the generalized bas-relief ambiguity by entropy
+minimization, CVPR 2007.
+"""
+
+import itertools
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.single_view.photometric_stereo.factors import (
+    cast,
+    require_standard,
+    usable_pixels,
+)
+
+# In the standard form a ball cut at 75 degrees has lambda 0.9 and a relief with slopes of 0.15
+# has 0.15; the object's mean slope, which the form takes away, is rarely above one.
+_FLATTEST, _STEEPEST, _LAMBDAS = 0.125, 4.0, 23
+_MOST_TILT, _TILTS = 1.0, 17
+
+# The kernel's width in logarithm of albedo at first. A wider one smooths the right minimum away
+# where albedos are close, a narrower one needs a finer grid.
+_FIRST_WIDTH = 0.03
+# How far from the mean, a factor of 20, the histogram reaches.
+_REACH = 3.0
+# Places of the grid that are followed, half of them to the next kernel; pixels looked at meanwhile.
+_FOLLOWED, _FEW_PIXELS = 200, 1000
+# Pixels by candidates at a time: few enough to stay in a processor's cache.
+_CHUNK_ENTRIES = 250_000
+
+
+def resolve_by_albedo_entropy(
+    shading: Float[Tensor, "3 pixel"],
+    groups: Int[Tensor, " pixel"] | None = None,
+    *,
+    width: float = 0.015,
+    max_pixels: int = 20_000,
+) -> BasRelief:
+    r"""Find the bas-relief transformation under which the fewest albedos remain.
+
+    Minimises the entropy of :math:`\log \lVert G b \rVert`, whose distribution does not change
+    with the scale of albedo, smoothed by a kernel: on a grid in the standard form of
+    the surface (:func:`.standard_relief`) first,
+    then, from its best places, by steps that are halved as the kernel narrows.
+
+    Args:
+        shading: Albedo times normal, right up to a bas-relief transformation; vectors that are
+            zero or not finite are left out.
+        groups: Pixels of equal chromaticity
+            (:func:`.chromaticity_groups`). The
+            entropy of colour albedo is that of chromaticity, which no relief changes, plus that
+            of brightness within each group, which is minimised. Without it all are one group.
+        width: Of the last kernel, as a share of albedo; about the noise of shading.
+        max_pixels: Evenly chosen from more.
+
+    Returns:
+        The transformation with lambda above zero: hills stay hills. Constant to autograd.
+
+    Fails where the surface has as many albedos as pixels, or so few different normals that all
+    reliefs leave albedo as sharp; the last digits are those of the kernel's width.
+
+    Raises:
+        InputError: Fewer than 50 vectors, or all parallel.
+
+    Source: Alldrin, Mallick & Kriegman, CVPR 2007. The logarithm, which replaces their fixed
+    scale, the standard form and the reading of colour are ours.
+    """
+    with torch.no_grad():
+        usable = usable_pixels(shading)
+        count = int(usable.sum())
+        if count < 50:
+            raise InputError(
+                f"{count} of {shading.shape[1]} shading vectors are finite and not zero; needed: "
+                "50 at least for a histogram of albedo. Enlarge the mask."
+            )
+        start = require_standard(shading[:, usable])
+        b = start.on_shading(shading[:, usable].double())
+        labels = torch.zeros_like(b[0]).long() if groups is None else groups[usable]
+        labels = torch.unique(labels, return_inverse=True)[1]
+        found = _minimised(b, labels, width, max_pixels)
+        whole = BasRelief(mu=found[0], nu=found[1], lam=found[2].exp()).after(start)
+        return cast(whole, shading)
+
+
+def albedo_entropy(
+    shading: Float[Tensor, "3 pixel"],
+    labels: Int[Tensor, " pixel"],
+    candidates: Float[Tensor, "candidate 3"],
+    width: float,
+) -> Float[Tensor, " candidate"]:
+    """Give the entropy that log-albedo has within groups after each transformation.
+
+    Args:
+        shading: Albedo times normal.
+        labels: Of the groups, from 0.
+        candidates: mu, nu and the logarithm of lambda.
+        width: Standard deviation of the kernel, in logarithm of albedo.
+    """
+    size = max(1, _CHUNK_ENTRIES // shading.shape[1])
+    parts = [
+        _entropy(shading, labels, candidates[first : first + size], width)
+        for first in range(0, len(candidates), size)
+    ]
+    return torch.cat(parts)
+
+
+def _minimised(
+    b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], width: float, max_pixels: int
+) -> Float[Tensor, " 3"]:
+    few, few_labels = _chosen(b, labels, _FEW_PIXELS)
+    tilts = torch.linspace(-_MOST_TILT, _MOST_TILT, _TILTS).to(b)
+    flat, steep = (torch.tensor(value).to(b).log() for value in (_FLATTEST, _STEEPEST))
+    lambdas = torch.linspace(float(flat), float(steep), _LAMBDAS).to(b)
+    grid = torch.cartesian_prod(tilts, tilts, lambdas)
+    best = grid[albedo_entropy(few, few_labels, grid, _FIRST_WIDTH).argsort()[:_FOLLOWED]]
+    step = torch.stack([tilts[1] - tilts[0], tilts[1] - tilts[0], lambdas[1] - lambdas[0]]) / 2
+    narrow = _FIRST_WIDTH
+    while narrow > width:
+        best, entropy = _descended(few, few_labels, best, step, narrow)
+        best = torch.unique(best[entropy.argsort()[: -(-len(best) // 2)]], dim=0)
+        step, narrow = step / 2, narrow / 1.4142
+    final = albedo_entropy(few, few_labels, best, width).argmin()
+    many, many_labels = _chosen(b, labels, max_pixels)
+    best = best[final][None]
+    # Down to a step that changes albedo by a tenth of the kernel.
+    while float(step.max()) > width / 10:
+        best, _ = _descended(many, many_labels, best, step, width)
+        step = step / 2
+    return best[0]
+
+
+def _descended(
+    b: Float[Tensor, "3 pixel"],
+    labels: Int[Tensor, " pixel"],
+    best: Float[Tensor, "candidate 3"],
+    step: Float[Tensor, " 3"],
+    width: float,
+    rounds: int = 4,
+) -> tuple[Float[Tensor, "candidate 3"], Float[Tensor, " candidate"]]:
+    """Move each candidate to its best neighbour a step away until none is better."""
+    around = torch.tensor(list(itertools.product((-1, 0, 1), repeat=3))).to(b) * step
+    stay = len(around) // 2
+    best = best.clone()
+    least = torch.full_like(best[:, 0], torch.inf)
+    moving = torch.arange(len(best), device=b.device)
+    for _ in range(rounds):
+        near = best[moving, None] + around
+        entropy = albedo_entropy(b, labels, near.flatten(0, 1), width).reshape(near.shape[:2])
+        least[moving], chosen = entropy.min(dim=1)
+        best[moving] = near[torch.arange(len(near), device=b.device), chosen]
+        moving = moving[chosen != stay]
+        if len(moving) == 0:
+            break
+    return best, least
+
+
+def _entropy(
+    b: Float[Tensor, "3 pixel"],
+    labels: Int[Tensor, " pixel"],
+    candidates: Float[Tensor, "candidate 3"],
+    width: float,
+) -> Float[Tensor, " candidate"]:
+    mu, nu, log_lam = candidates.mT[..., None]
+    x, y, z = b
+    lam = log_lam.exp()
+    square = (lam * x - mu * z).square() + (lam * y - nu * z).square() + z * z
+    log = square.clamp_min(torch.finfo(b.dtype).tiny).log() / 2
+    # A cubic B-spline is a Gaussian of width 1 / sqrt(3) bins, and its samples' entropy hardly
+    # depends on where in a bin they are taken.
+    bins_per_unit = 1 / (3**0.5 * width)
+    place = (log - log.mean(dim=1, keepdim=True)).clamp(-_REACH, _REACH) + _REACH
+    place = place * bins_per_unit
+    bins = int(2 * _REACH * bins_per_unit) + 4
+    below = place.long()
+    t = place - below
+    index = labels * bins + below
+    histogram = b.new_zeros(len(candidates), (int(labels.max()) + 1) * bins)
+    u, double = 1 - t, t * t
+    last = double * t / 6
+    first, second = u * u * u / 6, 2 / 3 - double + 3 * last
+    for shift, share in enumerate((first, second, 1 - first - second - last, last)):
+        histogram.scatter_add_(1, index + shift, share)
+    probability = histogram / b.shape[1]
+    return -torch.special.xlogy(probability, probability).sum(dim=1)
+
+
+def _chosen(
+    b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], limit: int
+) -> tuple[Tensor, Tensor]:
+    every = -(-b.shape[1] // limit)
+    return b[:, ::every], labels[::every]

@@ -1,0 +1,163 @@
+r"""Photographs of one viewpoint as a product of few factors, indifferent to shadows.
+
+:math:`X = L S`, one row of ``L`` a view, one column of ``S`` a pixel: unique at best up to one
+invertible matrix between them.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.low_rank import low_rank_problem, random_left
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.records import Record
+from pimper_torch.single_view.photometric_stereo.regression import (
+    Shadows,
+    brightness,
+    regress,
+    reweigh,
+)
+
+# Lights are found from so many pixels at most; the rest follows pixel by pixel.
+_MAX_PIXELS = 4000
+# Of variable projection: the first solution, and each one after a change of weights.
+_FIRST_STEPS, _NEXT_STEPS = 100, 5
+_TURNS = 20
+_WIDEST, _NARROWING = 4.0, 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Factored(Record):
+    """Factors of the photographs.
+
+    Attributes:
+        lights: ``L``, orthonormal columns.
+        shading: ``S``; the noise of its components is even.
+        weight: What each sample was given in the end; 0 where missing or in shadow.
+    """
+
+    lights: Float[Tensor, "view rank"]
+    shading: Float[Tensor, "rank pixel"]
+    weight: Float[Tensor, "view pixel"]
+
+
+def factorize_photographs(
+    radiance: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    rank: int,
+    *,
+    robust: bool = True,
+    shadows: Shadows = "attached",
+    starts: int = 0,
+    generator: torch.Generator | None = None,
+) -> Factored:
+    """Factorize photographs with holes, shadows and highlights.
+
+    Without holes and outliers it is the singular value decomposition. Otherwise lights come
+    from pixels spread over the object, by variable projection, with Cauchy's weights if
+    asked for; the shading of all pixels is regressed on them.
+
+    Args:
+        radiance: Linear, gray. Samples without weight do not matter.
+        weight: Not negative; 0 where missing.
+        rank: 3 for lamps, 4 or 9 for harmonics.
+        robust: Whether to re-weight; see
+            :func:`~pimper_torch.single_view.photometric_stereo.regression.regress`.
+        shadows: What lights from behind leave. For harmonics, ``none``.
+        starts: Random starts besides the one from the data, of which the best is taken.
+        generator: Of the random starts; on the CPU.
+
+    Raises:
+        InputError: Fewer views or fewer usable pixels than the rank, or random starts without
+            a generator.
+
+    Constant to autograd.
+
+    Source: Hayakawa, JOSA A 11(11), 1994, for the decomposition; variable projection as in
+    :mod:`pimper_torch.photometry.variable_projection`.
+    """
+    with torch.no_grad():
+        seen = weight > 0
+        x = torch.where(seen, radiance, 0).double()
+        given = weight.double()
+        usable = torch.nonzero(seen.sum(dim=0) > rank)[:, 0]
+        views = int(seen.any(dim=1).sum())
+        if views < rank or len(usable) <= rank:
+            raise InputError(
+                f"factorization: {views} views have samples, {len(usable)} pixels more than "
+                f"{rank}; needed: {rank} views and more than {rank} such pixels. Add photographs "
+                "or widen the mask."
+            )
+        if starts > 0 and generator is None:
+            raise InputError("factorization: random starts need a generator; found none.")
+        if not robust and bool((given == given[seen].max()).all()):
+            left = torch.linalg.eigh(x @ x.mT).eigenvectors[:, -rank:].flip(1)
+            return Factored(lights=left, shading=left.mT @ x, weight=given)
+        some = usable[evenly(len(usable), _MAX_PIXELS).to(usable.device)]
+        first = given[:, some]
+        if robust and shadows == "attached":
+            first = first * brightness(x[:, some], seen[:, some])
+        left = _best_start(x[:, some], first, rank, starts, generator)
+        if robust:
+            left = _settle(x[:, some], given[:, some], first, left, shadows)
+        found = regress(x, given, left, robust=robust, shadows=shadows)
+        return Factored(lights=left, shading=found.shading, weight=found.weight)
+
+
+def _best_start(
+    x: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    rank: int,
+    starts: int,
+    generator: torch.Generator | None,
+) -> Float[Tensor, "view rank"]:
+    """Solve from the filled data and from random places; take the best."""
+    begin = [_filled(x, weight, rank)]
+    for _ in range(starts):
+        assert generator is not None
+        begin.append(random_left(1, len(x), rank, generator)[0].to(x))
+    count = len(begin)
+    problem = low_rank_problem(
+        x.expand(count, -1, -1), weight.expand(count, -1, -1), torch.stack(begin)
+    )
+    solved = solve_variable_projection(problem, _FIRST_STEPS)
+    return solved.lights[int(solved.convergence.residual.argmin())]
+
+
+def _settle(
+    x: Float[Tensor, "view pixel"],
+    given: Float[Tensor, "view pixel"],
+    first: Float[Tensor, "view pixel"],
+    left: Float[Tensor, "view rank"],
+    shadows: Shadows,
+) -> Float[Tensor, "view rank"]:
+    """Alternate weights and factors, weights from wide to their own scale."""
+    weight = first
+    for turn in range(_TURNS):
+        problem = low_rank_problem(x[None], weight[None], left[None])
+        solved = solve_variable_projection(problem, _NEXT_STEPS)
+        left = solved.lights[0]
+        widen = max(1.0, _WIDEST * _NARROWING**turn)
+        trust, lit = reweigh(x, given, left @ solved.shading[0], widen, shadows)
+        weight = trust * lit
+    return left
+
+
+def _filled(
+    x: Float[Tensor, "view pixel"], weight: Float[Tensor, "view pixel"], rank: int
+) -> Float[Tensor, "view rank"]:
+    """Fill what is missing with brightness times brightness, and take singular vectors."""
+    gain = (weight * x).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
+    level = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
+    albedo = (weight * x).sum(dim=0, keepdim=True) / level
+    share = weight / weight.amax().clamp_min(1e-300)
+    filled = share * x + (1 - share) * gain * albedo
+    return torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
+
+
+def evenly(count: int, most: int) -> Int[Tensor, " chosen"]:
+    """Choose places spread evenly over ``range(count)``."""
+    return torch.linspace(0, count - 1, min(count, most)).round().long()

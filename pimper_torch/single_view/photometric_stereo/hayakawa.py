@@ -1,0 +1,243 @@
+r"""Pixels of one albedo, or lamps of one strength, make a factorization of rank three metric.
+
+Six pixels whose albedo is the same, or six lamps whose strength is, determine the quadratic form
+that measures them; what leaves it unchanged are rotations and mirrors. Where integrability has
+left a bas-relief transformation instead, the same knowledge leaves only convex or concave.
+
+Source: Hayakawa, Photometric stereo under a light source with arbitrary motion, JOSA A 11(11),
+1994, for the form; that bas-relief and form have no more in common: Belhumeur, Kriegman & Yuille,
+IJCV 35(1), 1999.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.photometry.quadratics import diagonal, outer
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median_spread
+from pimper_torch.single_view.photometric_stereo.relief import convex
+
+_ROUNDS = 20
+# The least singular value of the equations, as a share of the largest: below, the vectors lie on
+# a cone, and more than one form measures them alike.
+_LEAST_SHARE = 1e-6
+# Depths, as factors of the given one, from which a bas-relief is looked for.
+_DEPTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+_STEPS = 60
+
+_Curve = Callable[
+    [Float[Tensor, "start 4"]], tuple[Float[Tensor, "start item"], Float[Tensor, "start item 4"]]
+]
+
+
+def metric_from_albedo(
+    shading: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"]
+) -> Float[Tensor, "3 3"]:
+    r"""Find the matrix after which shading has the same length wherever there is weight.
+
+    :math:`\lVert A s_k \rVert = 1` is linear in :math:`A^\top A`; Cauchy's weights let pixels of
+    another albedo go, as long as they are few. What remains free is an orthogonal matrix.
+
+    Args:
+        shading: Up to an invertible matrix.
+        weight: Not negative; 0 leaves a pixel out.
+
+    Returns:
+        ``A``, to be applied to shading. Its inverse goes to the lights.
+
+    Raises:
+        InputError: Fewer than six pixels, pixels that several forms measure alike, or that no
+            form does.
+    """
+    return _root(_form(shading, weight, "pixels of equal albedo"), "pixels of equal albedo")
+
+
+def metric_from_strength(lights: Float[Tensor, "view 3"]) -> Float[Tensor, "3 3"]:
+    r"""Find the matrix after which all lamps have the same strength.
+
+    :math:`\lVert A^{-\top} l_v \rVert = 1` for all lamps is linear in
+    :math:`A^{-1} A^{-\top}`. What remains free is an orthogonal matrix.
+
+    Args:
+        lights: Up to an invertible matrix; zero rows do not matter.
+
+    Returns:
+        ``A``, to be applied to shading. Its inverse goes to the lights.
+
+    Raises:
+        InputError: Fewer than six lamps, lamps on one cone, or lamps that cannot have one
+            strength.
+    """
+    weight = (lights != 0).any(dim=1).to(lights)
+    form = _form(lights.mT, weight, "lamps of equal strength")
+    return torch.linalg.inv(_root(form, "lamps of equal strength")).mT
+
+
+def relief_from_albedo(
+    shading: Float[Tensor, "3 pixel"],
+    weight: Float[Tensor, " pixel"],
+    mask: Bool[Tensor, "height width"],
+) -> BasRelief:
+    """Find the bas-relief transformation after which most albedos are the same; convex.
+
+    Args:
+        shading: Albedo times normal up to a bas-relief transformation, raster order.
+        weight: Not negative.
+        mask: Where the pixels are.
+
+    Raises:
+        InputError: Fewer than four pixels.
+
+    Levenberg-Marquardt from seven depths, with Cauchy's weights. Constant to autograd.
+    """
+    x, y, z = shading.double()
+
+    def curve(
+        at: Float[Tensor, "start 4"],
+    ) -> tuple[Float[Tensor, "start item"], Float[Tensor, "start item 4"]]:
+        lam, mu, nu, scale = (one[:, None] for one in at.unbind(dim=1))
+        u, v = lam * x - mu * z, lam * y - nu * z
+        slopes = [2 * (u * x + v * y), -2 * u * z, -2 * v * z, 2 * scale * z * z]
+        return u * u + v * v + (scale * z) ** 2, torch.stack(slopes, dim=-1)
+
+    size = _typical(shading, weight)
+    begin = [[depth / size, 0.0, 0.0, 1 / size] for depth in _DEPTHS]
+    lam, mu, nu, scale = _fitted(curve, weight, x.new_tensor(begin), "pixels of equal albedo")
+    found = BasRelief(mu=mu / scale, nu=nu / scale, lam=lam / scale)
+    return convex(found, shading, weight, mask)
+
+
+def relief_from_strength(
+    lights: Float[Tensor, "view 3"],
+    shading: Float[Tensor, "3 pixel"],
+    weight: Float[Tensor, " pixel"],
+    mask: Bool[Tensor, "height width"],
+) -> BasRelief:
+    """Find the bas-relief transformation after which most lamps have the same strength; convex.
+
+    Args:
+        lights: That go with the shading; zero rows do not matter.
+        shading: Albedo times normal up to a bas-relief transformation, raster order; it tells
+            convex from concave.
+        weight: Of the pixels.
+        mask: Where the pixels are.
+
+    Raises:
+        InputError: Fewer than four lamps.
+
+    Levenberg-Marquardt from seven depths, with Cauchy's weights. Constant to autograd.
+    """
+    x, y, z = lights.double().unbind(dim=1)
+
+    def curve(
+        at: Float[Tensor, "start 4"],
+    ) -> tuple[Float[Tensor, "start item"], Float[Tensor, "start item 4"]]:
+        across, tilt_x, tilt_y, along = (one[:, None] for one in at.unbind(dim=1))
+        height = tilt_x * x + tilt_y * y + along * z
+        square = x * x + y * y
+        slopes = [2 * across * square, 2 * height * x, 2 * height * y, 2 * height * z]
+        return across**2 * square + height**2, torch.stack(slopes, dim=-1)
+
+    known = (lights != 0).any(dim=1).to(lights)
+    size = _typical(lights.mT, known)
+    begin = [[depth / size, 0.0, 0.0, 1 / size] for depth in _DEPTHS]
+    across, tilt_x, tilt_y, along = _fitted(
+        curve, known, x.new_tensor(begin), "lamps of equal strength"
+    )
+    found = BasRelief(mu=tilt_x / across, nu=tilt_y / across, lam=along / across)
+    return convex(found, shading, weight, mask)
+
+
+def _form(
+    vectors: Float[Tensor, "3 item"], weight: Float[Tensor, " item"], what: str
+) -> Float[Tensor, "3 3"]:
+    """Find the symmetric matrix under which vectors have length 1, by re-weighted squares."""
+    with torch.no_grad():
+        given = weight.double()
+        count = int((given > 0).sum())
+        if count < 6:
+            raise InputError(f"{what}: {count} are given; needed: six or more. Mark more.")
+        size = _typical(vectors, weight)
+        double = torch.full((6, 1), 2.0).to(given)
+        double[diagonal(3)] = 1
+        monomials = double * outer(vectors.double() / size)
+        heavy = given
+        for _ in range(_ROUNDS):
+            root = heavy.sqrt()
+            singular = torch.linalg.svdvals(root * monomials)
+            if not singular[-1] > _LEAST_SHARE * singular[0]:
+                raise InputError(
+                    f"{what}: theirs are on one cone, which more than one measure makes equal; "
+                    "needed: others besides. Take more, in other directions."
+                )
+            entries = torch.linalg.lstsq((root * monomials).mT, root[:, None]).solution[:, 0]
+            residual = entries @ monomials - 1
+            scale = CAUCHY_TUNING * median_spread(residual, given > 0)
+            heavy = given * cauchy_weights(residual, scale)
+        rows, columns = torch.triu_indices(3, 3)
+        form = vectors.new_zeros(3, 3, dtype=torch.float64)
+        form[rows, columns] = entries
+        form[columns, rows] = entries
+        return form.to(vectors) / size**2
+
+
+def _root(form: Float[Tensor, "3 3"], what: str) -> Float[Tensor, "3 3"]:
+    """Split ``B = A^T A``."""
+    factor, failed = torch.linalg.cholesky_ex(form)
+    if int(failed) != 0:
+        raise InputError(
+            f"{what}: no measure makes theirs equal (the best one is not positive); needed: what "
+            "is equal. Leave the others out, or resolve the ambiguity otherwise."
+        )
+    return factor.mT
+
+
+def _typical(vectors: Float[Tensor, "3 item"], weight: Float[Tensor, " item"]) -> float:
+    length = vectors.norm(dim=0)
+    known = (weight > 0) & (length > 0)
+    return float(length[known].median()) if bool(known.any()) else 1.0
+
+
+def _fitted(
+    curve: _Curve, weight: Float[Tensor, " item"], begin: Float[Tensor, "start 4"], what: str
+) -> Float[Tensor, " 4"]:
+    """Bring ``curve`` to 1 by Levenberg-Marquardt with Cauchy's weights, from several places."""
+    with torch.no_grad():
+        given = weight.double()
+        count = int((given > 0).sum())
+        if count < 4:
+            raise InputError(f"{what}: {count} are given; needed: four or more. Mark more.")
+        at, damping = begin, torch.full_like(begin[:, 0], 1e-2)
+        values, slopes = curve(at)
+        eye = torch.eye(4).to(begin)
+        for _ in range(_STEPS):
+            residual = 1 - values
+            scale = CAUCHY_TUNING * median_spread(residual, (given > 0).expand_as(residual))
+            scale = scale.clamp_min(1e-6)[:, None]
+            heavy = given * cauchy_weights(residual, scale)
+            normal = slopes.mT @ (heavy[..., None] * slopes)
+            ridge = damping * normal.diagonal(dim1=1, dim2=2).mean(dim=1) + 1e-300
+            rhs = (slopes * (heavy * residual)[..., None]).sum(dim=1)
+            step = torch.linalg.solve(normal + ridge[:, None, None] * eye, rhs[..., None])[..., 0]
+            moved = at + step
+            after, steeper = curve(moved)
+            better = _loss(1 - after, given, scale) < _loss(residual, given, scale)
+            at = torch.where(better[:, None], moved, at)
+            values = torch.where(better[:, None], after, values)
+            slopes = torch.where(better[:, None, None], steeper, slopes)
+            damping = (damping * torch.where(better, 0.2, 5.0)).clamp(1e-12, 1e12)
+        # One scale for all, or each start would be judged by its own.
+        scale = CAUCHY_TUNING * median_spread(1 - values, (given > 0).expand_as(values)).amin()
+        return at[int(_loss(1 - values, given, scale.clamp_min(1e-6)).argmin())]
+
+
+def _loss(
+    residual: Float[Tensor, "start item"],
+    weight: Float[Tensor, " item"],
+    scale: Float[Tensor, "*#batch"],
+) -> Float[Tensor, " start"]:
+    return (weight * scale**2 * torch.log1p((residual / scale) ** 2)).sum(dim=1)

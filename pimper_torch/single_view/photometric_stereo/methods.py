@@ -1,0 +1,252 @@
+"""The methods by name, each from a problem to a solution."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.manifolds import second_order
+from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
+from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
+from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles
+from pimper_torch.single_view.photometric_stereo.diffuse_maxima import resolve_by_diffuse_maxima
+from pimper_torch.single_view.photometric_stereo.factorization import factorize_photographs
+from pimper_torch.single_view.photometric_stereo.hayakawa import (
+    metric_from_albedo,
+    metric_from_strength,
+    relief_from_albedo,
+    relief_from_strength,
+)
+from pimper_torch.single_view.photometric_stereo.integrability import integrable, turn_to_surface
+from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
+from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution, Surfaced
+from pimper_torch.single_view.photometric_stereo.regression import determined
+from pimper_torch.single_view.photometric_stereo.relief import bulge, convex, rounded_relief
+from pimper_torch.single_view.photometric_stereo.spherical_harmonics import (
+    Harmonic,
+    four_harmonic_stereo,
+    nine_harmonic_stereo,
+)
+from pimper_torch.single_view.photometric_stereo.woodham import calibrated_stereo, chromatic_albedo
+
+
+def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
+    images, mask = _trusted(given, found)
+    groups = chromaticity_groups(images, mask) if images.shape[1] > 1 else None
+    relief = resolve_by_albedo_entropy(found.shading[:, found.trust > 0], groups)
+    return convex(relief, found.shading, found.trust, given.mask)
+
+
+def _by_profiles(given: Problem, found: Surfaced) -> BasRelief:
+    images, mask = _trusted(given, found)
+    known = found.shading[:, found.trust > 0]
+    relief = resolve_by_colour_profiles(images, mask, known, found.lights)
+    return convex(relief, found.shading, found.trust, given.mask)
+
+
+def _by_maxima(given: Problem, found: Surfaced) -> BasRelief:
+    images, mask = _trusted(given, found)
+    known = found.shading[:, found.trust > 0]
+    relief = resolve_by_diffuse_maxima(images, mask, known, found.lights)
+    return convex(relief, found.shading, found.trust, given.mask)
+
+
+def _trusted(
+    given: Problem, found: Surfaced
+) -> tuple[Float[Tensor, "view channel height width"], Bool[Tensor, "height width"]]:
+    """Give the photographs, and the pixels that are trusted."""
+    mask = torch.zeros_like(given.mask)
+    mask[given.mask] = found.trust > 0
+    return _without_holes(given), mask
+
+
+def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]:
+    """Give the photographs with missing samples black."""
+    images = torch.zeros_like(given.images, dtype=torch.float64)
+    images[:, :, given.mask] = given.radiance
+    return images
+
+
+# How a bas-relief transformation is chosen. "rounded" is a convention; the others measure.
+# Entropy comes first, as the default: nearest to known lights on the rendered objects and, with
+# diffuse maxima, on the photographs (benchmarks/photometric_stereo.py).
+RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
+    "albedo_entropy": _by_entropy,
+    "rounded": lambda given, found: rounded_relief(found.shading, found.trust, given.mask),
+    "equal_albedo": lambda given, found: relief_from_albedo(found.shading, found.trust, given.mask),
+    "equal_strength": lambda given, found: relief_from_strength(
+        found.lights, found.shading, found.trust, given.mask
+    ),
+    "colour_profiles": _by_profiles,
+    "diffuse_maxima": _by_maxima,
+}
+_FACTOR = "a factor between albedo and light"
+
+
+def _calibrated(given: Problem, resolve: str) -> Solution:
+    assert given.lights is not None
+    found = calibrated_stereo(
+        given.radiance, given.weight, given.lights, robust=given.robust, ambient=given.ambient
+    )
+    return Solution(
+        normals=found.normals,
+        albedo=found.albedo,
+        lights=given.lights,
+        weight=found.weight,
+        applied=None,
+        free="nothing",
+    )
+
+
+def _hayakawa(given: Problem, resolve: str) -> Solution:
+    found = factorize_photographs(given.gray, given.weight, 3, robust=given.robust)
+    trust = _trust(found.weight, found.lights)
+    if resolve == "equal_albedo":
+        matrix = metric_from_albedo(found.shading, trust)
+    else:
+        matrix = metric_from_strength(found.lights)
+    shading = matrix @ found.shading
+    turned = turn_to_surface(shading, trust, given.mask, matrix @ matrix.mT)
+    sign = bulge((turned @ shading)[:2], trust, given.mask)
+    signs = torch.stack([sign, sign, torch.ones_like(sign)])
+    matrix = signs[:, None] * (turned @ matrix)
+    return _lambertian(
+        given,
+        Surfaced(
+            shading=matrix @ found.shading,
+            lights=found.lights @ torch.linalg.inv(matrix),
+            trust=trust,
+            weight=found.weight,
+        ),
+        None,
+        f"convex or concave, {_FACTOR}",
+    )
+
+
+def _integrability(given: Problem, resolve: str) -> Solution:
+    found = factorize_photographs(given.gray, given.weight, 3, robust=given.robust)
+    trust = _trust(found.weight, found.lights)
+    matrix = integrable(found.shading, trust, given.mask).matrix
+    surfaced = Surfaced(
+        shading=matrix @ found.shading,
+        lights=found.lights @ torch.linalg.inv(matrix),
+        trust=trust,
+        weight=found.weight,
+    )
+    applied = RESOLVERS[resolve](given, surfaced)
+    free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
+    moved = surfaced.replace(
+        shading=applied.on_shading(surfaced.shading), lights=applied.on_lights(surfaced.lights)
+    )
+    return _lambertian(given, moved, applied, free)
+
+
+def _perspective(given: Problem, resolve: str) -> Solution:
+    assert given.intrinsics is not None
+    shading, lights = factorize_in_perspective(
+        _without_holes(given), given.mask, given.intrinsics, given.weight > 0
+    )
+    shading, lights = shading.double(), lights.double()
+    found = Surfaced(
+        shading=shading,
+        lights=lights,
+        trust=(shading != 0).any(dim=0).double(),
+        weight=given.weight,
+    )
+    return _lambertian(given, found, None, _FACTOR)
+
+
+def _four_harmonics(given: Problem, resolve: str) -> Solution:
+    return _by_harmonics(given, four_harmonic_stereo, harmonics)
+
+
+def _nine_harmonics(given: Problem, resolve: str) -> Solution:
+    return _by_harmonics(given, nine_harmonic_stereo, second_order)
+
+
+def _by_harmonics(
+    given: Problem, stereo: Callable[..., Harmonic], basis: Callable[[Tensor], Tensor]
+) -> Solution:
+    found = stereo(given.gray, given.weight, given.mask, given.generator, robust=given.robust)
+    albedo = found.shading[0]
+    normals = found.shading[1:] / torch.where(albedo > 0, albedo, 1)
+    shade = found.lights @ basis(normals.mT).mT
+    return _scaled(
+        Solution(
+            normals=normals,
+            albedo=chromatic_albedo(given.radiance, found.weight, shade),
+            lights=found.lights,
+            weight=found.weight,
+            applied=found.ambiguity,
+            free=f"convex or concave, {_FACTOR}",
+        )
+    )
+
+
+def _lambertian(given: Problem, found: Surfaced, applied: BasRelief | None, free: str) -> Solution:
+    """Read normals and the albedo of each colour off shading and lamps."""
+    size = found.shading.norm(dim=0)
+    normals = found.shading / torch.where(size > 0, size, 1)
+    shade = (found.lights @ normals).clamp_min(0)
+    return _scaled(
+        Solution(
+            normals=normals,
+            albedo=chromatic_albedo(given.radiance, found.weight, shade),
+            lights=found.lights,
+            weight=found.weight,
+            applied=applied,
+            free=free,
+        )
+    )
+
+
+def _scaled(found: Solution) -> Solution:
+    """Give lights the median length 1."""
+    length = found.lights.norm(dim=1)
+    shining = length[length > 0]
+    factor = shining.median() if len(shining) else length.new_ones(())
+    return found.replace(lights=found.lights / factor, albedo=found.albedo * factor)
+
+
+def _trust(
+    weight: Float[Tensor, "view pixel"], lights: Float[Tensor, "view unknown"]
+) -> Float[Tensor, " pixel"]:
+    """Trust pixels by the samples that are left to them."""
+    enough, spanned = determined(weight, lights)
+    total = weight.sum(dim=0)
+    return torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Method:
+    """A method by its name.
+
+    Attributes:
+        solve: The method; told what to resolve by.
+        unknowns: Numbers that a pixel has to be told: so many views it takes.
+        resolvers: What it can resolve by; the first is the default.
+        calibrated: Whether it needs lights.
+        perspective: Whether it needs intrinsics.
+        robust: Whether shadows and highlights lose weight by default.
+    """
+
+    solve: Callable[[Problem, str], Solution]
+    unknowns: int
+    resolvers: tuple[str, ...] = ()
+    calibrated: bool = False
+    perspective: bool = False
+    robust: bool = True
+
+
+METHODS = {
+    "calibrated": Method(solve=_calibrated, unknowns=3, calibrated=True),
+    "hayakawa": Method(solve=_hayakawa, unknowns=3, resolvers=("equal_strength", "equal_albedo")),
+    "integrability": Method(solve=_integrability, unknowns=3, resolvers=tuple(RESOLVERS)),
+    "perspective": Method(solve=_perspective, unknowns=3, perspective=True),
+    "four_harmonics": Method(solve=_four_harmonics, unknowns=4, robust=False),
+    "nine_harmonics": Method(solve=_nine_harmonics, unknowns=9, robust=False),
+}

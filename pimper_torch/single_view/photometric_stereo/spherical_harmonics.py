@@ -1,0 +1,340 @@
+r"""Photometric stereo under light of any kind: photographs as four or nine harmonics.
+
+A convex Lambertian surface under distant light reflects, to first order,
+:math:`\rho\, l^\top (1, n)`, and to second order nine harmonics of the normal. Four dimensions
+hold a constraint that three do not: shading vectors lie on a cone, so a factorization is unique
+up to a scaled Lorentz transformation before integrability is asked.
+
+Source: Basri, Jacobs & Kemelmacher, Photometric stereo with general, unknown lighting, IJCV
+72(3), 2007.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.photometry.ambiguity import Ambiguity, lorentz
+from pimper_torch.photometry.cone import project_to_cone, split_shading
+from pimper_torch.photometry.manifolds import second_order
+from pimper_torch.photometry.spectral import upgrade_to_cone
+from pimper_torch.records import Record
+from pimper_torch.single_view.photometric_stereo.factorization import evenly, factorize_photographs
+from pimper_torch.single_view.photometric_stereo.integrability import (
+    Curls,
+    both_ways,
+    curls,
+    moments,
+    reweighed,
+    wedge,
+)
+from pimper_torch.single_view.photometric_stereo.regression import regress
+from pimper_torch.single_view.photometric_stereo.relief import bulge
+
+# Random Lorentz transformations from which the integrable one is looked for: boosts of this
+# rapidity from where the mean of all shading vectors has no direction.
+_STARTS, _RAPIDITY = 48, 1.0
+# Boosts without end make all normals the same, and every field of one normal is integrable. The
+# mean normal of a visible half ball has a Lorentz factor of 1.3, of normals within 20 degrees 6.
+_LORENTZ_FACTOR = 6.0
+_STEPS, _ROUNDS = 40, 5
+_NUDGE = 1e-6  # of forward differences in float64
+_LEAST_GAIN = 1e-6  # a step that gains less of the misfit is the last
+_MAX_PIXELS = 1000  # for the map from nine dimensions to normals, which has 27 numbers
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Harmonic(Record):
+    """Photographs explained by harmonics.
+
+    Attributes:
+        shading: ``rho (1, n)`` of the pixels inside the mask, raster order, on the cone.
+        lights: Of four or nine harmonics; see :func:`nine_harmonics`.
+        weight: What each sample was given in the end.
+        ambiguity: The Lorentz transformation that integrability chose, after the cone.
+        curl: What is left of the equations of integrability; 0 is a surface.
+    """
+
+    shading: Float[Tensor, "4 pixel"]
+    lights: Float[Tensor, "view harmonic"]
+    weight: Float[Tensor, "view pixel"]
+    ambiguity: Ambiguity
+    curl: float
+
+
+def four_harmonic_stereo(
+    radiance: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    mask: Bool[Tensor, "height width"],
+    generator: torch.Generator,
+    *,
+    robust: bool = False,
+) -> Harmonic:
+    """Recover shading and lights from photographs under first-order light; convex.
+
+    Rank-four factorization, the quadric through the shading vectors for the cone, and of the
+    Lorentz transformations left the one whose normals are those of a surface: as boosts mix
+    albedo into the normals, and of rotations bas-relief knows none, only convex or concave
+    remains, and one factor between albedo and light.
+
+    The paper solves integrability for the rows of the matrix linearly and repairs them; here
+    the same equations are minimised within the Lorentz group from many starts, which keeps
+    the cone.
+
+    Args:
+        radiance: Linear, gray, of the pixels inside the mask in raster order.
+        weight: Not negative; 0 where missing.
+        mask: Where the pixels are.
+        generator: Of the starts; on the CPU.
+        robust: Whether what harmonics do not explain loses weight: highlights, but also what
+            lamps leave in attached shadow, so leave it for soft light.
+
+    Raises:
+        InputError: Fewer than four views, or too few pixels for integrability.
+
+    Fails where shadows are cast, which no harmonics of the normal make; where all lights come
+    from a narrow cone, as lamps without shadows are of rank three and leave the quadric free;
+    and for a surface of revolution seen along its axis, where boosts along the axis are
+    integrable too. Constant to autograd.
+    """
+    with torch.no_grad():
+        found = factorize_photographs(radiance, weight, 4, robust=robust, shadows="none")
+        trust = found.weight.sum(dim=0)
+        trust = trust / trust.amax()
+        upgraded = upgrade_to_cone(found.lights[None], found.shading[None], trust[None])
+        L, S = upgraded.lights[0], upgraded.shading[0]
+        applied, curl = _upright(S, trust, mask, torch.linalg.inv(L.mT @ L), generator)
+        on_cone = project_to_cone(applied.on_shading(S).mT).mT
+        return Harmonic(
+            shading=on_cone,
+            lights=applied.on_lights(L),
+            weight=found.weight,
+            ambiguity=applied,
+            curl=curl,
+        )
+
+
+def nine_harmonic_stereo(
+    radiance: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    mask: Bool[Tensor, "height width"],
+    generator: torch.Generator,
+    *,
+    robust: bool = False,
+) -> Harmonic:
+    r"""Refine the first-order solution by light of second order; convex.
+
+    In the nine dimensions of a factorization the normals are a linear map of it, 3 x 9. The map
+    is regressed on the first-order solution and moved until the nine harmonics of its normals
+    explain the factorization best. Lorentz transformations are free again: the nine harmonics
+    are the quadratic forms of :math:`k = (1, n)` on the cone, so :math:`n \to n'` with
+    :math:`\Lambda k = t (1, n')` and :math:`\rho \to t^2 \rho` leaves their span. Integrability
+    chooses among them as for four. That the map is found by Gauss-Newton on the misfit, the
+    mixing matrix of 9 x 9 eliminated, is our reading of how the paper ties the nine dimensions
+    together; that the freedom is Lorentz again is our observation, pinned by a test.
+
+    Args:
+        radiance: As in :func:`four_harmonic_stereo`.
+        weight: The same.
+        mask: The same.
+        generator: The same.
+        robust: The same.
+
+    Returns:
+        ``lights`` have nine columns, in the order of :func:`nine_harmonics`.
+
+    Raises:
+        InputError: Fewer than nine views, or too few pixels.
+    """
+    with torch.no_grad():
+        found = factorize_photographs(radiance, weight, 9, robust=robust, shadows="none")
+        start = four_harmonic_stereo(radiance, weight, mask, generator, robust=robust)
+        trust = found.weight.sum(dim=0)
+        trust = trust / trust.amax()
+        S = found.shading
+        some = evenly(S.shape[1], _MAX_PIXELS).to(S.device)
+        linear = _regressed(S, start.shading[1:], trust)
+        linear = _explain(linear, S[:, some], trust[some])
+        vector = linear @ S
+        length = vector.norm(dim=0)
+        cone = torch.cat([length[None], vector])
+        noise = torch.zeros(4, 4).to(linear)
+        noise[1:, 1:] = linear @ linear.mT
+        noise[0, 0] = noise.trace() / 3
+        applied, curl = _upright(cone, trust, mask, noise, generator)
+        moved = applied.on_shading(cone)
+        normal = split_shading(project_to_cone(moved.mT))[1].mT
+        # From rho (1, n) to t rho (1, n'), and then to t^2 rho.
+        albedo = moved[0] ** 2 / torch.where(length > 0, length, 1)
+        basis = albedo * second_order(normal.mT).mT
+        lights = regress(
+            torch.where(weight > 0, radiance, 0).double().mT,
+            weight.double().mT,
+            basis.mT,
+            robust=robust,
+            shadows="none",
+        )
+        return start.replace(
+            shading=albedo * torch.cat([torch.ones_like(albedo[None]), normal]),
+            lights=lights.shading.mT,
+            weight=lights.weight.mT,
+            ambiguity=applied,
+            curl=curl,
+        )
+
+
+def _explain(
+    linear: Float[Tensor, "3 9"], S: Float[Tensor, "9 pixel"], weight: Float[Tensor, " pixel"]
+) -> Float[Tensor, "3 9"]:
+    """Move the map to normals until their harmonics explain the factorization best."""
+    root = weight.sqrt()
+
+    def misfit(flat: Float[Tensor, " entry"]) -> Float[Tensor, " residual"]:
+        vector = flat.reshape(3, 9) @ S
+        albedo = vector.norm(dim=0)
+        normal = vector / torch.where(albedo > 0, albedo, 1)
+        basis = root * albedo * second_order(normal.mT).mT
+        # An orthonormal basis of the rows: what of S is not in it is the misfit.
+        rows = torch.linalg.qr(basis.mT).Q
+        heavy = root * S
+        return (heavy - (heavy @ rows) @ rows.mT).flatten()
+
+    at = (linear / linear.norm()).flatten()
+    residual = misfit(at)
+    damping = 1e-3
+    for _ in range(_STEPS):
+        nudges = _NUDGE * torch.eye(len(at)).to(at)
+        J = torch.stack([(misfit(at + nudge) - residual) / _NUDGE for nudge in nudges])
+        normal = J @ J.mT
+        ridge = damping * normal.diagonal().mean() * torch.eye(len(at)).to(at)
+        moved = at - torch.linalg.solve(normal + ridge, J @ residual)
+        after = misfit(moved)
+        if after.square().sum() < residual.square().sum():
+            gain = 1 - float(after.square().sum() / residual.square().sum())
+            at, residual, damping = moved, after, max(damping * 0.2, 1e-12)
+            if gain < _LEAST_GAIN:
+                break
+        else:
+            damping = min(damping * 5.0, 1e12)
+    return at.reshape(3, 9) * linear.norm()
+
+
+def _upright(
+    cone: Float[Tensor, "4 pixel"],
+    weight: Float[Tensor, " pixel"],
+    mask: Bool[Tensor, "height width"],
+    noise: Float[Tensor, "4 4"],
+    generator: torch.Generator,
+) -> tuple[Ambiguity, float]:
+    """Find the Lorentz transformation after which normals are a convex surface's."""
+    mean = (weight * cone).sum(dim=1)
+    matrix, curl = _surface(curls(cone, weight, mask, noise), mean, generator)
+    signs = torch.ones(4).to(matrix)
+    # Slopes may change their sign with n_z, or with n_x and n_y: integrability cannot tell.
+    signs[3] = torch.where((weight * (matrix @ cone)[3].sign()).sum() > 0, -1.0, 1.0)
+    signs[1:3] = bulge((matrix @ cone)[1:3], weight, mask)
+    return Ambiguity(matrix=signs[:, None] * matrix), curl
+
+
+def _surface(
+    equations: Curls, mean: Float[Tensor, " 4"], generator: torch.Generator
+) -> tuple[Float[Tensor, "4 4"], float]:
+    """Find the Lorentz transformation whose space rows are integrable; Gauss-Newton, batched.
+
+    Args:
+        equations: Of integrability.
+        mean: Of the shading vectors.
+        generator: Of the starts.
+    """
+    drawn = torch.randn(_STARTS, 6, generator=generator, dtype=torch.float64)
+    drawn[:, :3] *= _RAPIDITY
+    drawn[:, 3:] *= 2.0  # rotations of any angle
+    drawn[0] = 0
+    at_rest = lorentz(drawn).to(mean) @ _to_rest(mean)
+    matrix = torch.cat([torch.eye(4).to(mean)[None], at_rest])
+    weighed = equations
+    metric = both_ways(equations.noise)
+    for turn in range(_ROUNDS):
+        full, terms = moments(weighed)
+        values, vectors = torch.linalg.eigh(full)
+        root = values.clamp_min(0).sqrt()[:, None] * vectors.mT
+        matrix, cost = _descend(matrix, root, metric, mean)
+        best = int(cost.argmin())
+        solution = _bivectors(matrix[best])
+        weighed = equations.replace(weight=reweighed(equations, solution))
+        if turn == 0:
+            matrix = matrix[cost.argsort()[:4]]
+            best = 0
+    share = (solution @ full @ solution) / (solution @ terms @ solution)
+    return matrix[best], float(share.clamp_min(0).sqrt())
+
+
+def _to_rest(vector: Float[Tensor, " 4"]) -> Float[Tensor, "4 4"]:
+    """Give the boost after which a vector inside the cone has no space part; else nothing."""
+    length = vector[1:].norm()
+    if not bool((length > 0) & (length < vector[0])):
+        return torch.eye(4).to(vector)
+    rapidity = torch.atanh(length / vector[0])
+    still = torch.zeros_like(vector[1:])
+    return lorentz(torch.cat([-rapidity * vector[1:] / length, still]))
+
+
+def _descend(
+    matrix: Float[Tensor, "start 4 4"],
+    root: Float[Tensor, "row both"],
+    metric: Float[Tensor, "both both"],
+    mean: Float[Tensor, " 4"],
+) -> tuple[Float[Tensor, "start 4 4"], Float[Tensor, " start"]]:
+    nudges = lorentz(_NUDGE * torch.eye(6).to(matrix))
+    eye = torch.eye(6).to(matrix)
+    damping = torch.full_like(matrix[:, 0, 0], 1e-2)
+    residual = _residual(matrix, root, metric, mean)
+    cost = residual.square().sum(dim=-1)
+    for _ in range(_STEPS):
+        nudged = _residual(nudges @ matrix[:, None], root, metric, mean)
+        J = (nudged - residual[:, None]) / _NUDGE  # start, generator, row
+        normal = J @ J.mT
+        ridge = damping * normal.diagonal(dim1=1, dim2=2).mean(dim=1) + 1e-300
+        rhs = -(J @ residual[..., None])
+        step = torch.linalg.solve(normal + ridge[:, None, None] * eye, rhs)[..., 0]
+        step = step * (1 / step.norm(dim=1, keepdim=True).clamp_min(1e-30)).clamp_max(1)
+        moved = lorentz(step) @ matrix
+        after = _residual(moved, root, metric, mean)
+        better = after.square().sum(dim=-1) < cost
+        matrix = torch.where(better[:, None, None], moved, matrix)
+        residual = torch.where(better[:, None], after, residual)
+        cost = residual.square().sum(dim=-1)
+        damping = (damping * torch.where(better, 0.2, 5.0)).clamp(1e-12, 1e12)
+    return matrix, cost
+
+
+def _residual(
+    matrix: Float[Tensor, "*batch 4 4"],
+    root: Float[Tensor, "row both"],
+    metric: Float[Tensor, "both both"],
+    mean: Float[Tensor, " 4"],
+) -> Float[Tensor, "*batch row"]:
+    """Give the equations' sums in units of what noise would make of them, dearer with boosts."""
+    both = _bivectors(matrix)
+    noise = ((both @ metric) * both).sum(dim=-1, keepdim=True)
+    moved = matrix @ mean
+    time, space = moved[..., :1], moved[..., 1:]
+    mass = (time.square() - space.square().sum(dim=-1, keepdim=True)).abs().clamp_min(1e-300)
+    factor = time.square() / mass
+    return (both @ root.mT) / noise.sqrt() * (1 + factor / _LORENTZ_FACTOR**2).sqrt()
+
+
+def _bivectors(matrix: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch both"]:
+    first, second, third = matrix[..., 1, :], matrix[..., 2, :], matrix[..., 3, :]
+    return torch.cat([wedge(second, third), wedge(third, first)], dim=-1)
+
+
+def _regressed(
+    source: Float[Tensor, "in pixel"],
+    target: Float[Tensor, "out pixel"],
+    weight: Float[Tensor, " pixel"],
+) -> Float[Tensor, "out in"]:
+    moment = (weight * source) @ source.mT
+    ridge = 1e-12 * moment.diagonal().mean() * torch.eye(len(moment)).to(moment)
+    return torch.linalg.solve(moment + ridge, (weight * source) @ target.mT).mT

@@ -1,0 +1,270 @@
+"""One call for every method of photometric stereo from one viewpoint."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.ambiguity import Ambiguity
+from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.records import Record
+from pimper_torch.single_view.photometric_stereo.methods import METHODS, Method
+from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution
+from pimper_torch.single_view.photometric_stereo.regression import determined
+from pimper_torch.single_view.photometric_stereo.visibility_subspaces import visibility_subspaces
+
+
+class Finding(IntEnum):
+    """What became of a pixel."""
+
+    FOUND = 0
+    OUTSIDE = 1  # of the mask
+    TOO_FEW = 2  # samples with weight, for the unknowns of the method
+    FLAT = 3  # the lights that reach it lie in a plane, so that its normal is free across it
+    BLACK = 4  # no light comes from it
+    AVERTED = 5  # its normal does not face the viewer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PhotometricStereo(Record):
+    """Normals, albedo and lights of one viewpoint.
+
+    Attributes:
+        normals: Unit, camera frame: x right, y down, z forward, ``n_z < 0`` where valid. Where
+            not valid, the best guess there is, or zero.
+        albedo: Of each colour, not negative. With unknown lights up to one factor, such that
+            lights have the median length 1.
+        lights: One row a view: towards the lamp, as long as it is strong; or four or nine
+            harmonics. Zero for a view without samples.
+        lit: True where a sample agrees with the result: seen, in no shadow, no highlight.
+        valid: Where the normal is determined and faces the viewer.
+        finding: A :class:`Finding` for each pixel.
+        applied: What was chosen of the transformations that the method leaves free.
+        free: What is still free, in words.
+        unused_views: Without any sample.
+    """
+
+    normals: Float[Tensor, "height width 3"]
+    albedo: Float[Tensor, "height width channel"]
+    lights: Float[Tensor, "view unknown"]
+    lit: Bool[Tensor, "view height width"]
+    valid: Bool[Tensor, "height width"]
+    finding: Int[Tensor, "height width"]
+    applied: BasRelief | Ambiguity | None
+    free: str
+    unused_views: tuple[int, ...]
+
+
+def photometric_stereo(
+    images: Float[Tensor, "view channel height width"],
+    mask: Bool[Tensor, "rows columns"],
+    *,
+    method: str,
+    resolve: str | None = None,
+    lights: Float[Tensor, "light 3"] | None = None,
+    intrinsics: Float[Tensor, "3 3"] | None = None,
+    weight: Float[Tensor, "..."] | None = None,
+    generator: torch.Generator | None = None,
+    robust: bool | None = None,
+    subspaces: bool = False,
+    ambient: bool = False,
+) -> PhotometricStereo:
+    """Recover normals and albedo from photographs of one viewpoint under changing light.
+
+    ========================  ============================================  =================
+    method                    light                                         left free
+    ========================  ============================================  =================
+    ``calibrated``            lamps, known                                  nothing
+    ``hayakawa``              lamps of one strength, or pixels of one       convex or concave
+                              albedo (``resolve``)
+    ``integrability``         lamps                                         bas-relief, chosen
+                                                                            by ``resolve``
+    ``perspective``           lamps, camera near by (``intrinsics``)        nothing
+    ``four_harmonics``        any, from all sides of the viewer, without    convex or concave
+                              cast shadows
+    ``nine_harmonics``        the same, more exactly                        convex or concave
+    ========================  ============================================  =================
+
+    Convex is chosen. ``resolve`` is ``rounded`` (a convention: leans nowhere, as deep as a
+    ball), ``equal_albedo``, ``equal_strength``, ``albedo_entropy`` (few albedos),
+    ``colour_profiles`` (paints of different hue) or ``diffuse_maxima``.
+
+    Args:
+        images: Linear radiance from one viewpoint far away. NaN inside the mask is missing.
+        mask: True on the object; of the size of the images.
+        method: See the table.
+        resolve: For ``integrability`` by default ``albedo_entropy``, for ``hayakawa`` by default
+            ``equal_strength``; others have nothing to resolve.
+        lights: For ``calibrated``, one a view: towards the lamp, as long as it is strong, camera
+            frame.
+        intrinsics: ``K``, for methods of a camera near by; others take it to be far away.
+        weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
+            known to be in shadow.
+        generator: On the CPU; for harmonics and subspaces, by default with the seed 0.
+        robust: Whether shadows and highlights lose weight; by default with lamps, but not with
+            harmonics, which explain attached shadows.
+        subspaces: Whether shadows are found first, as visibility subspaces (see
+            :mod:`.visibility_subspaces`), and left out. For lamps
+            whose shadows are black.
+        ambient: For ``calibrated``: whether each pixel has a radiance of its own.
+
+    Raises:
+        InputError: Unknown names, shapes that disagree, an empty mask, fewer views with samples
+            than unknowns, lights that are missing, not needed or in a plane; or what the
+            method itself refuses.
+
+    >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
+    >>> images = torch.tensor([1.0, 0.8, 0.8]).reshape(3, 1, 1, 1)
+    >>> found = photometric_stereo(
+    ...     images, torch.ones(1, 1) > 0, method="calibrated", lights=lights
+    ... )
+    >>> found.normals[0, 0].round(decimals=3) + 0
+    tensor([ 0.,  0., -1.])
+    """
+    if method not in METHODS:
+        raise InputError(f"method is {method!r}; needed: one of {', '.join(METHODS)}.")
+    _refuse_shapes(images, mask, lights, weight)
+    chosen = METHODS[method]
+    _refuse_settings(method, chosen, resolve, lights, intrinsics, ambient)
+    with torch.no_grad():
+        given = images.new_ones(len(images), *mask.shape) if weight is None else weight
+        samples = images.movedim(1, 0)[..., mask].movedim(0, 1)
+        seen = samples.isfinite().all(dim=1)
+        heavy = torch.where(seen, given[:, mask], 0).double()
+        generator = torch.Generator().manual_seed(0) if generator is None else generator
+        if subspaces:
+            clean = torch.where(images.isfinite(), images, 0)
+            heavy = heavy * visibility_subspaces(clean, mask, generator)
+        used = (heavy > 0).any(dim=1)
+        unknowns = chosen.unknowns + int(ambient)
+        _refuse_few(int(used.sum()), unknowns, method)
+        problem = Problem(
+            images=images[used],
+            radiance=torch.where((heavy > 0)[:, None], samples, 0).double()[used],
+            weight=heavy[used],
+            mask=mask,
+            lights=None if lights is None else lights[used].double(),
+            intrinsics=None if intrinsics is None else intrinsics.double(),
+            generator=generator,
+            robust=chosen.robust if robust is None else robust,
+            ambient=ambient,
+        )
+        if problem.lights is not None:
+            _refuse_plane(problem.lights)
+        by = resolve or (chosen.resolvers[0] if chosen.resolvers else "")
+        found = chosen.solve(problem, by)
+        return _spread_out(found, problem, used, like=images)
+
+
+def _spread_out(
+    found: Solution, given: Problem, used: Bool[Tensor, " view"], like: Tensor
+) -> PhotometricStereo:
+    """Put pixels back on the raster and views back in their places."""
+    mask = given.mask
+    rows = found.lights
+    if given.ambient:
+        rows = torch.cat([rows, torch.ones_like(rows[:, :1])], dim=1)
+    enough, spanned = determined(found.weight, rows)
+    finding = torch.full_like(spanned, int(Finding.FOUND), dtype=torch.long)
+    checks = [
+        (found.normals[2] >= 0, Finding.AVERTED),
+        ((found.normals == 0).all(dim=0) | (found.albedo <= 0).all(dim=0), Finding.BLACK),
+        (~spanned, Finding.FLAT),
+        (~enough, Finding.TOO_FEW),
+    ]
+    for wrong, name in checks:  # the last one that applies is the one to tell
+        finding = torch.where(wrong, int(name), finding)
+    raster = torch.full(mask.shape, int(Finding.OUTSIDE), device=mask.device)
+    raster[mask] = finding
+    normals = like.new_zeros(*mask.shape, 3)
+    normals[mask] = found.normals.mT.to(like)
+    albedo = like.new_zeros(*mask.shape, len(found.albedo))
+    albedo[mask] = found.albedo.mT.to(like)
+    lit = torch.zeros(len(used), *mask.shape, dtype=torch.bool, device=mask.device)
+    agreeing = lit[used]
+    agreeing[:, mask] = (given.weight > 0) & (found.weight >= 0.5 * given.weight)
+    lit[used] = agreeing
+    lights = like.new_zeros(len(used), found.lights.shape[1])
+    lights[used] = found.lights.to(like)
+    return PhotometricStereo(
+        normals=normals,
+        albedo=albedo,
+        lights=lights,
+        lit=lit,
+        valid=raster == int(Finding.FOUND),
+        finding=raster,
+        applied=found.applied,
+        free=found.free,
+        unused_views=tuple(torch.nonzero(~used)[:, 0].tolist()),
+    )
+
+
+def _refuse_shapes(
+    images: Tensor, mask: Tensor, lights: Tensor | None, weight: Tensor | None
+) -> None:
+    if images.shape[2:] != mask.shape:
+        raise InputError(
+            f"photometric stereo: images are {tuple(images.shape[2:])} and the mask is "
+            f"{tuple(mask.shape)}; needed: one size. Resize the mask."
+        )
+    if not bool(mask.any()):
+        raise InputError(
+            "photometric stereo: the mask is empty; needed: pixels of the object. Is it inverted?"
+        )
+    if lights is not None and len(lights) != len(images):
+        raise InputError(
+            f"photometric stereo: {len(lights)} lights for {len(images)} photographs; needed: one "
+            "for each."
+        )
+    if weight is not None:
+        if weight.shape != (len(images), *mask.shape):
+            raise InputError(
+                f"photometric stereo: weights are {tuple(weight.shape)}; needed: "
+                f"{(len(images), *mask.shape)}, one a sample."
+            )
+        if not bool(((weight >= 0) & weight.isfinite()).all()):
+            raise InputError("photometric stereo: weights must be finite and not negative.")
+
+
+def _refuse_settings(
+    name: str,
+    method: Method,
+    resolve: str | None,
+    lights: Tensor | None,
+    intrinsics: Tensor | None,
+    ambient: bool,
+) -> None:
+    if method.calibrated and lights is None:
+        raise InputError(f"{name}: there are no lights; needed: one direction a photograph.")
+    if not method.calibrated and lights is not None:
+        raise InputError(f"{name}: finds the lights itself. Leave them out, or use calibrated.")
+    if not method.calibrated and ambient:
+        raise InputError(f"{name}: cannot tell ambient light. Leave it out, or use calibrated.")
+    if method.perspective and intrinsics is None:
+        raise InputError(f"{name}: there are no intrinsics; needed: those of the camera.")
+    if not method.perspective and intrinsics is not None:
+        raise InputError(f"{name}: takes the camera to be far away. Leave intrinsics out.")
+    if resolve is not None and resolve not in method.resolvers:
+        raise InputError(
+            f"{name}: resolve is {resolve!r}; needed: {', '.join(method.resolvers) or 'none'}."
+        )
+
+
+def _refuse_few(views: int, unknowns: int, method: str) -> None:
+    if views < unknowns:
+        raise InputError(
+            f"{method}: {views} photographs have samples inside the mask; needed: {unknowns} or "
+            "more, one for each unknown of a pixel. Add photographs, or choose a simpler method."
+        )
+
+
+def _refuse_plane(lights: Float[Tensor, "view 3"]) -> None:
+    singular = torch.linalg.svdvals(lights)
+    if not bool(lights.isfinite().all()) or not singular[-1] > 1e-6 * singular[0]:
+        raise InputError(
+            "calibrated: the lights lie in one plane through the object; needed: lights that span "
+            "space, or normals are free across the plane. Add one from outside it."
+        )

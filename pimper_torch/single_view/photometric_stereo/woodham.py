@@ -1,0 +1,131 @@
+r"""Photometric stereo under known lights, the reference for every method that lacks them.
+
+:math:`x_{vc} = \rho_c\, l_v^\top n + a_c`: one normal for all colours, an albedo for each, and, if
+asked for, a part ``a`` that does not depend on the lamp.
+
+Source: Woodham, Photometric method for determining surface orientation from multiple images,
+Optical Engineering 19(1), 1980.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.photometry.quadratics import PackedCholesky, outer
+from pimper_torch.records import Record
+from pimper_torch.single_view.photometric_stereo.regression import regress
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Calibrated(Record):
+    """What known lights say about pixels.
+
+    Attributes:
+        normals: Unit, in the frame of the lights; zero where a pixel is black.
+        albedo: Of each colour, not negative.
+        ambient: What a pixel shows in the shadow of the lamp; zero if not asked for.
+        weight: What each sample was given in the end; 0 where missing or in shadow.
+    """
+
+    normals: Float[Tensor, "3 pixel"]
+    albedo: Float[Tensor, "channel pixel"]
+    ambient: Float[Tensor, "channel pixel"]
+    weight: Float[Tensor, "view pixel"]
+
+
+def calibrated_stereo(
+    radiance: Float[Tensor, "view channel pixel"],
+    weight: Float[Tensor, "view pixel"],
+    lights: Float[Tensor, "view 3"],
+    *,
+    robust: bool = True,
+    ambient: bool = False,
+) -> Calibrated:
+    r"""Recover normals and albedos of pixels under known distant lamps.
+
+    Weights are decided on the mean of the colours; see
+    :func:`.regress`. Normal and albedos are then
+    the least-squares solution over all colours: with :math:`A = \sum w\, l l^\top = C C^\top`
+    and ``b_c`` the solution of one colour, :math:`C^\top n` is the leading eigenvector of
+    :math:`\sum_c C^\top b_c b_c^\top C`.
+
+    Args:
+        radiance: Linear. Samples without weight do not matter.
+        weight: Not negative; 0 where missing.
+        lights: Towards the lamp, as long as it is strong.
+        robust: Whether shadows and highlights lose weight.
+        ambient: Whether pixels have a radiance of their own, one more unknown a colour.
+
+    Fails, giving one of the best answers, where a pixel has fewer lit samples than unknowns
+    or lights in one plane; see
+    :func:`.determined`. Constant to autograd.
+    """
+    with torch.no_grad():
+        seen = weight > 0
+        x = torch.where(seen[:, None], radiance, 0).double()
+        gray = regress(x.mean(dim=1), weight, lights, robust=robust, base=ambient)
+        rows = lights.double()
+        if ambient:
+            rows = torch.cat([rows, torch.ones_like(rows[:, :1])], dim=1)
+        heavy = gray.weight
+        packed = outer(rows.mT) @ heavy
+        factored = PackedCholesky(packed, rows.shape[1])
+        found = torch.stack([factored.solve(rows.mT @ (heavy * one)) for one in x.unbind(dim=1)])
+        full = _unpacked(packed, rows.shape[1])
+        inner = full[:, :3, :3]
+        if ambient:
+            total = full[:, 3, 3].clamp_min(torch.finfo(full.dtype).tiny)
+            inner = inner - full[:, :3, 3:] * full[:, 3:, :3] / total[:, None, None]
+        normals, albedo = _shared(inner, found[:, :3])
+        base = torch.zeros_like(albedo)
+        if ambient:
+            left = x - albedo * (rows[:, :3] @ normals)[:, None]
+            base = (heavy[:, None] * left).sum(dim=0) / heavy.sum(dim=0).clamp_min(1e-300)
+        return Calibrated(normals=normals, albedo=albedo, ambient=base, weight=heavy)
+
+
+def chromatic_albedo(
+    radiance: Float[Tensor, "view channel pixel"],
+    weight: Float[Tensor, "view pixel"],
+    shade: Float[Tensor, "view pixel"],
+) -> Float[Tensor, "channel pixel"]:
+    """Fit the albedo of each colour, not negative, where what white would show is known."""
+    x = torch.where((weight > 0)[:, None], radiance, 0).to(shade)
+    square = (weight * shade * shade).sum(dim=0)
+    product = ((weight * shade)[:, None] * x).sum(dim=0)
+    return (product / torch.where(square > 0, square, 1)).clamp_min(0)
+
+
+def _shared(
+    inner: Float[Tensor, "pixel 3 3"], found: Float[Tensor, "channel 3 pixel"]
+) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "channel pixel"]]:
+    """Give all colours of a pixel one normal."""
+    vectors = found.permute(2, 1, 0)  # pixel, 3, channel
+    scale = inner.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(torch.finfo(inner.dtype).tiny)
+    eye = torch.eye(3).to(inner)
+    root = torch.linalg.cholesky_ex(inner + 1e-12 * scale[:, None, None] * eye).L
+    white = root.mT @ vectors
+    if white.shape[2] == 1:
+        lead = white[..., 0]
+    else:
+        lead = torch.linalg.eigh(white @ white.mT).eigenvectors[..., -1]
+    normal = torch.linalg.solve_triangular(root.mT, lead[..., None], upper=True)[..., 0]
+    size = normal.norm(dim=1, keepdim=True)
+    normal = normal / torch.where(size > 0, size, 1)
+    weighted = (inner @ normal[..., None])[..., 0]
+    square = (weighted * normal).sum(dim=1, keepdim=True)
+    albedo = (weighted[..., None] * vectors).sum(dim=1) / torch.where(square > 0, square, 1)
+    sign = torch.where(albedo.sum(dim=1, keepdim=True) < 0, -1.0, 1.0)
+    black = (vectors == 0).all(dim=2).all(dim=1)
+    normal = torch.where(black[:, None], 0, sign * normal)
+    return normal.mT, (sign * albedo).clamp_min(0).mT
+
+
+def _unpacked(packed: Float[Tensor, "entry pixel"], size: int) -> Float[Tensor, "pixel size size"]:
+    rows, columns = torch.triu_indices(size, size)
+    full = packed.new_zeros(packed.shape[1], size, size)
+    full[:, rows, columns] = packed.mT
+    full[:, columns, rows] = packed.mT
+    return full

@@ -1,0 +1,160 @@
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
+from pimper_torch.evidence.baselines.external import Deadline, Program, run_program, workspace
+
+TOOL = Program(name="tool", variable="PIMPER_TOOL", source="https://tool.example")
+
+
+@pytest.fixture(autouse=True)
+def _bare(monkeypatch, tmp_path):
+    """Neither the machine's programs nor the user's variables."""
+    (tmp_path / "bin").mkdir()
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    monkeypatch.delenv("PIMPER_TOOL", raising=False)
+
+
+def script(path: Path, body: str) -> Path:
+    path.write_text(f"#!{sys.executable}\n{body}\n")
+    path.chmod(0o755)
+    return path
+
+
+def test_a_missing_program_is_named_with_the_place_to_get_it():
+    with pytest.raises(MissingProgramError, match=r"tool is not installed.*https://tool.example"):
+        TOOL.find()
+
+
+def test_what_is_given_goes_before_the_variable_before_the_path_before_usual_places(
+    monkeypatch, tmp_path
+):
+    for name in ("usual", "named", "given"):
+        (tmp_path / name).mkdir()
+    tool = Program(
+        name="tool", variable="PIMPER_TOOL", source="a shop", places=(tmp_path / "usual",)
+    )
+    usual = script(tmp_path / "usual" / "tool", "")
+    assert tool.find() == usual
+    on_path = script(tmp_path / "bin" / "tool", "")
+    assert tool.find() == on_path
+    named = script(tmp_path / "named" / "tool", "")
+    monkeypatch.setenv("PIMPER_TOOL", str(tmp_path / "named"))
+    assert tool.find() == named
+    given = script(tmp_path / "given" / "tool-2.1", "")
+    assert tool.find(given) == given
+
+
+def test_a_program_that_is_not_where_the_settings_say_is_not_looked_for_elsewhere(tmp_path):
+    script(tmp_path / "bin" / "tool", "")
+    with pytest.raises(MissingProgramError, match="where the settings say"):
+        TOOL.find(tmp_path / "nowhere")
+    (tmp_path / "text").write_text("not executable")
+    with pytest.raises(MissingProgramError, match="where the settings say"):
+        TOOL.find(tmp_path / "text")
+
+
+def test_a_program_found_by_a_relative_path_runs_in_another_folder(monkeypatch, tmp_path):
+    script(tmp_path / "bin" / "tool", "print('here')")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    found = TOOL.find(Path("bin"))
+    assert run_program([found], tmp_path / "elsewhere", Deadline(1.0), threads=1) == "here\n"
+
+
+def test_arguments_reach_the_program_untouched_by_a_shell(tmp_path):
+    tool = script(tmp_path / "tool", "import sys, os; print(sys.argv[1:], os.getcwd())")
+    printed = run_program([tool, "a b", "$HOME; exit 3"], tmp_path, Deadline(1.0), threads=3)
+    assert printed == f"['a b', '$HOME; exit 3'] {tmp_path}\n"
+
+
+def test_threads_are_told_to_openmp_and_what_is_printed_stays_in_the_folder(tmp_path):
+    tool = script(tmp_path / "tool", "import os; print(os.environ['OMP_NUM_THREADS'])")
+    assert run_program([tool], tmp_path, Deadline(1.0), threads=3) == "3\n"
+    (log,) = tmp_path.glob("tool-*.log")
+    assert log.read_text() == "3\n"
+
+
+def test_a_failing_program_is_quoted_from_its_end(tmp_path):
+    tool = script(
+        tmp_path / "tool",
+        "import sys\nfor i in range(40): print('line', i)\nsys.exit('no \\udcff disparity')",
+    )
+    with pytest.raises(ReconstructionError, match=r"exit status 1") as caught:
+        run_program([tool], tmp_path, Deadline(1.0), threads=1)
+    assert "line 39" in str(caught.value)
+    assert "line 20" not in str(caught.value)
+
+
+def test_a_program_that_a_signal_ended_is_said_so(tmp_path):
+    tool = script(tmp_path / "tool", "import os; os.kill(os.getpid(), 9)")
+    with pytest.raises(ReconstructionError, match=r"SIGKILL; often because memory.*nothing"):
+        run_program([tool], tmp_path, Deadline(1.0), threads=1)
+
+
+def test_at_the_deadline_the_program_and_its_children_are_stopped(tmp_path):
+    child = "import time, pathlib; time.sleep(1.5); pathlib.Path('late').touch()"
+    tool = script(
+        tmp_path / "tool",
+        "import subprocess, sys, time\nprint('begun', flush=True)\n"
+        f"subprocess.Popen([sys.executable, '-c', {child!r}])\ntime.sleep(60)",
+    )
+    began = time.monotonic()
+    with pytest.raises(ReconstructionError, match=r"(?s)0.01 minutes are over.*begun"):
+        run_program([tool], tmp_path, Deadline(0.01), threads=1)
+    assert time.monotonic() - began < 20
+    time.sleep(1.6)
+    assert not (tmp_path / "late").exists()
+
+
+def test_a_deadline_is_shared_by_the_programs_that_it_is_given_to(tmp_path):
+    tool = script(tmp_path / "tool", "import time; time.sleep(60)")
+    deadline = Deadline(0.005)
+    for _ in range(2):
+        with pytest.raises(ReconstructionError, match="minutes are over"):
+            run_program([tool], tmp_path, deadline, threads=1)
+    assert deadline.seconds_left <= 0
+
+
+def test_a_file_that_is_no_program_for_this_machine_counts_as_missing(tmp_path):
+    (tmp_path / "tool").write_bytes(b"\x7fELF of another kind")
+    (tmp_path / "tool").chmod(0o755)
+    with pytest.raises(MissingProgramError, match="cannot be started"):
+        run_program([tmp_path / "tool"], tmp_path, Deadline(1.0), threads=1)
+
+
+def test_the_workspace_is_removed_also_when_something_fails():
+    made = []
+
+    def work():
+        with workspace("tool", None) as folder:
+            (folder / "file").touch()
+            made.append(folder)
+            raise ValueError("oops")
+
+    with pytest.raises(ValueError, match="oops"):
+        work()
+    assert not made[0].exists()
+
+
+def test_a_workspace_to_keep_stays_beside_those_of_other_runs(tmp_path):
+    kept = []
+    for _ in range(2):
+        with workspace("tool", tmp_path / "new" / "keep") as folder:
+            (folder / "file").touch()
+            kept.append(folder)
+    assert kept[0] != kept[1]
+    assert all((folder / "file").exists() for folder in kept)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="keep_in"), workspace("tool", tmp_path / "file"):
+        pass
+
+
+def test_programs_find_no_terminal_to_ask(tmp_path):
+    tool = script(tmp_path / "tool", "import sys; print(repr(sys.stdin.read()))")
+    assert run_program([tool], tmp_path, Deadline(1.0), threads=1) == "''\n"
+    assert os.environ.get("QT_QPA_PLATFORM") != "offscreen"  # our own environment is untouched

@@ -1,0 +1,93 @@
+import json
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.cli.main import main
+from pimper_torch.evidence.datasets.rendered import read_rendered
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.records import Mesh
+
+
+@pytest.fixture
+def ball(tmp_path):
+    vertices, faces = icosphere(2)
+    write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "ball.ply")
+    return tmp_path / "ball.ply"
+
+
+def render(scene, out, *options):
+    small = ["--num-views", "2", "--width", "32", "--height", "24", "--processes", "1"]
+    return main(["render", str(scene), "-o", str(out), *small, *options])
+
+
+def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
+    options = ("--path", "turntable", "--bits", "16", "--encoding", "linear", "--seed", "4")
+    assert render(ball, tmp_path / "out", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert settings["path"] == "turntable"
+    assert settings["bits"] == 16
+    assert settings["seed"] == 4
+    assert settings["lamp_distance"] == 2.5
+    told = capsys.readouterr()
+    assert f"{tmp_path}/out/photos" in told.out
+    assert "--photographs.response linear" in told.out
+    assert "photographs 2" in told.err
+
+
+def test_a_room_and_a_lamp_stand_still_on_demand_and_only_where_the_object_turns(
+    ball, tmp_path, capsys
+):
+    options = ("--fixed-lamp", "--fixed-room", "--fixed-table")
+    assert render(ball, tmp_path / "out", *options) == 2
+    assert "fixed_lamp is True; needed: path turntable" in capsys.readouterr().err
+    assert render(ball, tmp_path / "out", "--path", "turntable", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert all(settings[name] for name in ("fixed_lamp", "fixed_room", "fixed_table"))
+
+
+def test_an_object_of_one_albedo_stands_on_a_patterned_table_on_demand(ball, tmp_path):
+    options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--turn-deg", "30")
+    assert render(ball, tmp_path / "out", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert settings["albedo"] == [0.6, 0.5, 0.4]
+    assert settings["table"] == "patterned"
+    assert settings["turn_deg"] == 30
+    capture = read_rendered(tmp_path / "out")
+    seen = capture.truth.albedo[capture.truth.foreground]
+    assert_close(seen, torch.tensor([0.6, 0.5, 0.4]).expand_as(seen), atol=3e-4, rtol=0)  # float16
+
+
+def test_a_conductor_mirrors_an_environment_that_changes_on_demand(ball, tmp_path, capsys):
+    options = ("--conductor", "copper", "--environment", "changing")
+    assert render(ball, tmp_path / "out", *options) == 0
+    capture = read_rendered(tmp_path / "out")
+    around = ~capture.truth.depth.isfinite()
+    assert around.any()  # nothing is there, and the environment is seen
+    assert capture.views.images.movedim(1, -1)[around].mean() > 0.01
+    assert (capture.truth.albedo[capture.truth.foreground] == 0).all()
+    assert capture.truth.highlight[capture.truth.foreground].float().mean() > 0.5
+    assert render(ball, tmp_path / "other", "--conductor", "copper", "--albedo", *"000") == 2
+    assert "no matte part" in capsys.readouterr().err
+
+
+def test_a_former_rendering_is_replaced_only_on_demand(ball, tmp_path, capsys):
+    assert render(ball, tmp_path / "out") == 0
+    assert render(ball, tmp_path / "out") == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert render(ball, tmp_path / "out", "--overwrite", "--seed", "9") == 0
+    account = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())
+    assert account["settings"]["seed"] == 9
+
+
+def test_a_scene_that_does_not_exist_is_told_in_a_sentence(tmp_path, capsys):
+    assert render("teapot", tmp_path / "out") == 2
+    assert "no scene 'teapot'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_impossible_setting_is_told_in_a_sentence(ball, tmp_path, capsys):
+    assert render(ball, tmp_path / "out", "--exposure", "0") == 2
+    assert "exposure is 0.0" in capsys.readouterr().err

@@ -1,0 +1,54 @@
+import pytest
+import torch
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets.layout import expect, inside, numbers, objects, read_json
+
+
+def test_a_refusal_tells_where_what_was_needed_and_what_there_is(tmp_path):
+    (tmp_path / "one.txt").touch()
+    with pytest.raises(InputError, match=r"not the layout of a toy.*a spoon.*one\.txt") as refusal:
+        expect(False, tmp_path, "a toy", "a spoon")
+    assert str(tmp_path) in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["../x.png", "/etc/passwd", "a/../../x", "link/x.png", "a\0b"])
+def test_a_path_that_leads_out_of_the_folder_is_refused(tmp_path, name):
+    folder = tmp_path / "set"
+    folder.mkdir()
+    (folder / "link").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="leads out of it"):
+        inside(folder, name, "a toy")
+    assert inside(folder, "a/../b.png", "a toy").resolve() == folder / "b.png"
+
+
+@pytest.mark.parametrize("value", ["1 2.5 -3e1", ["1", "2.5", "-30"], [[1, 2.5, -30]]])
+def test_numbers_come_as_texts_or_lists(tmp_path, value):
+    expected = torch.tensor([1.0, 2.5, -30.0], dtype=torch.float64)
+    assert torch.equal(numbers(value, 3, "x", tmp_path, "a toy"), expected)
+
+
+@pytest.mark.parametrize("value", [None, "1 2", [1, 2, "nan"], [[1], [2, 3]], {"a": 1}, [1, 2, {}]])
+def test_anything_but_so_many_finite_numbers_is_refused(tmp_path, value):
+    with pytest.raises(InputError, match="3 finite numbers as x"):
+        numbers(value, 3, "x", tmp_path, "a toy")
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", "{", "[" * 100000, "\ufeff3"])
+def test_json_of_anything_but_an_object_is_refused(tmp_path, text):
+    path = tmp_path / "a.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=r"a\.json"):
+        read_json(path, "a toy")
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    (tmp_path / "a.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="UTF-8"):
+        read_json(tmp_path / "a.json", "a toy")
+
+
+@pytest.mark.parametrize("value", [None, [], "", [1], {"a": 1}])
+def test_anything_but_a_list_of_objects_is_refused(tmp_path, value):
+    with pytest.raises(InputError, match="a list of objects as frames"):
+        objects(value, "frames", tmp_path, "a toy")

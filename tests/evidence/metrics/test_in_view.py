@@ -1,0 +1,215 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.metrics import (
+    compare_albedo,
+    compare_along_rays,
+    mean_absolute_depth_error,
+    mean_angular_error_deg,
+)
+from pimper_torch.evidence.metrics.visible import joined
+from pimper_torch.geometry.visibility import cast_view
+from pimper_torch.records import Truth
+
+IDENTITY = torch.eye(4, dtype=torch.float64)
+
+
+def with_maps(make, truth, cameras):
+    """Give a capture whose maps are those of a mesh."""
+    hits = [cast_view(truth, cameras, view) for view in range(cameras.num_views)]
+    return Truth(
+        depth=torch.stack([hit.distance for hit in hits]),
+        normals_world=torch.stack(
+            [hit.interpolate(truth.vertices_world, truth.faces) for hit in hits]
+        ),
+        albedo=torch.stack(
+            [hit.interpolate(truth.vertices_world.abs() + 0.1, truth.faces) for hit in hits]
+        ),
+    )
+
+
+def test_a_mesh_that_is_the_truth_has_no_error(make):
+    sphere, cameras = make.sphere(level=4), make.cameras(count=2)
+    mesh = sphere.replace(albedo=3 * (sphere.vertices_world.abs() + 0.1))
+    truth = with_maps(make, sphere, cameras)
+    found = compare_along_rays(mesh, IDENTITY, make.capture(truth, cameras=cameras), 1)
+    assert found.name == "view_1.png"
+    assert found.relative_error < 1e-4  # float32 of the ray caster
+    assert found.coverage == 1.0
+    assert found.carried_normals is None
+    assert found.shape_normals.mean_deg < 0.5  # facets
+    assert found.albedo.one_scale_percent < 1e-3
+
+
+def test_carried_normals_and_those_of_the_shape_are_told_apart(make, generator):
+    sphere, cameras = make.sphere(level=4), make.cameras(count=1)
+    tilt = make.rotation(generator, 10.0)
+    # About its axis the tilt turns nothing: the mean angle is below 10, the shape's is not.
+    mesh = sphere.replace(normals_world=sphere.vertices_world @ tilt.mT)
+    truth = with_maps(make, sphere, cameras)
+    found = compare_along_rays(mesh, IDENTITY, make.capture(truth, cameras=cameras), 0)
+    assert found.shape_normals.mean_deg < 0.5
+    normals = truth.normals_world[0][truth.depth[0].isfinite()].double()
+    cosine = (normals * (normals @ tilt.mT)).sum(dim=1) / normals.square().sum(dim=1)
+    expected = torch.rad2deg(cosine.clamp(-1, 1).acos())
+    assert found.carried_normals.mean_deg == pytest.approx(float(expected.mean()), abs=0.02)
+    assert found.carried_normals.median_deg == pytest.approx(float(expected.median()), abs=0.05)
+
+
+def test_a_true_mesh_serves_where_there_are_no_maps(make):
+    sphere, cameras = make.sphere(level=4), make.cameras(count=1)
+    table = make.square(side=9.0)
+    table = table.replace(vertices_world=table.vertices_world - 3.0)
+    truth = Truth(mesh=sphere, surroundings=table)
+    found = compare_along_rays(sphere, IDENTITY, make.capture(truth, cameras=cameras), 0)
+    alone = compare_along_rays(sphere, IDENTITY, make.capture_of(sphere, cameras=cameras), 0)
+    assert found.coverage == 1.0  # the table counts for nothing
+    assert found.pixels == alone.pixels
+    assert found.shape_normals.mean_deg < 1e-3
+
+
+def on_a_table(make):
+    """A ball on a large table, and cameras that look down on both."""
+    ball = make.sphere(level=4)
+    table = make.square(height=-1.0, side=20.0)
+    table = table.replace(vertices_world=table.vertices_world - torch.tensor([10.0, 10.0, 0.0]))
+    return ball, table, make.cameras(count=1)
+
+
+def half_of(mesh):
+    right = mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0
+    return mesh.replace(faces=mesh.faces[right])
+
+
+def test_rays_through_a_hole_that_meet_the_table_are_misses(make):
+    ball, table, cameras = on_a_table(make)
+    half = half_of(ball)
+    capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
+    alone = compare_along_rays(half, IDENTITY, capture, 0)
+    found = compare_along_rays(joined(half, table), IDENTITY, capture, 0)
+    unknown = compare_along_rays(
+        joined(half, table), IDENTITY, make.capture_of(ball, cameras=cameras), 0
+    )
+    assert 0.4 < alone.coverage < 0.8
+    assert found.coverage == alone.coverage
+    assert found.relative_error == pytest.approx(alone.relative_error, abs=1e-6)
+    assert unknown.coverage == 1.0  # where nobody knows the table, its error is the object's
+    assert unknown.relative_error > 20
+
+
+def test_a_surface_behind_the_true_one_is_no_table(make):
+    ball, table, cameras = on_a_table(make)
+    small = ball.replace(vertices_world=0.9 * ball.vertices_world)
+    capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
+    found = compare_along_rays(joined(small, table), IDENTITY, capture, 0)
+    alone = compare_along_rays(small, IDENTITY, capture, 0)
+    assert found.coverage == alone.coverage
+    raised = table.replace(vertices_world=table.vertices_world + torch.tensor([0.0, 0.0, 0.5]))
+    before = compare_along_rays(joined(ball, raised), IDENTITY, capture, 0)
+    assert before.coverage == 1.0  # in front of the object it is an error, not a miss
+
+
+def test_a_mesh_of_the_table_alone_is_refused(make):
+    ball, table, cameras = on_a_table(make)
+    capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
+    with pytest.raises(InputError, match="lies on the surroundings"):
+        compare_along_rays(table, IDENTITY, capture, 0)
+
+
+def test_maps_on_a_larger_raster_than_the_photograph_are_compared_inside_it(make):
+    sphere, cameras = make.sphere(level=3), make.cameras(count=1)
+    truth = with_maps(make, sphere, cameras)
+    padded = truth.replace(
+        depth=torch.nn.functional.pad(truth.depth, (0, 7, 0, 3), value=torch.inf),
+        normals_world=None,
+        albedo=None,
+    )
+    found = compare_along_rays(sphere, IDENTITY, make.capture(padded, cameras=cameras), 0)
+    assert found.coverage == 1.0
+    assert found.relative_error < 1e-4
+    small = truth.replace(depth=truth.depth[:, :20], normals_world=None, albedo=None)
+    with pytest.raises(InputError, match="one and the same size"):
+        compare_along_rays(sphere, IDENTITY, make.capture(small, cameras=cameras), 0)
+
+
+def test_nothing_is_compared_where_nothing_is_known(make):
+    sphere, cameras = make.sphere(level=2), make.cameras(count=1)
+    empty = make.capture(Truth(), cameras=cameras)
+    assert compare_along_rays(sphere, IDENTITY, empty, 0) is None
+    cloud = sphere.replace(faces=sphere.faces[:0])
+    assert compare_along_rays(cloud, IDENTITY, make.capture_of(sphere, cameras=cameras), 0) is None
+
+
+def test_albedo_is_judged_up_to_one_scale_and_up_to_one_a_channel():
+    truth = torch.tensor([[0.2, 0.4], [0.6, 0.2], [0.4, 0.8]], dtype=torch.float64)
+    scaled = compare_albedo(0.1 * truth, truth)
+    assert scaled.one_scale_percent < 1e-10
+    tinted = compare_albedo(truth * truth.new_tensor([1.0, 2.0]), truth)
+    assert tinted.channel_scales_percent < 1e-10
+    # s = sum a t / sum a^2 = (.56 + 2 * .84) / (.56 + 4 * .84); the rest by hand.
+    s = (0.56 + 2 * 0.84) / (0.56 + 4 * 0.84)
+    rest = (s - 1) ** 2 * 0.56 + (2 * s - 1) ** 2 * 0.84
+    assert tinted.one_scale_percent == pytest.approx(100 * (rest / 1.4) ** 0.5)
+
+
+def test_an_outlier_moves_the_mean_of_albedo_and_not_its_median():
+    truth = torch.full((101, 1), 0.5, dtype=torch.float64)
+    ours = truth.clone()
+    ours[0] = 50
+    found = compare_albedo(ours, truth)
+    assert found.one_scale_percent > 50
+    assert found.one_scale_median_percent < 1e-10
+    assert found.samples == 101
+
+
+def test_grey_albedo_is_compared_with_the_mean_of_colours():
+    truth = torch.tensor([[0.2, 0.4, 0.6], [0.6, 0.2, 0.1]], dtype=torch.float64)
+    found = compare_albedo(2 * truth.mean(dim=1, keepdim=True), truth)
+    assert found.channels == 1
+    assert found.one_scale_percent < 1e-10
+    assert compare_albedo(0 * truth, truth) is None
+
+
+def test_the_mean_angular_error_is_over_the_mask_and_silence_costs():
+    truth = torch.zeros(2, 2, 3, dtype=torch.float64)
+    truth[..., 2] = -1
+    ours = truth.clone()
+    tilt = torch.deg2rad(torch.tensor(20.0, dtype=torch.float64))
+    ours[0, 0] = 3 * torch.stack([tilt.sin(), 0 * tilt, -tilt.cos()])  # its length is no matter
+    ours[0, 1] = 0
+    ours[1, 1] = torch.tensor([1.0, 0, 0])
+    mask = torch.tensor([[True, True], [True, False]])
+    assert mean_angular_error_deg(ours, truth, mask) == pytest.approx((20 + 90 + 0) / 3)
+    with pytest.raises(InputError, match="mask is empty"):
+        mean_angular_error_deg(ours, truth, mask & False)
+    with pytest.raises(InputError, match="1 of 3 pixels"):
+        mean_angular_error_deg(ours, ours, mask)
+
+
+def test_depth_known_up_to_scale_is_aligned_by_the_median_ratio():
+    truth = torch.tensor([[2.0, 4.0, 6.0], [8.0, 10.0, torch.inf]], dtype=torch.float64)
+    ours = truth / 2
+    ours[0, 0] = 2.0  # ratios 1, 2, 2, 2, 2: the median is 2, the mean is not
+    assert mean_absolute_depth_error(ours, truth, "median scale") == pytest.approx(2 / 5)
+    assert mean_absolute_depth_error(ours, truth, "none") == pytest.approx((0 + 2 + 3 + 4 + 5) / 5)
+    inner = torch.tensor([[False, True, True], [True, True, True]])
+    assert mean_absolute_depth_error(ours, truth, "median scale", inner) == 0
+
+
+def test_depth_known_up_to_a_constant_is_aligned_by_the_median_difference():
+    truth = torch.tensor([[1.0, 2.0, 3.0, 4.0, 5.0]], dtype=torch.float64)
+    ours = truth - 7
+    ours[0, 4] = 0.0
+    assert mean_absolute_depth_error(ours, truth, "median offset") == pytest.approx(2 / 5)
+    with pytest.raises(InputError, match="not positive"):
+        mean_absolute_depth_error(ours, truth, "median scale")
+    with pytest.raises(InputError, match="no pixel"):
+        mean_absolute_depth_error(ours * torch.nan, truth, "none")
+
+
+def test_the_median_of_an_even_number_lies_between_the_two():
+    truth = torch.tensor([[1.0, 2.0]], dtype=torch.float64)
+    found = mean_absolute_depth_error(torch.zeros(1, 2).double(), truth, "median offset")
+    assert_close(found, 0.5)

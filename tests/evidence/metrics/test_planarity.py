@@ -1,0 +1,105 @@
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.metrics.planarity import dihedrals, planar_faces
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.records import Mesh
+
+SIZE = (1.0, 1.5, 3.0)
+
+QUADS = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(3)
+
+
+def box(generator, noise=0.0, lean_deg=0.0, spacing=0.03):
+    """A closed box of SIZE, one pair of sides leaning, with noise on its vertices."""
+    corners = torch.tensor([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]).double()
+    corners = corners * torch.tensor(SIZE).double()
+    corners[:, 0] += math.tan(math.radians(lean_deg)) * corners[:, 1]
+    faces = torch.tensor([part for a, b, c, d in QUADS for part in ((a, b, c), (a, c, d))])
+    dense = subdivide(corners, faces, torch.full((12,), spacing).double())
+    volume = (dense.points[dense.faces].det() / 6).sum()
+    turned = dense.faces if volume > 0 else dense.faces.flip(1)
+    shake = torch.randn(dense.points.shape, generator=generator, dtype=torch.float64)
+    return Mesh(vertices_world=dense.points + noise * shake, faces=turned)
+
+
+def test_an_exact_box_has_six_flat_sides_at_right_angles(generator):
+    mesh = box(generator)
+    sides = planar_faces(mesh, generator)
+    assert len(sides) == 6
+    # All but a line along the edges, where smoothed normals are those of both sides.
+    assert 0.97 * len(mesh.faces) < sum(len(side.faces) for side in sides) <= len(mesh.faces)
+    assert max(side.rms for side in sides) < 1e-9
+    found = sorted(side.sides for side in sides)
+    expected = sorted([(1.5, 1.0)] * 2 + [(3.0, 1.0)] * 2 + [(3.0, 1.5)] * 2)
+    assert_close(torch.tensor(found), torch.tensor(expected), atol=0.03, rtol=0)
+    angles = dihedrals(mesh, sides)
+    assert len(angles) == 12
+    assert all(abs(each.angle_deg - 90) < 1e-6 for each in angles)
+    # Outward: away from the middle.
+    middle = torch.tensor(SIZE).double() / 2
+    assert all((side.point - middle) @ side.normal > 0 for side in sides)
+
+
+def test_noise_is_measured_as_it_was_made(generator):
+    noise = 0.004
+    sides = planar_faces(box(generator, noise=noise), generator)
+    assert len(sides) == 6
+    for side in sides:
+        assert side.rms == pytest.approx(noise, rel=0.08)
+        assert side.p95 == pytest.approx(1.96 * noise, rel=0.08)
+        assert side.edge == pytest.approx(math.prod(side.sides) ** 0.5)
+
+
+def test_a_leaning_box_has_angles_of_88_and_92_degrees(generator):
+    mesh = box(generator, noise=0.003, lean_deg=2.0)
+    sides = planar_faces(mesh, generator)
+    angles = sorted(each.angle_deg for each in dihedrals(mesh, sides))
+    expected = [88.0] * 2 + [90.0] * 8 + [92.0] * 2
+    assert_close(torch.tensor(angles), torch.tensor(expected), atol=0.05, rtol=0)
+
+
+def test_a_bulge_is_found_in_the_side_that_has_it(generator):
+    mesh = box(generator)
+    vertices = mesh.vertices_world.clone()
+    top = vertices[:, 2] > SIZE[2] - 1e-9
+    across = torch.sin(torch.pi * vertices[:, 0]) * torch.sin(torch.pi * vertices[:, 1] / 1.5)
+    vertices[top, 2] += 0.02 * across[top]
+    sides = planar_faces(mesh.replace(vertices_world=vertices), generator)
+    (bulged,) = [side for side in sides if side.normal[2] > 0.9]
+    others = [side.rms for side in sides if side.normal[2] < 0.9]
+    assert 0.003 < bulged.rms < 0.006  # the bulge's own spread is 0.0057, its rim left out
+    assert max(others) < 1e-9
+
+
+def test_an_open_box_with_a_part_missing_keeps_the_sides_it_has(generator):
+    mesh = box(generator, noise=0.002)
+    middles = mesh.vertices_world[mesh.faces].mean(dim=1)
+    kept = (middles[:, 2] > 0.05) & ((middles - torch.tensor([0, 0.7, 1.5])).norm(dim=1) > 0.3)
+    sides = planar_faces(mesh.replace(faces=mesh.faces[kept]), generator)
+    assert len(sides) == 5
+    assert all(side.rms == pytest.approx(0.002, rel=0.1) for side in sides)
+
+
+def test_a_ball_has_no_flat_sides_to_speak_of(generator):
+    vertices, faces = icosphere(4)
+    sides = planar_faces(
+        Mesh(vertices_world=vertices, faces=faces), generator, band=0.002, min_share=0.04
+    )
+    assert len(sides) == 0
+
+
+def test_a_mesh_without_area_is_refused(generator):
+    flat = Mesh(vertices_world=torch.zeros(3, 3), faces=torch.tensor([[0, 1, 2]]))
+    with pytest.raises(InputError, match="without area"):
+        planar_faces(flat, generator)

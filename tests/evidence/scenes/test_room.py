@@ -1,0 +1,122 @@
+import pytest
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.evidence.datasets.rendered import read_rendered
+from pimper_torch.evidence.scenes.config import SceneConfig
+from pimper_torch.evidence.scenes.frame import render_frame
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.scene import build_scene
+from pimper_torch.evidence.scenes.stage import Stage
+from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.records import Mesh
+
+
+@pytest.fixture(scope="module")
+def egg(tmp_path_factory):
+    """Twice as long as wide, so that it looks and shadows differently when it has turned."""
+    path = tmp_path_factory.mktemp("meshes") / "egg.ply"
+    vertices, faces = icosphere(3)
+    scaled = vertices * vertices.new_tensor([1.0, 2.0, 1.0])
+    write_ply(Mesh(vertices_world=scaled, faces=faces), path)
+    return path
+
+
+def settings(**changes):
+    calm = {"num_views": 5, "width": 80, "height": 60, "supersample": 1, "path": "turntable"}
+    return SceneConfig(**(calm | {"read_noise": 0.0, "shot_noise": 0.0} | changes))
+
+
+def photograph(scene, view):
+    stage = Stage(scene.bodies_in(view))
+    noise = scene.noise(view)
+    return render_frame(stage, scene.cameras, scene.lights, view, noise, scene.config.sensor)
+
+
+def test_all_but_the_object_and_its_shadow_is_the_same_in_every_photograph(egg):
+    scene = build_scene(egg, settings(fixed_lamp=True, fixed_room=True, fixed_table=True))
+    first, second = photograph(scene, 0), photograph(scene, 1)
+    around = ~first.foreground & ~second.foreground
+    alike = around & (first.lit == second.lit)
+    assert alike.float().mean() > 0.3
+    assert (around & ~alike).any()  # the shadow turned
+    assert_close(first.image[:, alike], second.image[:, alike], atol=1e-4, rtol=0)  # float32
+    assert first.image[:, alike].std() > 0.02  # patterned, so that equality says something
+    turned = first.foreground & second.foreground
+    assert (first.image - second.image).abs()[:, turned].mean() > 0.05
+    assert_close(scene.bodies_in(0)[0].mesh.vertices_world, scene.object_mesh.vertices_world)
+
+
+def test_a_turning_table_is_where_the_true_cameras_see_it_and_the_room_is_not(egg):
+    scene = build_scene(egg, settings(fixed_lamp=True, fixed_room=True))
+    first, second = photograph(scene, 0), photograph(scene, 1)
+    cameras = scene.cameras
+    at = pixel_centers(80, 60, like=cameras.intrinsics).reshape(-1, 2)
+    rays = rays_through(at, cameras.cam_from_world[0], cameras.intrinsics[0])
+    depth = first.depth.reshape(-1).double()
+    assert depth.isfinite().all()
+    points = cameras.centers_world[0] + depth[:, None] * rays
+    pixels, _ = project(points, cameras.cam_from_world[1], cameras.intrinsics[1])
+    u, v = pixels.floor().long().unbind(dim=-1)
+    framed = (u >= 0) & (v >= 0) & (u < 80) & (v < 60)
+    row, column = v.clamp(0, 59), u.clamp(0, 79)
+    away = transform(cameras.cam_from_world[1], points)[:, 2]
+    seen = framed & ((second.depth[row, column] - away).abs() < 0.05)
+    difference = (first.albedo.reshape(-1, 3) - second.albedo[row, column]).abs().mean(dim=-1)
+    around = ~first.foreground.reshape(-1)
+    table = around & (points[:, 2].abs() < 1e-4)
+    assert (seen & table).sum() > 100
+    # A pixel is 0.07 wide here, less than the table's finest pattern.
+    assert difference[seen & table].mean() < 0.02
+    beyond = seen & around & (points[:, 2] < -0.1)
+    assert beyond.sum() > 50
+    assert difference[beyond].mean() > 0.05
+
+
+def test_a_fixed_lamp_stands_still_before_the_camera(egg):
+    scene = build_scene(egg, settings(fixed_lamp=True))
+    lamps = scene.lights.positions_world[:, None]
+    before = transform(scene.cameras.cam_from_world, lamps)[:, 0]
+    assert_close(before, before[:1].expand(5, 3))
+    assert (lamps[1:] - lamps[:-1]).norm(dim=-1).min() > 1  # it goes round the object
+    assert scene.lights.irradiance.std() == 0
+    target = transform(scene.cameras.cam_from_world, scene.lights.target_world.expand(5, 1, 3))
+    assert_close(target, target[:1].expand(5, 1, 3))  # so the room is lit alike
+    moving = build_scene(egg, settings())
+    lamps = moving.lights.positions_world[:, None]
+    before = transform(moving.cameras.cam_from_world, lamps)[:, 0]
+    assert before.std(dim=0).min() > 0.1
+
+
+@pytest.mark.parametrize("name", ["fixed_lamp", "fixed_room", "fixed_table"])
+@pytest.mark.parametrize("path", ["arc", "handheld"])
+def test_only_a_turntable_has_things_that_stand_still(name, path):
+    with pytest.raises(ConfigError, match=f"{name} is True.*turntable instead of {path}"):
+        settings(path=path, **{name: True})
+
+
+@pytest.mark.parametrize("fixed_table", [False, True])
+def test_the_truth_is_told_in_the_frame_of_the_object(egg, tmp_path, fixed_table):
+    config = settings(
+        num_views=3, fixed_lamp=True, fixed_room=True, fixed_table=fixed_table, bits=16
+    )
+    scene = build_scene(egg, config)
+    capture = read_rendered(render_scene(egg, tmp_path / "out", config, processes=1))
+    truth = capture.truth
+    assert (truth.surroundings is None) == fixed_table
+    for view in range(3):
+        frame = photograph(scene, view)
+        assert_close(truth.depth[view], frame.depth)
+        assert_close(truth.lit[view], frame.lit)
+        assert_close(capture.views.masks[view], frame.foreground)
+        alone = build_scene(egg, settings(num_views=3))  # no room, no fixed lamp
+        bare = photograph(alone, view)
+        assert_close(frame.foreground, bare.foreground)
+        shown = frame.foreground
+        assert_close(frame.depth[shown], bare.depth[shown])
+        assert_close(frame.albedo[shown], bare.albedo[shown])
+        assert_close(frame.normals_world[shown], bare.normals_world[shown])

@@ -1,0 +1,283 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.geometry.frames import invert_rigid, rigid
+from pimper_torch.paper.alignment.align import Align, AlignConfig
+from pimper_torch.paper.alignment.trust import trust_by_distance
+from pimper_torch.records import Mesh
+
+RADIUS = 2.0
+CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)
+
+
+def cap(x, y):
+    return RADIUS - (RADIUS**2 - x**2 - y**2).sqrt()
+
+
+def random_transforms(count, generator, offset=0.02):
+    draw = torch.randn(count, 4, generator=generator, dtype=torch.float64)
+    tilt, scale, shift = 0.15 * draw[:, :2], (0.35 * draw[:, 2:3]).exp(), offset * draw[:, 3:]
+    return torch.cat([tilt, scale, shift], dim=1)
+
+
+def spoiled(depths, transforms):
+    buckets = []
+    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+        x, y, _ = templates.points_patch.unbind(dim=-1)
+        hx, hy, hz, h0 = transforms[templates.facet][:, :, None, None].unbind(dim=1)
+        buckets.append(relief.replace(depth=hx * x + hy * y + hz * relief.depth + h0))
+    return depths.replace(buckets=tuple(buckets))
+
+
+def error(found, truth):
+    pairs = zip(found.buckets, truth.buckets, strict=True)
+    apart = torch.cat([(a.depth - b.depth)[b.valid] for a, b in pairs])
+    return float(apart.square().mean().sqrt())
+
+
+def by_facet(depths):
+    facets = torch.cat([templates.facet for templates in depths.patches.buckets])
+    return torch.cat([relief.transform for relief in depths.buckets])[torch.argsort(facets)]
+
+
+@pytest.fixture
+def sphere(facets_over, reliefs, sphere_relief):
+    return reliefs(facets_over(cap), sphere_relief(CENTER, RADIUS))
+
+
+@pytest.fixture
+def noise(generator):
+    """Waves of their own on every patch, of a quarter edge's length."""
+
+    def add(depths, amplitude):
+        buckets = []
+        for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+            x, y, _ = templates.points_patch.unbind(dim=-1)
+            waves = torch.zeros_like(x)
+            for _ in range(6):
+                fx, fy, start = torch.randn(
+                    3, len(x), 1, 1, generator=generator, dtype=torch.float64
+                )
+                waves = waves + torch.cos(fx / 0.08 * x + fy / 0.08 * y + 9 * start)
+            buckets.append(relief.replace(depth=relief.depth + amplitude * waves / 3**0.5))
+        return depths.replace(buckets=tuple(buckets))
+
+    return add
+
+
+@pytest.mark.parametrize(("prior", "left"), [(1e-6, 0.001), (3e-4, 0.03)])
+def test_alignment_undoes_random_bas_relief_transforms(sphere, generator, prior, left):
+    put_on = random_transforms(sphere.patches.num_patches, generator)
+    bad = spoiled(sphere, put_on)
+    found = Align(AlignConfig(prior=prior, rounds=4))(bad)
+    assert error(found, sphere) < left * error(bad, sphere)
+    # Scales too, which no anchor tells: only neighbours and the folds between them do.
+    scales = by_facet(found)[:, 2] * put_on[:, 2]
+    assert (scales - 1).abs().mean() < 2 * left
+    assert found.mismatch.shape == (5,)
+    assert found.mismatch[-1] < 0.02 * found.mismatch[0]
+
+
+def test_the_published_three_numbers_undo_what_three_numbers_did(sphere, generator):
+    bad = spoiled(sphere, random_transforms(sphere.patches.num_patches, generator, offset=0.0))
+    found = Align(AlignConfig(prior=1e-6, rounds=5, offset=False))(bad)
+    assert error(found, sphere) < 0.01 * error(bad, sphere)
+    assert (by_facet(found)[:, 3] == 0).all()
+
+
+def test_depths_are_the_reported_transform_of_the_old_depths(sphere, generator):
+    bad = spoiled(sphere, random_transforms(sphere.patches.num_patches, generator))
+    once = Align()(bad)
+    assert error(spoiled(bad, by_facet(once)), once) < 1e-12
+    twice = Align()(once)
+    assert error(spoiled(bad, by_facet(twice)), twice) < 1e-12
+
+
+def test_the_curvature_term_keeps_disagreeing_patches_from_being_flattened(
+    facets_over, reliefs, noise
+):
+    flat = reliefs(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
+    bad = noise(flat, 0.02)  # neighbours have nothing in common
+
+    def scales(**settings):
+        return by_facet(Align(AlignConfig(prior=1e-5, **settings))(bad))[:, 2]
+
+    assert scales(curvature=False, scale_limit=1e6).median() < 0.05
+    assert scales(scale_limit=1e6).median() > 0.25
+
+
+def test_no_patch_collapses_with_default_settings(facets_over, reliefs, noise):
+    flat = reliefs(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
+    bad = noise(flat, 0.02)
+    for curvature in (True, False):
+        scales = by_facet(Align(AlignConfig(curvature=curvature))(bad))[:, 2]
+        assert scales.min() >= 0.25
+        assert scales.max() <= 4
+
+
+def test_noise_on_a_curved_surface_shrinks_it_without_the_curvature_term_only(sphere, noise):
+    bad = noise(sphere, 0.01)  # half of the relief's own size
+
+    def mean_scale(curvature):
+        return by_facet(Align(AlignConfig(prior=1e-5, curvature=curvature))(bad))[:, 2].mean()
+
+    assert mean_scale(False) < 0.85
+    assert mean_scale(True) > 0.85
+
+
+def test_rigid_motion_and_scale_of_the_world_change_nothing(sphere, generator):
+    transforms = random_transforms(sphere.patches.num_patches, generator)
+    bad = spoiled(sphere, transforms)
+    q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    q = q * torch.linalg.det(q)
+    size, shift = 7.0, torch.tensor([30.0, -4.0, 9.0], dtype=torch.float64)
+    old_from_new = invert_rigid(rigid(q, shift))
+
+    coarse = bad.patches.coarse
+    vertices = size * coarse.mesh.vertices_world @ q.T + shift
+    mesh = Mesh(vertices_world=vertices, faces=coarse.mesh.faces)
+    templates = []
+    for bucket in bad.patches.buckets:
+        grown = bucket.patch_from_world.clone()
+        grown[:, :3, 3] *= size
+        templates.append(
+            bucket.replace(
+                patch_from_world=grown @ old_from_new,
+                origin=size * bucket.origin,
+                spacing=size * bucket.spacing,
+            )
+        )
+    patches = bad.patches.replace(coarse=coarse.replace(mesh=mesh), buckets=tuple(templates))
+    moved = bad.replace(
+        photometric=bad.photometric.replace(patches=patches),
+        buckets=tuple(relief.replace(depth=size * relief.depth) for relief in bad.buckets),
+    )
+    here, there = Align()(bad), Align()(moved)
+    for a, b in zip(here.buckets, there.buckets, strict=True):
+        assert_close(b.depth, size * a.depth, atol=1e-7, rtol=1e-7)
+    assert_close(there.mismatch, size * here.mismatch)
+
+
+def test_a_patch_without_data_stays_as_it_is_and_drags_nobody(sphere, generator):
+    bad = spoiled(sphere, random_transforms(sphere.patches.num_patches, generator))
+    blind, rest = bad.buckets[0], bad.buckets[1:]
+    valid = blind.valid.clone()
+    valid[0] = False
+    depth = blind.depth.clone()
+    depth[0] = torch.nan
+    bad = bad.replace(buckets=(blind.replace(depth=depth, valid=valid), *rest))
+    found = Align(AlignConfig(prior=1e-5))(bad)
+    assert_close(found.buckets[0].transform[0], torch.tensor([0.0, 0, 1, 0], dtype=torch.float64))
+    assert error(found.replace(buckets=_but_first(found)), _only_valid(sphere, valid)) < 0.002
+
+
+def test_patches_that_meet_nobody_are_handed_back(sphere):
+    nothing = tuple(relief.replace(valid=relief.valid & False) for relief in sphere.buckets)
+    alone = sphere.replace(buckets=nothing)
+    assert Align()(alone) is alone
+
+
+def test_a_single_facet_is_handed_back(facets_over, reliefs):
+    patches = facets_over(lambda x, y: 0 * x, side=2)
+    mesh = patches.coarse.mesh
+    first = patches.buckets[0]
+    lone = patches.replace(
+        coarse=patches.coarse.replace(mesh=mesh.replace(faces=mesh.faces[first.facet[:1]])),
+        buckets=(_one_template(first),),
+    )
+    depths = reliefs(lone, lambda points, _: 0.1 * points[..., 0] ** 2)
+    assert Align()(depths) is depths
+
+
+def test_a_step_in_one_patch_is_left_standing_instead_of_tilting_it(sphere):
+    facet = 0
+    bucket = next(i for i, t in enumerate(sphere.patches.buckets) if facet in t.facet)
+    templates, relief = sphere.patches.buckets[bucket], sphere.buckets[bucket]
+    row = int(torch.nonzero(templates.facet == facet)[0, 0])
+    depth = relief.depth.clone()
+    beyond = templates.barycentric[row, ..., 0] > 0.8
+    depth[row] = depth[row] + 0.2 * beyond
+    buckets = list(sphere.buckets)
+    buckets[bucket] = relief.replace(depth=depth)
+    stepped = sphere.replace(buckets=tuple(buckets))
+
+    def others(outlier):
+        found = Align(AlignConfig(outlier=outlier, anchor=0.0))(stepped)
+        away = by_facet(found) - torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
+        return float(away.abs().mean())
+
+    assert others(5.0) < 0.3 * others(1e9)
+
+
+def test_samples_lose_three_quarters_at_the_outlier_distance():
+    distance = torch.tensor([[1.0, 1.0, 1.0, 5.0, 1e3]])
+    met = torch.tensor([[True, True, True, True, False]])
+    trust = trust_by_distance(distance, met, outlier=5.0)
+    assert_close(trust[0, 3], torch.tensor(0.25))
+    assert trust[0, 0] > 0.9
+
+
+def test_gradients_run_from_depths_to_aligned_depths(
+    facets_over, reliefs, sphere_relief, generator
+):
+    patches = facets_over(cap, side=3, sample=0.06, overlap=4.0)
+    bad = spoiled(
+        reliefs(patches, sphere_relief(CENTER, RADIUS)),
+        random_transforms(patches.num_patches, generator),
+    )
+    align = Align(AlignConfig(rounds=2))
+    probe = [torch.randn(b.depth.shape, generator=generator).double() for b in bad.buckets]
+    change = 0.1 * random_transforms(patches.num_patches, generator)
+
+    def outcome(step):
+        found = align(spoiled(bad, torch.tensor([0.0, 0, 1, 0]).double() + step * change))
+        return sum((b.depth * p)[b.valid].sum() for b, p in zip(found.buckets, probe, strict=True))
+
+    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(outcome(step), step)
+    tiny = 1e-6
+    numeric = (outcome(torch.tensor(tiny)) - outcome(torch.tensor(-tiny))) / (2 * tiny)
+    assert slope.abs() > 1e-3
+    assert_close(slope, numeric, rtol=1e-3, atol=1e-6)  # Newton's bilinear cells end in kinks
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"rounds": 0},
+        {"rows": 1},
+        {"columns": 2},
+        {"reach_samples": 0.0},
+        {"anchor": -1.0},
+        {"prior": 0.0},
+        {"scale_limit": 1.0},
+        {"outlier": 0.0},
+    ],
+)
+def test_impossible_settings_are_refused(setting):
+    with pytest.raises(ConfigError, match=next(iter(setting))):
+        AlignConfig(**setting)
+
+
+def _one_template(templates):
+    return templates.replace(
+        facet=torch.tensor([0]),
+        patch_from_world=templates.patch_from_world[:1],
+        origin=templates.origin[:1],
+        spacing=templates.spacing[:1],
+        depth=templates.depth[:1],
+        barycentric=templates.barycentric[:1],
+        inside=templates.inside[:1],
+    )
+
+
+def _but_first(depths):
+    first, *rest = depths.buckets
+    return (first.replace(depth=torch.nan_to_num(first.depth)), *rest)
+
+
+def _only_valid(depths, valid):
+    first, *rest = depths.buckets
+    return depths.replace(buckets=(first.replace(valid=valid), *rest))

@@ -1,0 +1,217 @@
+"""The published system against a dense assembly, and what keeps it from flattening."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.chains.presets import load_config
+from pimper_torch.paper.alignment.align import Align, AlignConfig
+from pimper_torch.paper.alignment.system import Pulls, solve_transforms
+
+RADIUS = 2.0
+CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)
+
+
+def cap(x, y):
+    return RADIUS - (RADIUS**2 - x**2 - y**2).sqrt()
+
+
+def random_transforms(count, generator):
+    draw = torch.randn(count, 4, generator=generator, dtype=torch.float64)
+    return torch.cat([0.15 * draw[:, :2], (0.35 * draw[:, 2:3]).exp(), 0.02 * draw[:, 3:]], dim=1)
+
+
+def changed(depths, change):
+    """Replace each depth by ``change(x, y, depth, facet)``."""
+    buckets = []
+    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+        x, y, _ = templates.points_patch.unbind(dim=-1)
+        buckets.append(relief.replace(depth=change(x, y, relief.depth, templates.facet)))
+    return depths.replace(buckets=tuple(buckets))
+
+
+def spoiled(depths, transforms):
+    def change(x, y, depth, facet):
+        hx, hy, hz, h0 = transforms[facet][:, :, None, None].unbind(dim=1)
+        return hx * x + hy * y + hz * depth + h0
+
+    return changed(depths, change)
+
+
+def waves(depths, amplitude, generator):
+    """Add waves of its own, a quarter of an edge long, to every patch."""
+
+    def change(x, y, depth, facet):
+        for _ in range(6):
+            fx, fy, start = torch.randn(3, len(x), 1, 1, generator=generator, dtype=torch.float64)
+            depth = depth + amplitude / 3**0.5 * torch.cos(
+                fx / 0.08 * x + fy / 0.08 * y + 9 * start
+            )
+        return depth
+
+    return changed(depths, change)
+
+
+def by_facet(depths):
+    facets = torch.cat([templates.facet for templates in depths.patches.buckets])
+    return torch.cat([relief.transform for relief in depths.buckets])[torch.argsort(facets)]
+
+
+@pytest.fixture
+def sphere(facets_over, reliefs, sphere_relief):
+    return reliefs(facets_over(cap), sphere_relief(CENTER, RADIUS))
+
+
+def test_the_preset_paper_is_the_published_system():
+    align = load_config("paper").align
+    assert align.offset is False
+    assert align.curvature is True
+    assert align.outlier == float("inf")
+    assert align.points == 0
+
+
+def test_three_numbers_a_patch_solve_the_dense_kronecker_equations(generator):
+    """vec(N h^T S) = (S^T kron N) h, stacked for all seams and solved by least squares."""
+
+    def random(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    facets = torch.tensor([[0, 1], [2, 1], [0, 2], [3, 2]])
+    normals = torch.nn.functional.normalize(random(4, 2, 3), dim=-1)
+    samples, feet = random(4, 2, 5, 4), random(4, 2, 5, 3)
+    weight, k = random(4, 5).abs(), random(4).abs()
+    corners, corner_weight = random(4, 3, 4), random(4, 3).abs()
+    prior = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    pulls = Pulls(
+        facets=facets,
+        normals=normals,
+        samples=samples,
+        gap=feet[:, 0] - feet[:, 1],
+        weight=weight,
+        curvature=torch.zeros(4, 2, dtype=torch.float64),
+        corners=corners,
+        corner_weight=corner_weight,
+        prior_weight=torch.cat([prior, prior.new_tensor([torch.inf])]),
+    )
+    start = prior.new_tensor([0, 0, 1, 0]).expand(4, 4)
+    found = solve_transforms(pulls, start, k, torch.zeros(4, 2, dtype=torch.float64))
+
+    rows, right = [], []
+    for seam, (first, second) in enumerate(facets.tolist()):
+        block = torch.zeros(15, 12, dtype=torch.float64)
+        for side, (patch, sign) in enumerate(((first, 1), (second, -1))):
+            normal = normals[seam, side, :, None]
+            kronecker = [torch.kron(s[None, :3], normal) for s in samples[seam, side]]
+            block[:, 3 * patch : 3 * patch + 3] += sign * torch.cat(kronecker)
+        root = (k[seam] * weight[seam]).sqrt().repeat_interleave(3)
+        rows.append(root[:, None] * block)
+        right.append(root * (feet[seam, 1] - feet[seam, 0]).flatten())
+    for patch in range(4):
+        held = torch.zeros(3, 12, dtype=torch.float64)
+        held[:, 3 * patch : 3 * patch + 3] = (
+            corner_weight[patch].sqrt()[:, None] * corners[patch, :, :3]
+        )
+        rows += [
+            held,
+            torch.eye(12, dtype=torch.float64)[3 * patch : 3 * patch + 3] * prior.sqrt()[:, None],
+        ]
+        right += [torch.zeros(3).double(), prior.sqrt() * prior.new_tensor([0, 0, 1])]
+    dense = torch.linalg.lstsq(torch.cat(rows), torch.cat(right)[:, None]).solution
+    assert_close(found[:, :3], dense.reshape(4, 3), atol=1e-10, rtol=1e-9)
+    assert (found[:, 3] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("curvature", "noise", "least"),
+    [
+        (True, 0.0, 0.995),
+        (True, 0.002, 0.97),
+        (True, 0.005, 0.9),
+        (False, 0.0, 0.995),
+        (False, 0.002, 0.94),
+        (False, 0.005, 0.7),  # without k noise is made less by making everything less
+    ],
+)
+def test_scales_do_not_shrink_after_random_transforms_and_noise(
+    sphere, generator, curvature, noise, least
+):
+    """Noise is up to a quarter of the relief's own root mean square."""
+    put_on = random_transforms(sphere.patches.num_patches, generator)
+    bad = waves(spoiled(sphere, put_on), noise, generator)
+    found = Align(AlignConfig(prior=1e-6, curvature=curvature, rounds=4))(bad)
+    scales = by_facet(found)[:, 2] * put_on[:, 2]
+    assert scales.median() > least
+    assert scales.median() < 1.05
+    assert scales.min() > 0.3
+
+
+@pytest.mark.parametrize("curvature", [True, False])
+def test_flattening_costs_nothing_on_coplanar_facets_and_is_not_chosen(
+    facets_over, reliefs, generator, curvature
+):
+    """All seams agree at h = 0 too: nothing but the gauge tells the two apart."""
+
+    def bumps(points, patch_from_world):
+        world = points - patch_from_world[:, None, None, :3, 3]
+        world = world @ patch_from_world[:, None, :3, :3]
+        return 0.03 * torch.sin(5 * world[..., 0]) * torch.cos(4 * world[..., 1])
+
+    flat = reliefs(facets_over(lambda x, y: 0 * x), bumps)
+    put_on = random_transforms(flat.patches.num_patches, generator)
+    config = AlignConfig(prior=1e-5, anchor=0.0, curvature=curvature, rounds=4)
+    found = Align(config)(spoiled(flat, put_on))
+    scales = by_facet(found)[:, 2] * put_on[:, 2]
+    assert scales.std() < 0.05 * scales.mean()  # one common scale, which nothing tells
+    assert scales.mean() > 0.5
+
+
+@pytest.fixture
+def disc(facets_over, reliefs, generator):
+    """Bumps, and in front of them a disc whose step every patch has as high as it likes.
+
+    So is relief across a depth edge: integration does not know how high the step is.
+    """
+    flat = reliefs(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
+    mesh = flat.patches.coarse.mesh
+    middle = mesh.vertices_world[mesh.faces].mean(dim=1)
+    steps = 0.2 * torch.rand(len(middle), generator=generator, dtype=torch.float64)
+
+    def world(x, y, facet):
+        return x + middle[facet, 0, None, None], y + middle[facet, 1, None, None]
+
+    def in_front(x, y, facet):
+        x, y = world(x, y, facet)
+        return (x - 0.3) ** 2 + (y - 0.2) ** 2 < 0.25**2
+
+    def change(x, y, depth, facet):
+        along, down = world(x, y, facet)
+        bumps = 0.03 * torch.sin(5 * along + 1) * torch.cos(4 * down)
+        return bumps - steps[facet, None, None] * in_front(x, y, facet)
+
+    behind = []
+    for templates in flat.patches.buckets:
+        x, y, _ = templates.points_patch.unbind(dim=-1)
+        behind.append(~in_front(x, y, templates.facet))
+    return changed(flat, change), behind
+
+
+def test_what_lies_beside_a_depth_edge_is_not_pulled_by_it(disc):
+    depths, behind = disc
+
+    share = torch.cat([where.flatten(1).double().mean(dim=1) for where in behind])
+    facets = torch.cat([templates.facet for templates in depths.patches.buckets])
+    untouched = facets[share == 1]
+    assert len(untouched) > 8
+
+    def moved(outlier):
+        """How unlike each other patches move that see nothing of the disc themselves.
+
+        Their common tilt and shift are the gauge's, for nothing is anchored here.
+        """
+        found = Align(AlignConfig(anchor=0.0, outlier=outlier))(depths)
+        return float(by_facet(found)[untouched].std(dim=0).norm())
+
+    plain, robust = moved(1e9), moved(5.0)
+    assert plain > 0.03  # the edge does matter
+    assert robust < 0.4 * plain  # measured 0.25
+    assert moved(2.0) < robust

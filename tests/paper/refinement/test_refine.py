@@ -1,0 +1,196 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.fusion.union import ray_directions, unite, vertex_spacing
+from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.surfaces import boundary_vertices
+from pimper_torch.paper.refinement.refine import Refine, RefineConfig
+
+SPACING = 0.02
+
+
+def plane(x, y):
+    return 0.3 * x - 0.2 * y
+
+
+def changed(depths, change):
+    """Replace the relief of every bucket by ``change(templates, relief)``."""
+    buckets = tuple(
+        relief.replace(**change(templates, relief))
+        for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True)
+    )
+    return depths.replace(buckets=buckets)
+
+
+def shifted(depths, facets, by):
+    """Move some patches along their z."""
+
+    def change(templates, relief):
+        chosen = torch.isin(templates.facet, torch.tensor(facets))
+        return {"depth": relief.depth + by * chosen[:, None, None]}
+
+    return changed(depths, change)
+
+
+def united(depths, outlier_samples=4.0):
+    mesh = depths.patches.coarse.mesh
+    lattice = subdivide(mesh.vertices_world, mesh.faces, vertex_spacing(depths.patches, 1.0))
+    directions = ray_directions(lattice, depths.patches.coarse)
+    union = unite(depths, lattice, directions, outlier_samples)
+    return lattice, union, lattice.points + union.heights[:, None] * directions
+
+
+def off_sphere(points):
+    centre = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return (points - centre).norm(dim=-1) - 1
+
+
+def test_exact_relief_on_a_cap_gives_the_sphere_back(cap):
+    lattice, union, points = united(cap)
+    assert union.supported.all()
+    flat = off_sphere(lattice.points).abs().mean()
+    # Bilinear cells sag by spacing^2 / 4 = 1e-4.
+    assert off_sphere(points).abs().max() < 1.5e-4
+    for radius, factor in ((1.0, 12), (2.0, 4)):  # smoothing flattens by about r^2 / 2 cells
+        surface = Refine(RefineConfig(smoothing_radius_samples=radius))(cap)
+        assert off_sphere(surface.vertices_world).abs().mean() < flat / factor
+
+
+def test_the_rim_of_a_cap_moves_less_than_a_sample(cap):
+    _, _, points = united(cap)
+    surface = Refine()(cap)
+    rim = boundary_vertices(surface.faces, len(points))
+    assert (surface.vertices_world - points)[rim].norm(dim=-1).max() < 0.3 * SPACING
+    free = Refine(RefineConfig(hold_planes=False))(cap).vertices_world
+    assert (free - points)[rim].norm(dim=-1).max() > SPACING
+
+
+def test_normals_albedo_and_confidence_come_from_the_patches(cap):
+    surface = Refine(RefineConfig(smoothing_radius_samples=1.0))(cap)
+    centre = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    radial = torch.nn.functional.normalize(surface.vertices_world - centre, dim=-1)
+    assert (surface.normals_world * radial).sum(-1).min() > 1 - 1e-5
+    assert_close(surface.normals_world.norm(dim=-1), torch.ones(len(radial)).double())
+    albedo = 0.5 + 0.25 * surface.vertices_world
+    assert_close(surface.albedo, albedo, atol=0.25 * SPACING, rtol=0)
+    assert_close(surface.confidence, torch.ones(len(radial)).double())
+    assert surface.convergence.converged.all()
+
+
+def test_a_tilted_plane_stays_a_plane(builder):
+    depths = builder.patches(builder.coarse(plane), plane, spacing=0.03)
+    vertices = Refine()(depths).vertices_world
+    assert (vertices[:, 2] - plane(vertices[:, 0], vertices[:, 1])).abs().max() < 1e-9
+
+
+def test_the_union_is_continuous_across_a_step_between_patches(builder):
+    depths = builder.patches(builder.coarse(plane, rings=1), plane)
+    step = 4 * SPACING
+    lattice, _, points = united(shifted(depths, [0, 2], step))
+    edges = lattice.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    heights = points[:, 2] - plane(points[:, 0], points[:, 1])
+    jump = (heights[edges[:, 0]] - heights[edges[:, 1]]).abs()
+    assert heights.abs().max() > 0.9 * step
+    # The blend spans nine samples with smoothstep's steepest slope, 1.5; and a diagonal.
+    assert jump.max() < 0.3 * step
+
+
+def test_steps_at_seams_are_smoothed_and_the_middle_of_facets_is_kept(builder):
+    depths = builder.patches(builder.coarse(plane, rings=1), plane, overlap=2.0)
+    step = 3 * SPACING
+    stepped = shifted(depths, [0, 2, 4], step)
+    lattice, _, points = united(stepped)
+    surface = Refine(RefineConfig(smoothing_radius_samples=2.0))(stepped)
+    edges = torch.unique(
+        lattice.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values, dim=0
+    )
+
+    def steepest(vertices):
+        height = vertices[:, 2] - plane(vertices[:, 0], vertices[:, 1])
+        return (height[edges[:, 0]] - height[edges[:, 1]]).abs().max()
+
+    assert steepest(surface.vertices_world) < 0.4 * steepest(points)
+    moved = (surface.vertices_world - points).norm(dim=-1)
+    middle = (lattice.barycentric - 1 / 3).abs().amax(dim=1) < 0.05
+    seam = (lattice.barycentric.amin(dim=1) < 0.02) & (lattice.barycentric.amax(dim=1) < 0.8)
+    assert moved[middle].max() < 0.2 * moved[seam].max()
+
+
+def test_one_wild_patch_is_outvoted_where_three_meet(builder):
+    depths = builder.patches(builder.coarse(plane, rings=1), plane)
+    wild = shifted(depths, [1], 30 * SPACING)
+    lattice, _, points = united(wild)
+    _, _, plain = united(wild, outlier_samples=torch.inf)
+    centre = lattice.points[:, :2].norm(dim=1) < 1e-9
+    assert centre.sum() == 1
+    off = points[centre, 2].abs()
+    assert off.max() < 2 * SPACING
+    assert plain[centre, 2].abs().max() > 4 * SPACING
+
+
+def test_a_hole_in_the_relief_is_filled_and_marked(cap):
+    def change(templates, relief):
+        world = templates.points_patch @ templates.patch_from_world[:, None, :3, :3]
+        offset = templates.patch_from_world[:, :3, :3].mT @ templates.patch_from_world[:, :3, 3:]
+        x, y = (world - offset.mT[:, None])[..., :2].unbind(-1)
+        away = (x - 0.15).square() + (y - 0.1).square() < 0.08**2
+        return {
+            "valid": relief.valid & ~away,
+            "depth": torch.where(away, torch.nan, relief.depth),
+        }
+
+    surface = Refine(RefineConfig(smoothing_radius_samples=1.0))(changed(cap, change))
+    empty = surface.confidence == 0
+    assert 20 < empty.sum() < 120
+    for part in (surface.vertices_world, surface.normals_world, surface.albedo):
+        assert part.isfinite().all()
+    # A soap film over a hole of radius 0.1, a sample wider than ours, sags by 0.1^2 / 2.
+    assert off_sphere(surface.vertices_world)[empty].abs().max() < 0.008
+    assert_close(surface.normals_world.norm(dim=-1), torch.ones(len(empty)).double())
+
+
+def test_gradients_reach_the_depth(builder):
+    depths = builder.patches(builder.coarse(plane, rings=1), plane, spacing=0.1, overlap=3.0)
+    generator = torch.Generator().manual_seed(71)
+    sizes = [bucket.depth.shape for bucket in depths.buckets]
+    noise = [0.02 * torch.randn(size, generator=generator, dtype=torch.float64) for size in sizes]
+
+    def places(*relief):
+        buckets = tuple(
+            bucket.replace(depth=bucket.depth + extra)
+            for bucket, extra in zip(depths.buckets, relief, strict=True)
+        )
+        return Refine()(depths.replace(buckets=buckets)).vertices_world
+
+    probe = torch.randn(places(*noise).shape, generator=generator, dtype=torch.float64)
+    inputs = [one.clone().requires_grad_() for one in noise]
+    gradients = torch.autograd.grad((places(*inputs) * probe).sum(), inputs)
+    moves = [torch.randn(size, generator=generator, dtype=torch.float64) for size in sizes]
+    analytic = sum((g * m).sum() for g, m in zip(gradients, moves, strict=True))
+    assert analytic.abs() > 1e-3
+    small = 1e-6
+    up = places(*(one + small * move for one, move in zip(noise, moves, strict=True)))
+    down = places(*(one - small * move for one, move in zip(noise, moves, strict=True)))
+    assert_close(analytic, ((up - down) * probe).sum() / (2 * small), rtol=1e-6, atol=1e-8)
+
+
+def test_relief_that_is_valid_nowhere_leaves_the_facets_without_confidence(cap):
+    nowhere = changed(cap, lambda _, relief: {"valid": torch.zeros_like(relief.valid)})
+    surface = Refine()(nowhere)
+    mesh = nowhere.patches.coarse.mesh
+    flat = subdivide(mesh.vertices_world, mesh.faces, vertex_spacing(nowhere.patches, 1.0))
+    assert surface.vertices_world.shape == flat.points.shape
+    away = (surface.vertices_world - flat.points).norm(dim=1)
+    assert away.max() < 3 * SPACING  # seams are smoothed, nothing else
+    assert away.median() < 0.2 * SPACING
+    assert (surface.confidence == 0).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["samples_per_vertex", "smoothing_radius_samples", "outlier_samples"]
+)
+def test_settings_that_mean_nothing_are_refused(name):
+    with pytest.raises(ConfigError, match=name):
+        RefineConfig(**{name: 0.0})

@@ -1,0 +1,124 @@
+"""Which way G works, against brute force."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.paper.refinement.energy import (
+    assemble,
+    seam_weight,
+)
+
+SPACING = 0.05
+
+
+@pytest.fixture(scope="module")
+def square():
+    """Two flat facets with a seam on the diagonal, 20 spacings a side."""
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    return subdivide(vertices, facets, torch.full((2,), SPACING).double())
+
+
+def everywhere(lattice):
+    return torch.ones(len(lattice.points), dtype=torch.bool)
+
+
+def published(lattice, union, radius):
+    fidelity = torch.full((2,), (radius * SPACING) ** -2, dtype=torch.float64)
+    parts = assemble(lattice, fidelity, everywhere(lattice))
+    factor = SparseCholesky(parts.rows, parts.cols, parts.values, size=len(union))
+    return factor.solve(parts.mass[:, None] * union)
+
+
+def published_energy(lattice, union, places, radius):
+    """The functional as printed, face by face, without a line of the package's assembly."""
+    a, b, c = lattice.barycentric.unbind(dim=1)
+    weights = ((a - b).abs() + (a - c).abs() + (c - b).abs()).sqrt() / 2
+    corners, values = lattice.points[lattice.faces], places[lattice.faces]
+    frame = (corners[:, 1:] - corners[:, :1]).mT
+    slope = (values[:, 1:] - values[:, :1]).mT @ torch.linalg.pinv(frame)
+    area = torch.linalg.cross(*frame.unbind(dim=-1)).norm(dim=-1) / 2
+    apart = (1 - weights) * (union - places).square().sum(dim=-1) / (radius * SPACING) ** 2
+    smooth = weights[lattice.faces].mean(dim=1) * slope.square().sum(dim=(1, 2))
+    return (area * (apart[lattice.faces].mean(dim=1) + smooth)).sum()
+
+
+def test_descent_on_the_printed_functional_arrives_at_the_solve(square):
+    generator = torch.Generator().manual_seed(91)
+    noise = torch.randn(square.points.shape, generator=generator, dtype=torch.float64)
+    union = square.points + 0.05 * noise
+    places = union.clone().requires_grad_()
+    optimiser = torch.optim.LBFGS(
+        [places],
+        max_iter=500,
+        history_size=50,
+        tolerance_grad=1e-10,
+        tolerance_change=1e-14,
+        line_search_fn="strong_wolfe",
+    )
+
+    def closure():
+        optimiser.zero_grad()
+        energy = published_energy(square, union, places, 2.0)
+        energy.backward()
+        return energy
+
+    optimiser.step(closure)
+    assert (places.detach() - union).abs().max() > 0.02  # it moved
+    assert_close(places.detach(), published(square, union, 2.0), atol=1e-5, rtol=0)
+
+
+def test_the_middle_of_a_facet_is_kept_and_seams_are_smoothed_the_more_the_larger_g(square):
+    """White noise keeps what G leaves of it: all at G = 0, least at the vertices."""
+    generator = torch.Generator().manual_seed(92)
+    kept = torch.zeros(len(square.points), dtype=torch.float64)
+    flat = torch.zeros_like(square.points)
+    for _ in range(60):
+        noise = torch.randn(len(kept), generator=generator, dtype=torch.float64)
+        union = flat.clone()
+        union[:, 2] = noise
+        kept += published(square, union, 0.5)[:, 2] * noise
+    kept = kept / 60  # the share of its own noise a vertex keeps
+    inside = (square.barycentric > 0.02).all(dim=1)
+    g = seam_weight(square.barycentric)
+    middle = (square.barycentric - 1 / 3).abs().amax(dim=1) < 0.04
+    assert middle.any()
+    assert kept[middle].mean() > 0.7  # a vertex's neighbours lie where G is 0.1 already
+    steps = [(0.0, 0.25), (0.25, 0.35), (0.35, 0.45), (0.45, 0.6)]
+    shares = [float(kept[inside & (g >= low) & (g < high)].mean()) for low, high in steps]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > 1.7 * shares[-1]
+    edge = (square.barycentric.amin(dim=1) < 1e-9) & (g < 0.52)
+    corner = square.barycentric.amax(dim=1) > 1 - 1e-9
+    assert float(kept[corner].mean()) < float(kept[edge].mean()) < 0.45
+
+
+def test_smoothing_at_a_seam_has_the_width_that_the_docstring_gives():
+    """Where G is 1/2 throughout, a wave keeps 1 / (1 + (2 pi r / w)^2) of its height."""
+    columns = torch.arange(160, dtype=torch.float64) * SPACING
+    x, y = torch.meshgrid(columns, columns[:5], indexing="ij")
+    points = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3)
+    index = torch.arange(len(points)).reshape(160, 5)
+    low = torch.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:]], dim=-1).reshape(-1, 3)
+    up = torch.stack([index[:-1, :-1], index[1:, 1:], index[:-1, 1:]], dim=-1).reshape(-1, 3)
+    faces = torch.cat([low, up])
+    vertices = torch.tensor([[0.0, 0, 0], [8, 0, 0], [0, 8, 0]], dtype=torch.float64)
+    template = subdivide(vertices, torch.tensor([[0, 1, 2]]), torch.full((1,), 4.0).double())
+    lattice = template.replace(
+        points=points,
+        facet=torch.zeros(len(points), dtype=torch.long),
+        barycentric=torch.tensor([0.5, 0.5, 0.0]).double().expand(len(points), 3),
+        faces=faces,
+        face_facet=torch.zeros(len(faces), dtype=torch.long),
+    )
+    radius, wave = 3.0, 32
+    union = torch.zeros_like(points)
+    union[:, 2] = torch.cos(2 * torch.pi * x / (wave * SPACING)).reshape(-1)
+    found = published(lattice, union, radius)[:, 2].reshape(160, 5)[32:128]
+    share = (found * union[:, 2].reshape(160, 5)[32:128]).sum()
+    share = share / union[:, 2].reshape(160, 5)[32:128].square().sum()
+    wanted = 1 / (1 + (2 * torch.pi * radius / wave) ** 2)
+    assert_close(share, torch.tensor(wanted).double(), atol=0.01, rtol=0)  # finite elements

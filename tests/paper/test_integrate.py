@@ -1,0 +1,136 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.reliefs import sample_raster
+from pimper_torch.paper.integrate import Integrate, IntegrateConfig, integrate_normals
+
+
+def bumps(x, y):
+    return 0.2 * x * x + 0.1 * x * y + 0.02 * torch.sin(6 * x) * torch.cos(5 * y)
+
+
+def slopes_of_bumps(x, y):
+    p = 0.4 * x + 0.1 * y + 0.12 * torch.cos(6 * x) * torch.cos(5 * y)
+    q = 0.1 * x - 0.1 * torch.sin(6 * x) * torch.sin(5 * y)
+    return p, q
+
+
+def worst_misfit(depths, keep=None):
+    """Largest distance to the bumps, each patch shifted along z to fit."""
+    worst = 0.0
+    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+        x, y, _ = templates.points_patch.unbind(dim=-1)
+        for patch in range(len(x)):
+            chosen = relief.valid[patch] if keep is None else keep(x[patch], y[patch])
+            misfit = (relief.depth[patch] - bumps(x[patch], y[patch]))[chosen]
+            worst = max(worst, float((misfit - misfit.mean()).abs().max()))
+    return worst
+
+
+def test_closed_form_surfaces_return_with_an_error_that_falls_with_the_square_of_the_spacing(
+    two_facets, photographed
+):
+    coarse, fine = (
+        worst_misfit(Integrate()(photographed(two_facets(density), slopes_of_bumps)))
+        for density in (1.0, 2.0)
+    )
+    assert coarse < 2e-3  # of a relief 0.2 high
+    assert fine < 0.4 * coarse
+
+
+def test_refinement_keeps_the_filled_outside_from_bending_the_inside(two_facets, photographed):
+    seen = photographed(two_facets(2.0), slopes_of_bumps)
+    published = worst_misfit(Integrate(IntegrateConfig(iterations=0))(seen))
+    assert worst_misfit(Integrate()(seen)) < 0.1 * published
+
+
+@pytest.mark.parametrize("iterations", [0, 8])
+def test_a_tilted_plane_stays_a_plane_to_float32_rounding(two_facets, photographed, iterations):
+    patches = two_facets(2.0, dtype=torch.float32)
+
+    def slopes(x, y):
+        return torch.full_like(x, 0.8), torch.full_like(x, -0.3)
+
+    depths = Integrate(IntegrateConfig(iterations=iterations))(photographed(patches, slopes))
+    for templates, relief in zip(patches.buckets, depths.buckets, strict=True):
+        x, y, _ = templates.points_patch.unbind(dim=-1)
+        plane = 0.8 * x - 0.3 * y
+        rest = relief.depth - plane
+        rest = rest - rest.mean(dim=(1, 2), keepdim=True)
+        assert rest.abs().max() < 4 * torch.finfo(torch.float32).eps * plane.abs().max()
+
+
+def test_holes_are_bridged_in_keeping_with_their_rim(two_facets, photographed):
+    patches = two_facets(2.0)
+
+    def outside_hole(x, y):
+        return (x**2 + y**2) > 0.1**2
+
+    depths = Integrate()(photographed(patches, slopes_of_bumps, keep=outside_hole))
+    assert all(
+        (d.valid == t.inside).all() for d, t in zip(depths.buckets, patches.buckets, strict=True)
+    )
+    # Over a hole 0.2 wide, the bumps leave a plane by 0.01; the bridge does better.
+    assert worst_misfit(depths, keep=lambda x, y: ~outside_hole(x, y)) < 0.005
+
+
+def test_a_patch_without_normals_stays_its_facet_and_says_so(two_facets, photographed):
+    patches = two_facets(1.0)
+    seen = photographed(patches, slopes_of_bumps, keep=lambda x, y: torch.zeros_like(x) > 0)
+    for relief in Integrate()(seen).buckets:
+        assert_close(relief.depth, torch.zeros_like(relief.depth))
+        assert not relief.valid.any()
+
+
+def test_the_relief_passes_on_average_through_the_corners(two_facets, photographed):
+    depths = Integrate()(photographed(two_facets(1.0), slopes_of_bumps))
+    mesh = depths.patches.coarse.mesh
+    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+        corners = transform(
+            templates.patch_from_world, mesh.vertices_world[mesh.faces[templates.facet]]
+        )
+        found = sample_raster(
+            relief.depth[:, None], corners[..., :2], templates.origin, templates.spacing
+        )[:, 0]
+        assert found.abs().max() > 1e-3  # so that only the mean can be zero
+        assert_close(found.mean(dim=1), torch.zeros_like(found[:, 0]))
+        identity = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
+        assert_close(relief.transform, identity.expand(len(found), 4))
+
+
+def test_uncertain_normals_yield_to_certain_ones(generator):
+    normals = torch.zeros(1, 20, 20, 3, dtype=torch.float64)
+    normals[..., 2] = -1
+    normals[:, 8:12, 8:12] = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
+    valid = torch.ones(1, 20, 20, dtype=torch.bool)
+    confidence = torch.ones(1, 20, 20, dtype=torch.float64)
+    spacing = torch.ones(1, dtype=torch.float64)
+    trusted = integrate_normals(normals, valid, confidence, spacing, 4.0, 30)
+    confidence[:, 8:12, 8:12] = 0
+    doubted = integrate_normals(normals, valid, confidence, spacing, 4.0, 30)
+    assert doubted.abs().max() < 0.4 * trusted.abs().max()
+
+
+def test_gradients_reach_normals_and_confidence(generator):
+    slopes = 0.3 * torch.randn(1, 3, 4, 2, generator=generator, dtype=torch.float64)
+    normals = torch.cat([slopes, -torch.ones_like(slopes[..., :1])], dim=-1)
+    confidence = 0.2 + 0.7 * torch.rand(1, 3, 4, generator=generator, dtype=torch.float64)
+    valid = torch.ones(1, 3, 4, dtype=torch.bool)
+    valid[0, 1, 2] = False
+    spacing = torch.tensor([0.5], dtype=torch.float64)
+
+    def integrate(normals, confidence):
+        return integrate_normals(normals, valid, confidence, spacing, 10.0, 15)
+
+    inputs = normals.requires_grad_(), confidence.requires_grad_()
+    # The solve stops at 1e-7, and finite differences magnify that.
+    assert torch.autograd.gradcheck(integrate, inputs, atol=1e-4, eps=1e-4)
+
+
+@pytest.mark.parametrize("setting", [{"max_tilt_deg": 90.0}, {"iterations": -1}])
+def test_impossible_settings_are_refused(setting):
+    with pytest.raises(ConfigError, match=next(iter(setting))):
+        IntegrateConfig(**setting)

@@ -1,0 +1,152 @@
+import pytest
+import torch
+from torch.autograd.functional import jvp
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.scenes.one_view import bumps_in_perspective, lamps, photograph, regions
+from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.single_view.photometric_stereo.perspective import (
+    factorize_in_perspective,
+    integrability_equations,
+)
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(1)
+
+
+def error_deg(shading, normals):
+    cross = torch.linalg.cross(shading, normals, dim=0).norm(dim=0)
+    return torch.rad2deg(torch.atan2(cross, (shading * normals).sum(dim=0))).mean()
+
+
+def seen_in_perspective(generator, noise=0.0, widest_deg=30.0, steepest=1.0):
+    normals, mask, intrinsics, _ = bumps_in_perspective(64, generator, steepest=steepest)
+    lights = lamps(12, generator, widest_deg)
+    made = photograph(normals, regions(64, generator), mask, lights, generator, noise)
+    return made, intrinsics
+
+
+def lit(made):
+    values = made.images.sum(dim=1)[:, made.mask]
+    return values > 0.03 * values.max()
+
+
+def test_equations_vanish_on_normals_of_a_surface(generator):
+    # z = exp(f), f = 0.3 x + 0.2 x y - 0.4 y^2 + 0.3 x^3 + 0.2 y^3; see bumps_in_perspective.
+    x, y = torch.rand(2, 40, generator=generator, dtype=torch.float64) - 0.5
+
+    def normal(x, y):
+        fx, fy = 0.3 + 0.2 * y + 0.9 * x * x, 0.2 * x - 0.8 * y + 0.6 * y * y
+        return (1 + x * x) * torch.stack([fx, fy, -1 - x * fx - y * fy])
+
+    one = torch.ones_like(x)
+    _, along_x = jvp(normal, (x, y), (one, 0 * one))
+    _, along_y = jvp(normal, (x, y), (0 * one, one))
+    matrix = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    hidden = [torch.linalg.solve(matrix, v) for v in (normal(x, y), along_x, along_y)]
+    rows = integrability_equations(*hidden, torch.stack([x, y, one]))
+    cofactors = torch.linalg.inv(matrix).mT.flatten()
+    assert_close(rows @ cofactors, 0 * x, atol=1e-12, rtol=0)
+    values = torch.linalg.svdvals(rows)
+    assert values[-1] < 1e-10 < 1e-4 < values[-2]  # and nothing else solves them
+
+
+def test_everything_but_scale_is_found(generator):
+    made, intrinsics = seen_in_perspective(generator)
+    shading, lights = factorize_in_perspective(made.images, made.mask, intrinsics)
+    # What is left are fifth derivatives over squares of seven pixels.
+    assert error_deg(shading, made.normals) < 0.2
+    assert error_deg(lights.mT, made.lights.mT) < 0.2
+    factor = made.lights.square().sum(dim=1).mean().sqrt()
+    assert_close(shading, factor * made.shading, rtol=0.02, atol=0.02)
+    assert_close(lights @ shading, made.images.sum(dim=1)[:, made.mask], atol=1e-10, rtol=0)
+
+
+def test_a_ball_which_has_two_solutions_is_refused(generator):
+    size, focal = 64, 88.0
+    intrinsics = torch.tensor([[focal, 0, 32], [0, focal, 32], [0, 0, 1]]).double()
+    pixels = pixel_centers(size, size, intrinsics)
+    rays = torch.cat([(pixels - 32) / focal, torch.ones(size, size, 1).double()], dim=-1)
+    ball = Sphere(center=(0.0, 0.0, 3.2))
+    depth = ball.intersect(torch.zeros_like(rays), rays)
+    mask = depth < 2.9
+    normals = ball.normals(torch.where(mask, depth, 1)[..., None] * rays)
+    lights = lamps(12, generator, 30.0)
+    made = photograph(normals, regions(size, generator), mask, lights, generator, 0.002)
+    with pytest.raises(InputError, match="second surface"):
+        factorize_in_perspective(made.images, mask, intrinsics, lit(made))
+
+
+@pytest.mark.parametrize("steepest", [1.0, -1.0])
+def test_hollows_are_told_from_hills(generator, steepest):
+    made, intrinsics = seen_in_perspective(generator, steepest=steepest)
+    shading, _ = factorize_in_perspective(made.images, made.mask, intrinsics)
+    assert error_deg(shading, made.normals) < 0.2
+
+
+def test_shadows_are_left_out(generator):
+    made, intrinsics = seen_in_perspective(generator, widest_deg=65.0)
+    seen = lit(made)
+    assert 0.02 < 1 - seen.double().mean() < 0.5
+    shading, lights = factorize_in_perspective(made.images, made.mask, intrinsics, seen)
+    assert error_deg(shading, made.normals) < 0.3
+    dark = made.images.sum(dim=1)[:, made.mask][~seen]
+    assert ((lights @ shading)[~seen] - dark).min() < -0.1  # the product goes below zero there
+
+
+def test_noise_of_half_a_per_cent_is_borne(generator):
+    made, intrinsics = seen_in_perspective(generator, noise=0.005)
+    shading, _ = factorize_in_perspective(made.images, made.mask, intrinsics, radius=4)
+    # A pixel's own noise costs 0.5 degrees; perspective of 40 degrees is a weak cue.
+    assert error_deg(shading, made.normals) < 3
+
+
+def test_oblong_and_skewed_pixels_are_followed(generator):
+    # The same picture seen by another camera: only the meaning of its pixels changes.
+    made, intrinsics = seen_in_perspective(generator)
+    change = torch.tensor([[1.0, 0.2, 3.0], [0.0, 0.7, -5.0], [0.0, 0.0, 1.0]]).double()
+    # Rays K^-1 u of the new camera are change^-1 of the old, normals turn by its transpose.
+    oblong = intrinsics @ change
+    turned = torch.nn.functional.normalize(change.mT @ made.normals, dim=0)
+    assert error_deg(turned, made.normals) > 1
+    shading, _ = factorize_in_perspective(made.images, made.mask, oblong)
+    # Lights turn by the inverse, and images stay the product: the truth for the new camera.
+    assert error_deg(shading, turned) < 0.2
+
+
+def test_dtype_and_pixels_without_enough_views(generator):
+    made, intrinsics = seen_in_perspective(generator)
+    seen = torch.ones(12, made.normals.shape[1], dtype=torch.bool)
+    seen[2:, 100] = False
+    shading, lights = factorize_in_perspective(
+        made.images.float(), made.mask, intrinsics.float(), seen
+    )
+    assert shading.dtype == lights.dtype == torch.float32
+    assert (shading[:, 100] == 0).all()
+    kept = torch.arange(shading.shape[1]) != 100
+    assert error_deg(shading[:, kept].double(), made.normals[:, kept]) < 0.2
+
+
+def test_what_does_not_fit_is_refused(generator):
+    made, intrinsics = seen_in_perspective(generator)
+    images, mask = made.images, made.mask
+    with pytest.raises(InputError, match="2 views"):
+        factorize_in_perspective(images[:2], mask, intrinsics)
+    with pytest.raises(InputError, match="one column a pixel"):
+        factorize_in_perspective(images, mask, intrinsics, lit(made)[:, 1:])
+    with pytest.raises(InputError, match="focal lengths"):
+        factorize_in_perspective(images, mask, -intrinsics)
+    thin = torch.zeros_like(mask)
+    thin[::2] = True
+    with pytest.raises(InputError, match="squares of 7 x 7"):
+        factorize_in_perspective(images, thin, intrinsics)
+    with pytest.raises(InputError, match="rank two"):
+        factorize_in_perspective(images[:1].expand(5, -1, -1, -1), mask, intrinsics)
+    three = torch.zeros(12, int(mask.sum()), dtype=torch.bool)
+    three[:3] = True
+    with pytest.raises(InputError, match="four views"):
+        factorize_in_perspective(images, mask, intrinsics, three)

@@ -1,0 +1,53 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.single_view.photometric_stereo.relief_metric import (
+    metric_row,
+    relief_of_metric,
+    standard_relief,
+)
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(3)
+
+
+def some(generator, sign=1.0):
+    mu, nu, size = torch.randn(3, generator=generator, dtype=torch.float64)
+    return BasRelief(mu=mu, nu=nu, lam=sign * size.exp())
+
+
+def test_the_metric_gives_squared_albedo_and_leads_back_to_the_relief(generator):
+    relief = some(generator)
+    b = torch.randn(3, 30, generator=generator, dtype=torch.float64)
+    M = relief.matrix.mT @ relief.matrix
+    metric = torch.stack([M[0, 0], M[0, 2], M[1, 2], M[2, 2]])
+    assert_close(metric_row(b) @ metric, relief.on_shading(b).square().sum(dim=0))
+    for factor in (1.0, 7.0, -0.2):
+        assert_close(relief_of_metric(factor * metric).matrix, relief.matrix)
+
+
+def test_what_is_no_metric_gives_no_number():
+    for wrong in ([1.0, 2.0, 0.0, 1.0], [1.0, 0.0, 0.0, -1.0], [0.0, 1.0, 1.0, 1.0]):
+        assert relief_of_metric(torch.tensor(wrong)).lam.isnan()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_all_reliefs_of_a_surface_have_one_standard_form(generator, sign):
+    b = torch.randn(3, 80, generator=generator, dtype=torch.float64)
+    moved = some(generator, sign).on_shading(b)
+    form = standard_relief(b).on_shading(b)
+    other = standard_relief(moved).on_shading(moved)
+    flip = torch.tensor([[sign], [sign], [1.0]], dtype=torch.float64)  # lambda below zero mirrors
+    assert_close(other, flip * form)
+    x, y, z = form
+    assert_close(torch.stack([(x * z).sum(), (y * z).sum()]), torch.zeros(2).double())
+    assert_close((x * x + y * y).sum(), (z * z).sum())
+
+
+def test_a_plane_has_no_standard_form():
+    b = torch.tensor([[0.0], [0.0], [-1.0]]) * torch.arange(1, 5)
+    assert standard_relief(b).lam.isnan()

@@ -1,0 +1,201 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.single_view.photometric_stereo import Finding, photometric_stereo
+from pimper_torch.single_view.photometric_stereo.methods import METHODS
+
+COLOURS = torch.tensor([0.9, 0.5, 0.2], dtype=torch.float64)
+
+
+def photographed(scene, lights, albedo, colours=COLOURS):
+    """Images in colour, and the truth about shadows."""
+    shade = (lights @ scene.columns).clamp_min(0)
+    return (colours[:, None, None] * scene.raster(albedo * shade)), shade > 0
+
+
+@pytest.mark.parametrize(
+    ("method", "resolve"),
+    [
+        ("calibrated", None),
+        ("hayakawa", None),
+        ("integrability", "equal_strength"),
+    ],
+)
+def test_lamps_of_one_strength_are_enough(bumpy, lamps, patchwork, angles_deg, method, resolve):
+    lights = 1.3 * lamps(16, spread=0.5)
+    images, lit = photographed(bumpy, lights, patchwork(bumpy))
+    known = lights if method == "calibrated" else None
+    found = photometric_stereo(images, bumpy.mask, method=method, resolve=resolve, lights=known)
+    some = found.valid[bumpy.mask]
+    assert some.double().mean() > 0.97
+    off = angles_deg(found.normals[bumpy.mask].mT, bumpy.columns)[some]
+    # Without the lights, integrability is as exact as cells of 1/56 of the surface are.
+    assert off.mean() < (0.01 if method == "calibrated" else 0.7)
+    assert angles_deg(found.lights.mT, lights.mT).mean() < 0.7
+    scale = 1.0 if method == "calibrated" else 1.3
+    albedo = COLOURS * patchwork(bumpy)[:, None]
+    ratio = found.albedo[bumpy.mask][some] / (scale * albedo[some])
+    assert_close(ratio.median(), torch.ones((), dtype=torch.float64), atol=0.02, rtol=0)
+    assert (found.lit[:, bumpy.mask] == lit)[:, some].double().mean() > 0.99
+
+
+@pytest.mark.parametrize(
+    ("method", "resolve"), [("hayakawa", "equal_albedo"), ("integrability", "equal_albedo")]
+)
+def test_pixels_of_one_albedo_are_enough(bumpy, lamps, generator, angles_deg, method, resolve):
+    lights = lamps(12, spread=0.5) * (
+        0.5 + torch.rand(12, 1, generator=generator, dtype=torch.float64)
+    )
+    images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
+    found = photometric_stereo(images, bumpy.mask, method=method, resolve=resolve)
+    assert angles_deg(found.normals[bumpy.mask].mT, bumpy.columns).mean() < 0.7
+
+
+def test_black_shadows_are_left_out_by_visibility_subspaces(bumpy, lamps, patchwork, angles_deg):
+    lights = 1.3 * lamps(16, spread=0.5)
+    images, lit = photographed(bumpy, lights, patchwork(bumpy))
+    cast = torch.zeros_like(images[:, :1], dtype=torch.bool)
+    cast[2:6, :, 10:26, 8:30] = True  # an object that is not seen throws it
+    images = torch.where(cast, 0, images)
+    runs = {
+        use: photometric_stereo(
+            images, bumpy.mask, method="calibrated", lights=lights, robust=False, subspaces=use
+        )
+        for use in (False, True)
+    }
+    off = {
+        use: angles_deg(found.normals[bumpy.mask].mT, bumpy.columns)[found.valid[bumpy.mask]].mean()
+        for use, found in runs.items()
+    }
+    assert off[True] < 0.05
+    assert off[False] > 20 * off[True]
+    dark = ~lit | cast[:, 0, bumpy.mask]
+    assert runs[True].lit[:, bumpy.mask][dark].double().mean() < 0.01
+
+
+def test_without_knowledge_a_convention_is_taken_and_named(ball, lamps, angles_deg):
+    lights = lamps(12, spread=0.5)
+    images, _ = photographed(ball, lights, torch.ones(ball.columns.shape[1]).double())
+    found = photometric_stereo(images, ball.mask, method="integrability", resolve="rounded")
+    assert "bas-relief" in found.free
+    assert angles_deg(found.normals[ball.mask].mT, ball.columns).mean() < 2.5
+    assert found.applied.lam.isfinite()
+
+
+@pytest.mark.parametrize("method", ["four_harmonics", "nine_harmonics"])
+def test_soft_light_is_explained_by_harmonics(bumpy, patchwork, generator, angles_deg, method):
+    lights = torch.rand(15, 4, generator=generator, dtype=torch.float64) - 0.5
+    lights[:, 0] = 1.2
+    lights[:, 3] -= 0.4
+    shade = lights[:, :1] + lights[:, 1:] @ bumpy.columns
+    images = COLOURS[:, None, None] * bumpy.raster(patchwork(bumpy) * shade)
+    found = photometric_stereo(images, bumpy.mask, method=method)
+    assert found.lights.shape == (15, 4 if method == "four_harmonics" else 9)
+    assert angles_deg(found.normals[bumpy.mask].mT, bumpy.columns).mean() < 1
+    ratio = found.albedo[bumpy.mask] / (COLOURS * patchwork(bumpy)[:, None])
+    assert ratio.std() < 0.05 * ratio.mean()
+
+
+def test_what_is_missing_may_be_no_number_or_without_weight(bumpy, lamps, generator, angles_deg):
+    lights = lamps(14, spread=0.3)
+    images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
+    gone = torch.rand(14, 56, 56, generator=generator) < 0.2
+    weight = torch.where(torch.rand(14, 56, 56, generator=generator) < 0.2, 0.0, 1.0).double()
+    images = torch.where((weight == 0)[:, None], 1e3, images)
+    images[:, 1] = torch.where(gone, torch.nan, images[:, 1])  # one colour is enough
+    found = photometric_stereo(
+        images, bumpy.mask, method="calibrated", lights=lights, weight=weight
+    )
+    assert angles_deg(found.normals[found.valid].mT, bumpy.normals[found.valid].mT).max() < 0.1
+    assert not found.lit[gone | (weight == 0)].any()
+    blind = photometric_stereo(images, bumpy.mask, method="integrability", weight=weight)
+    assert blind.valid[bumpy.mask].double().mean() > 0.9
+
+
+def test_a_view_without_samples_is_told_and_has_no_light(bumpy, lamps):
+    lights = lamps(9, spread=0.3)
+    images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
+    images[4] = torch.nan
+    for method in ("calibrated", "hayakawa"):
+        known = lights if method == "calibrated" else None
+        found = photometric_stereo(images, bumpy.mask, method=method, lights=known)
+        assert found.unused_views == (4,)
+        assert (found.lights[4] == 0).all()
+        assert (found.lights[5] != 0).any()
+        assert not found.lit[4].any()
+
+
+def test_pixels_that_cannot_be_determined_say_why():
+    flat = [[0.0, 0, -1], [0.6, 0, -0.8], [-0.6, 0, -0.8]]
+    lights = torch.tensor([*flat, [0.0, 0.6, -0.8]], dtype=torch.float64)
+    normals = torch.tensor([[0.0, 0, -1]] * 5 + [[0.3, 0, 0.954]], dtype=torch.float64)
+    # The last one is a fake: its radiance is what a normal from behind would have, unclamped.
+    images = (lights @ normals.mT)[:, None, None]
+    images[:, :, :, 1] = 0
+    weight = torch.ones(4, 1, 6, dtype=torch.float64)
+    weight[1:3, 0, 2] = 0  # two samples
+    weight[3, 0, 3] = 0  # lights in a plane
+    mask = torch.tensor([[True, True, True, True, False, True]])
+    found = photometric_stereo(
+        images, mask, method="calibrated", lights=lights, weight=weight, robust=False
+    )
+    expected = [
+        Finding.FOUND,
+        Finding.BLACK,
+        Finding.TOO_FEW,
+        Finding.FLAT,
+        Finding.OUTSIDE,
+        Finding.AVERTED,
+    ]
+    assert [Finding(one) for one in found.finding[0].tolist()] == expected
+    assert found.valid[0].tolist() == [True, False, False, False, False, False]
+    assert (found.normals[0, 4] == 0).all()
+
+
+def test_results_have_the_dtype_of_the_images(bumpy, lamps):
+    lights = lamps(9)
+    images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
+    found = photometric_stereo(images.float(), bumpy.mask, method="hayakawa")
+    assert found.normals.dtype == found.albedo.dtype == found.lights.dtype == torch.float32
+
+
+def test_impossible_requests_are_refused(bumpy, lamps):
+    lights = lamps(6)
+    images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
+
+    def refuse(match, images=images, mask=bumpy.mask, **settings):
+        with pytest.raises(InputError, match=match):
+            photometric_stereo(images, mask, **{"method": "calibrated", **settings})
+
+    refuse("needed: one of calibrated, hayakawa", method="woodhem")
+    refuse("there are no lights")
+    refuse("finds the lights itself", method="hayakawa", lights=lights)
+    refuse("cannot tell ambient", method="hayakawa", ambient=True)
+    refuse("camera to be far away", lights=lights, intrinsics=torch.eye(3).double())
+    refuse("needed: none", lights=lights, resolve="rounded")
+    refuse("needed: albedo_entropy, rounded", method="integrability", resolve="entropy")
+    refuse("the mask is empty", mask=bumpy.mask & False, lights=lights)
+    refuse("Resize the mask", mask=bumpy.mask[:50], lights=lights)
+    refuse("5 lights for 6 photographs", lights=lights[:5])
+    refuse("weights are", lights=lights, weight=torch.ones(6, 56, 50).double())
+    refuse("finite and not negative", lights=lights, weight=-torch.ones(6, 56, 56).double())
+    refuse("2 photographs have samples", images=images[:2], lights=lights[:2])
+    refuse("needed: 4 or more", images=images[:3], lights=lights[:3], ambient=True)
+    refuse("needed: 9 or more", method="nine_harmonics")
+    refuse("in one plane", lights=lights * torch.tensor([1.0, 0, 1]).double())
+
+
+def test_every_method_needs_what_it_says(bumpy, lamps):
+    images, _ = photographed(bumpy, lamps(9), torch.ones(bumpy.columns.shape[1]).double())
+    for name, method in METHODS.items():
+        few = method.unknowns - 1
+        with pytest.raises(InputError, match="photographs have samples"):
+            photometric_stereo(
+                images[:few],
+                bumpy.mask,
+                method=name,
+                lights=lamps(few) if method.calibrated else None,
+                intrinsics=torch.eye(3).double() if method.perspective else None,
+            )
