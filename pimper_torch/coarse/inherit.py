@@ -130,13 +130,7 @@ def _carried(
 
 
 def _joined(one: FacetPoints | None, other: FacetPoints) -> FacetPoints:
-    if one is None:
-        return other
-    return FacetPoints(
-        points_world=torch.cat([one.points_world, other.points_world]),
-        covariance_world=torch.cat([one.covariance_world, other.covariance_world]),
-        facet=torch.cat([one.facet, other.facet]),
-    )
+    return other if one is None else FacetPoints.cat([one, other])
 
 
 def _first_face(faces: Int[Tensor, "face 3"], count: int) -> Int[Tensor, " {count}"]:

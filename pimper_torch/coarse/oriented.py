@@ -67,14 +67,6 @@ class OrientedPoints(Record):
     normals_world: Float[Tensor, "point 3"]
     noise: Float[Tensor, " point"]
 
-    def take(self, index: Tensor) -> "OrientedPoints":
-        """Keep some points."""
-        return OrientedPoints(
-            points_world=self.points_world[index],
-            normals_world=self.normals_world[index],
-            noise=self.noise[index],
-        )
-
 
 def no_points(like: Float[Tensor, "..."]) -> OrientedPoints:
     """Give a cloud without points, with the device and dtype of ``like``."""

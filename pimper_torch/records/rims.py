@@ -27,16 +27,6 @@ class RimRays(Record):
     normals_world: Float[Tensor, "ray 3"]
     sigma_px: Float[Tensor, " ray"]
 
-    def take(self, index: Tensor) -> "RimRays":
-        """Keep some rays."""
-        return RimRays(
-            view=self.view[index],
-            pixels=self.pixels[index],
-            rays_world=self.rays_world[index],
-            normals_world=self.normals_world[index],
-            sigma_px=self.sigma_px[index],
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class RimPoints(Record):

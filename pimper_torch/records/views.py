@@ -1,6 +1,5 @@
 """Photographs and the cameras that took them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -36,19 +35,6 @@ class Views(Record):
         """How many photographs there are."""
         return self.images.shape[0]
 
-    def take(self, chosen: Sequence[int]) -> "Views":
-        """Keep some views, in the order given; all of them in their order are not copied."""
-        if list(chosen) == list(range(self.num_views)):
-            return self
-        index = torch.tensor(chosen, dtype=torch.long, device=self.images.device)
-        return self.replace(
-            images=self.images[index],
-            sizes_px=self.sizes_px[index],
-            names=tuple(self.names[item] for item in chosen),
-            masks=None if self.masks is None else self.masks[index],
-            focals_px=self.focals_px[index],
-        )
-
     @property
     def inside(self) -> Bool[Tensor, "view height width"]:
         """True inside the photographs, false in the padding."""
@@ -78,15 +64,6 @@ class Cameras(Record):
     def num_views(self) -> int:
         """How many cameras there are."""
         return self.intrinsics.shape[0]
-
-    def take(self, chosen: Sequence[int]) -> "Cameras":
-        """Keep some cameras, in the order given."""
-        index = torch.tensor(chosen, dtype=torch.long, device=self.intrinsics.device)
-        return self.replace(
-            intrinsics=self.intrinsics[index],
-            cam_from_world=self.cam_from_world[index],
-            sizes_px=self.sizes_px[index],
-        )
 
     @property
     def centers_world(self) -> Float[Tensor, "view 3"]:

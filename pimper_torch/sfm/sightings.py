@@ -143,14 +143,6 @@ class _Templates(Record):
     inverse: Float[Tensor, "point 2 2"]
     usable: Bool[Tensor, " point"]
 
-    def take(self, some: Int[Tensor, " chosen"]) -> "_Templates":
-        return _Templates(
-            values=self.values[some],
-            slopes=self.slopes[some],
-            inverse=self.inverse[some],
-            usable=self.usable[some],
-        )
-
 
 class _Window:
     """The raster of a patch in steps of the plane, its weights, and what light may change."""

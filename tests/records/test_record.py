@@ -1,12 +1,14 @@
 import dataclasses
 from dataclasses import dataclass
 
-import jaxtyping
 import pytest
 import torch
+from torch.utils import _pytree as pytree
+from torch.utils.data import DataLoader
 
+from pimper_torch.errors import InputError
 from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.records import Cameras, Record, SparseScene, Views
+from pimper_torch.records import Cameras, Convergence, Photometry, Record, SparseScene, Views
 from pimper_torch.records.patches import Templates
 
 
@@ -78,12 +80,81 @@ def test_a_record_shows_shapes_instead_of_numbers(cameras):
     assert len(shown) < 300
 
 
-@pytest.mark.usefixtures("shapes_checked")
 def test_tensors_of_the_wrong_shape_or_kind_are_refused(cameras):
-    with pytest.raises(jaxtyping.TypeCheckError):
+    with pytest.raises(InputError, match=r"Cameras.cam_from_world is float64\[1, 4, 4\]; needed: "):
         cameras.replace(cam_from_world=cameras.cam_from_world[:1])  # one camera, two intrinsics
-    with pytest.raises(jaxtyping.TypeCheckError):
+    with pytest.raises(InputError, match=r"sizes_px is float64\[2, 2\]; needed: Int of shape"):
         cameras.replace(sizes_px=cameras.sizes_px.double())  # sizes are whole
+    with pytest.raises(InputError, match=r"shape \(view channel height width\)"):
+        views_of(2).replace(images=torch.zeros(3, 3))
+    with pytest.raises(InputError, match=r"masks is 3; needed: Bool .* or None, beside images"):
+        views_of(2).replace(masks=3)
+
+
+def test_a_part_that_is_taken_and_put_together_again_is_the_whole(cameras):
+    views = views_of(3).replace(images=torch.arange(3.0)[:, None, None, None].expand(3, 3, 4, 6))
+    some = views.take([2, 0])
+    assert some.names == ("2.png", "0.png")
+    assert some.images[:, 0, 0, 0].tolist() == [2, 0]
+    assert some.masks is None
+    assert views.take(torch.tensor([False, True, False])).names == ("1.png",)
+    assert views.take(slice(1, None)).names == ("1.png", "2.png")
+    assert views.take([0, 1, 2]) is views  # photographs are not copied
+    whole = Views.cat([some, views.take([1])])
+    assert whole.names == ("2.png", "0.png", "1.png")
+    assert torch.equal(whole.take([1, 2, 0]).images, views.images)
+    both = Cameras.cat([cameras, cameras])
+    assert torch.equal(both.take([2, 3]).cam_from_world, cameras.cam_from_world)
+    with pytest.raises(InputError, match="some records have masks, others none"):
+        Views.cat([views, views.replace(masks=torch.ones(3, 4, 6, dtype=torch.bool))])
+
+
+def test_records_inside_are_taken_along():
+    convergence = Convergence(
+        iterations=torch.arange(3), residual=torch.zeros(3), cause=torch.zeros(3).long()
+    )
+    photometry = Photometry(
+        normals_patch=torch.zeros(3, 2, 2, 3),
+        albedo=torch.zeros(3, 2, 2, 1),
+        lights_patch=torch.zeros(3, 5, 4),
+        valid=torch.zeros(3, 2, 2, dtype=torch.bool),
+        confidence=torch.zeros(3, 2, 2),
+        verdict=torch.zeros(3).long(),
+        convergence=convergence,
+    )
+    assert photometry.take([2]).convergence.iterations.tolist() == [2]
+    assert Photometry.cat([photometry, photometry]).convergence.iterations.tolist() == [0, 1, 2] * 2
+
+
+def test_a_record_is_a_pytree(cameras):
+    leaves, spec = pytree.tree_flatten(cameras)
+    assert [leaf.shape for leaf in leaves] == [(2, 3, 3), (2, 4, 4), (2, 2)]
+    again = pytree.tree_unflatten(leaves, spec)
+    assert torch.equal(again.intrinsics, cameras.intrinsics)
+    axes = pytree.tree_map(lambda _: 0, cameras)  # any leaves, as for vmap's `in_dims`
+    far = torch.func.vmap(lambda one: one.cam_from_world[:3, 3].norm(), in_dims=(axes,))(cameras)
+    assert far.shape == (2,)
+
+
+def test_detached_records_are_cut_off(cameras):
+    moved = cameras.replace(intrinsics=cameras.intrinsics.requires_grad_())
+    assert not moved.detach().intrinsics.requires_grad
+
+
+def test_a_record_is_saved_and_loaded_without_pickled_code(cameras, tmp_path):
+    box = Box(inside=cameras, many=(torch.ones(2),), label="box")
+    torch.save(box, tmp_path / "box.pt")
+    found = torch.load(tmp_path / "box.pt", weights_only=True)
+    assert found.label == "box"
+    assert torch.equal(found.inside.intrinsics, cameras.intrinsics)
+
+
+def test_a_loader_of_batches_puts_records_together(cameras):
+    loader = DataLoader(
+        [cameras.take([0]), cameras.take([1])], batch_size=2, collate_fn=Cameras.cat
+    )
+    (batch,) = loader
+    assert torch.equal(batch.cam_from_world, cameras.cam_from_world)
 
 
 def test_camera_centres_are_carried_to_the_origin_of_their_camera(cameras):

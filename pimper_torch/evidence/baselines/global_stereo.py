@@ -235,7 +235,7 @@ def fix_ambiguity(matrix: Matrix, whole: Whole, min_views: int) -> Whole:
     often = matrix.seen.sum(dim=0) >= min_views
     (told,) = often.nonzero(as_tuple=True)
     few = told[:: _stride(len(told), LIGHT_SAMPLES)]
-    some = matrix.take(few)
+    some = matrix.columns(few)
     lights = fit_distant_lights(some.radiance.mT, some.seen.mT, some.normals)
     move = align_factorizations(
         whole.shading[None, :, few],
@@ -298,14 +298,14 @@ def _stride(samples: int, number: int) -> int:
 def _well_seen(matrix: Matrix, min_views: int, number: int) -> Matrix:
     """Pick about so many samples, evenly among those that enough views see."""
     (told,) = (matrix.seen.sum(dim=0) >= min_views).nonzero(as_tuple=True)
-    return matrix.take(told[:: _stride(len(told), number)])
+    return matrix.columns(told[:: _stride(len(told), number)])
 
 
 def _best_shading(matrix: Matrix, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "4 sample"]:
     """Give shading vectors with the matrix's normals and the albedo that fits them best."""
     parts = []
     for part in chunks(matrix.seen.shape[1]):
-        some = matrix.take(part)
+        some = matrix.columns(part)
         shading = start_from_mesh(
             some.radiance[None], some.seen[None], lights[None], harmonics(some.normals).mT[None]
         )
@@ -320,7 +320,7 @@ def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
     convergence = Convergence(iterations=none, residual=none.to(whole.lights), cause=none)
     albedo, normals, confidence = [], [], []
     for part in chunks(len(lit)):
-        problem = as_problem(matrix.take(part), whole.lights, whole.shading[:, part])
+        problem = as_problem(matrix.columns(part), whole.lights, whole.shading[:, part])
         factors = Factors(
             lights=problem.lights,
             shading=problem.shading,

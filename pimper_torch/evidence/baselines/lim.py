@@ -198,7 +198,7 @@ def relief_from(
     """Factorize, fix the ambiguity by integrability and points, and integrate."""
     often = matrix.seen.sum(dim=0) >= config.min_views
     (told,) = often.nonzero(as_tuple=True)
-    some = matrix.take(told[:: max(1, -(-len(told) // config.light_samples))])
+    some = matrix.columns(told[:: max(1, -(-len(told) // config.light_samples))])
     lights = factorize_rank_three(some.radiance, some.seen, config.alternations)
     factors = Rank3(lights=lights, vectors=solve_vectors(matrix.radiance, matrix.seen, lights))
     spans = spans_between(edges_of(points), template, factors, often)

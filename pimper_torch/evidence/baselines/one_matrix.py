@@ -99,7 +99,7 @@ def solve_whole(
         rhs = lights.new_zeros(1, 4, len(lights), dtype=torch.float64)
         moved = apart = length = 0.0
         for part in chunks(shading.shape[1]):
-            problem = as_problem(matrix.take(part), lights, shading[:, part])
+            problem = as_problem(matrix.columns(part), lights, shading[:, part])
             A, b = equations_of_samples(problem, problem.lights, problem.weight)
             penalty = float(share * trace)
             A[:, diagonal(4)] += penalty

@@ -143,7 +143,7 @@ class Matrix(Record):
         """How much of J is missing."""
         return 1 - float(self.seen.sum(dtype=torch.int64)) / self.seen.numel()
 
-    def take(self, samples: slice | Int[Tensor, " chosen"]) -> "Matrix":
+    def columns(self, samples: slice | Int[Tensor, " chosen"]) -> "Matrix":
         """Keep some samples."""
         return Matrix(
             radiance=self.radiance[:, samples],
