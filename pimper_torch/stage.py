@@ -1,8 +1,14 @@
 """What every stage is: a module that takes records and gives one."""
 
+import inspect
+import typing
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Generic, ParamSpec, Protocol, TypeVar
 
 from torch import nn
+
+from pimper_torch.errors import InputError
+from pimper_torch.records.record import Record
 
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
@@ -17,13 +23,23 @@ class Stage(nn.Module):
     """A module whose call has the types of its ``forward``, for a checker of types.
 
     ``nn.Module`` alone may be called with anything and gives anything. A stage of one's own that
-    derives from this class is checked where it is put into a chain and wherever it is called.
+    derives from this class is checked where it is put into a chain and wherever it is called; and
+    so are the records it is handed, when it runs.
     """
 
     if TYPE_CHECKING:
 
         def __call__(self: _Forward[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-            """Run the stage."""
+            """Run the stage.
+
+            Raises:
+                InputError: What is handed to it is of another type than it takes, or a record
+                    whose values no stage can use.
+            """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_forward_pre_hook(_check, with_kwargs=True)
 
 
 class Given(Stage, Generic[T]):
@@ -36,3 +52,31 @@ class Given(Stage, Generic[T]):
     def forward(self, *_: object) -> T:
         """Give it."""
         return self.record
+
+
+def _check(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
+    """Refuse records of other types than a stage takes, and those that cannot be used."""
+    where = type(stage).__name__
+    for name, value, hint in _handed(stage, args, kwargs):
+        kinds = [kind for kind in (typing.get_args(hint) or (hint,)) if isinstance(kind, type)]
+        records = [kind for kind in kinds if issubclass(kind, Record)]
+        if records and not isinstance(value, tuple(kinds)):
+            wanted = " or ".join(kind.__name__ for kind in kinds)
+            raise InputError(
+                f"{where}: {name} is {type(value).__name__}; needed: {wanted}. It comes from "
+                "whoever called the stage, in a chain the stage before."
+            )
+        if isinstance(value, Record):
+            value.check(f"{where}: {name}")
+
+
+def _handed(
+    stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]
+) -> list[tuple[str, object, object]]:
+    """Give the names, values and annotated types of what ``forward`` is handed."""
+    try:
+        bound = inspect.signature(stage.forward).bind(*args, **kwargs)
+    except TypeError:
+        return []  # torch tells what does not fit
+    hints = typing.get_type_hints(stage.forward)
+    return [(name, value, hints.get(name)) for name, value in bound.arguments.items()]

@@ -25,7 +25,6 @@ from pimper_torch.fusion.evidence import (
     upright_heights,
 )
 from pimper_torch.fusion.expected_error import expected_error
-from pimper_torch.fusion.photometry import check_photometry
 from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
 from pimper_torch.geometry.lattice import Lattice, subdivide, transferred
 from pimper_torch.geometry.surfaces import face_edges, vertex_normals
@@ -194,9 +193,8 @@ class Fuse(Stage):
         scene units; its iterations are the solves at full size.
 
         Raises:
-            InputError: As :func:`~pimper_torch.fusion.photometry.check_photometry`.
+            InputError: A normal, a confidence or a height that is none.
         """
-        check_photometry(swept.photometric)
         rough = self._task(swept, _COARSER * self.config.samples_per_vertex)
         contacts = self._contacts(rough, swept, rims)
         learnt = self._learnt(rough, contacts)

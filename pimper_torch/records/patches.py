@@ -7,15 +7,20 @@ The patch frame is x right, y down, z forward into the surface: the facet lies i
 plane z = 0 and its outward normal is -z. A depth on the template is a coordinate along z.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.records.faults import beyond, not_finite, not_unit, once, outside, turned_away
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
+
+AnyPatches = TypeVar("AnyPatches", bound="OverPatches")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -45,6 +50,13 @@ class Templates(Record):
     inside: Bool[Tensor, "patch height width"]
     normals_patch: Float[Tensor, "patch height width 3"] | None = None
 
+    def faults_of(self, num_facets: int) -> Iterator[tuple[str, str, str]]:
+        """List facets that are none of so many, and templates of no size."""
+        if found := once(self.facet, lambda: beyond(self.facet, num_facets), num_facets):
+            yield "facet", found, f"indices of {num_facets} facets"
+        if not bool((self.spacing > 0).all()):
+            yield "spacing", "is not above 0 everywhere", "scene units"
+
     @property
     def points_patch(self) -> Float[Tensor, "patch height width 3"]:
         """The samples' places in the patch frame."""
@@ -57,7 +69,56 @@ class Templates(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class PatchSet(Record):
+class OverPatches(Record):
+    """What is known of all patches, in buckets like those of the templates.
+
+    ``len`` counts patches, and indexing by a facet's number, or iterating, gives records of one
+    patch each.
+    """
+
+    def __len__(self) -> int:
+        return self._templates.num_patches
+
+    def __getitem__(self: AnyPatches, facet: int) -> AnyPatches:
+        for place, bucket in enumerate(self._templates.buckets):
+            row = (bucket.facet == facet).nonzero()[:, 0]
+            if len(row):
+                return self._part(place, row[:1])
+        raise IndexError(f"no patch stands on facet {facet}; there are {len(self)} patches")
+
+    def __iter__(self: AnyPatches) -> Iterator[AnyPatches]:
+        facets = torch.cat([bucket.facet for bucket in self._templates.buckets])
+        yield from (self[facet] for facet in facets.sort().values.tolist())
+
+    @property
+    def _templates(self) -> "PatchSet":
+        found: PatchSet = self.patches  # type: ignore[attr-defined]
+        return found
+
+    def _part(self: AnyPatches, place: int, row: Tensor) -> AnyPatches:
+        patches = self._templates._part(place, row)
+        bucket = self.buckets[place].take(row)  # type: ignore[attr-defined]
+        return self.replace(patches=patches, buckets=(bucket,))
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List buckets that are not those of the templates, and what is wrong in one."""
+        yield from super(OverPatches, self).faults()
+        buckets: tuple[Any, ...] = self.buckets  # type: ignore[attr-defined]
+        templates = self._templates.buckets
+        if len(buckets) != len(templates):
+            needed = f"one for each of {len(templates)} buckets of templates, in their order"
+            yield "buckets", f"are {len(buckets)}", needed
+        for place, (bucket, own) in enumerate(zip(buckets, templates, strict=False)):
+            shape = bucket.raster
+            if shape != tuple(own.inside.shape):
+                needed = f"{tuple(own.inside.shape)}, as its templates"
+                yield f"buckets[{place}]", f"has patches, height, width {shape}", needed
+            for name, found, needed in bucket.faults():
+                yield f"buckets[{place}].{name}", found, needed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PatchSet(OverPatches):
     """The decomposition: every facet of the coarse mesh has one template.
 
     Attributes:
@@ -76,6 +137,23 @@ class PatchSet(Record):
         """How many facets there are."""
         return sum(len(bucket.facet) for bucket in self.buckets)
 
+    @property
+    def _templates(self) -> "PatchSet":
+        return self
+
+    def _part(self, place: int, row: Tensor) -> "PatchSet":
+        return self.replace(buckets=(self.buckets[place].take(row),))
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List templates of facets that are none, and of no size."""
+        yield from Record.faults(self)
+        if not self.buckets:
+            yield "buckets", "are none", "a bucket of templates at least"
+        count = len(self.coarse.mesh.faces)
+        for place, bucket in enumerate(self.buckets):
+            for name, found, needed in bucket.faults_of(count):
+                yield f"buckets[{place}].{name}", found, needed
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Registered(Record):
@@ -90,13 +168,18 @@ class Registered(Record):
     valid: Bool[Tensor, "patch view height width"]
 
     @property
+    def raster(self) -> tuple[int, ...]:
+        """Patches, height and width."""
+        return (len(self.valid), *self.valid.shape[-2:])
+
+    @property
     def gray(self) -> Float[Tensor, "patch view height width"]:
         """Mean over the channels."""
         return self.radiance.mean(dim=2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class PatchViews(Record):
+class PatchViews(OverPatches):
     """All views, registered on all templates."""
 
     patches: PatchSet
@@ -180,13 +263,32 @@ class Photometry(Record):
     convergence: Convergence
 
     @property
+    def raster(self) -> tuple[int, ...]:
+        """Patches, height and width."""
+        return tuple(self.valid.shape)
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List values that are no normals, albedo or confidence."""
+        normals, valid = self.normals_patch, self.valid
+        known = id(valid)
+        if found := once(normals, lambda: not_unit(normals, valid), known):
+            yield "normals_patch", found, "unit normals where valid"
+        if found := once(normals, lambda: turned_away(normals, valid), known):
+            yield "normals_patch", found, "n_z < 0: x right, y down, z into the surface"
+        if found := once(self.albedo, lambda: not_finite(self.albedo, valid), known):
+            yield "albedo", found, "finite where valid"
+        confidence = self.confidence
+        if found := once(confidence, lambda: outside(confidence, 1.0)):
+            yield "confidence", found, "in [0, 1], 1 for a normal without error"
+
+    @property
     def determined(self) -> Bool[Tensor, " patch"]:
         """Whether light told the patch's shape."""
         return self.verdict == int(PatchVerdict.DETERMINED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class PhotometricPatches(Record):
+class PhotometricPatches(OverPatches):
     """Normals, albedo and light of all patches."""
 
     patches: PatchSet
@@ -210,9 +312,22 @@ class Heights(Record):
     information: Float[Tensor, "patch height width"]
     num_views: Int[Tensor, " patch"]
 
+    @property
+    def raster(self) -> tuple[int, ...]:
+        """Patches, height and width."""
+        return tuple(self.offset.shape)
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List heights that are nowhere, and weights that are none."""
+        if found := once(self.offset, lambda: not_finite(self.offset)):
+            yield "offset", found, "finite, 0 where unknown"
+        information = self.information
+        if found := once(information, lambda: outside(information, torch.inf)):
+            yield "information", found, "an inverse variance, 0 where unknown"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class SweptPatches(Record):
+class SweptPatches(OverPatches):
     """Heights of all patches, with the photometry they were swept under.
 
     Attributes:
@@ -262,6 +377,17 @@ class Depths(Record):
     verdict: Int[Tensor, " patch"] | None = None
 
     @property
+    def raster(self) -> tuple[int, ...]:
+        """Patches, height and width."""
+        return tuple(self.depth.shape)
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List depths that are nowhere."""
+        depth, valid = self.depth, self.valid
+        if found := once(depth, lambda: not_finite(depth, valid), id(valid)):
+            yield "depth", found, "finite where valid"
+
+    @property
     def aligned(self) -> Bool[Tensor, " patch"]:
         """Whether a neighbour bears the relief out; false before alignment."""
         if self.verdict is None:
@@ -270,7 +396,7 @@ class Depths(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class DepthPatches(Record):
+class DepthPatches(OverPatches):
     """Relief of all patches, with the photometry it was integrated from.
 
     Attributes:
@@ -316,6 +442,13 @@ class Surface(Record):
     confidence: Float[Tensor, " vertex"]
     convergence: Convergence
     expected_error: Float[Tensor, " vertex"] | None = None
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List faces that name no vertex, vertices that are nowhere, and what is no normal."""
+        yield from self.mesh.faults()
+        normals = self.normals_world
+        if found := once(normals, lambda: not_unit(normals, None)):
+            yield "normals_world", found, "unit, outward"
 
     @property
     def mesh(self) -> Mesh:

@@ -1,5 +1,6 @@
 """What structure from motion finds, and triangle meshes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -7,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.records.faults import beyond, not_finite, once
 from pimper_torch.records.record import Record
 from pimper_torch.records.views import Cameras, Views
 
@@ -56,6 +58,33 @@ class SparseScene(Record):
     lenses: tuple[Lens, ...]
     unregistered: tuple[str, ...] = ()
 
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List what does not belong together."""
+        yield from super(SparseScene, self).faults()
+        cameras, count = self.cameras, len(self.points_world)
+        if self.views.num_views != cameras.num_views:
+            needed = f"one for each of {self.views.num_views} views"
+            yield "cameras", f"are {cameras.num_views}", needed
+        if found := once(self.points_world, lambda: not_finite(self.points_world)):
+            yield "points_world", found, "finite points"
+        point, view = self.observation_point, self.observation_view
+        if found := once(point, lambda: beyond(point, count), count):
+            yield "observation_point", found, f"indices of {count} points"
+        if found := once(view, lambda: beyond(view, cameras.num_views), cameras.num_views):
+            yield "observation_view", found, f"indices of {cameras.num_views} views"
+        if count:
+            pose, points = cameras.cam_from_world.detach(), self.points_world.detach()
+            depth = pose[:, 2, :3] @ points.mT + pose[:, 2, 3:]
+            behind = float((depth <= 0).float().mean())
+            if behind > 0.5:
+                found = f"look away from the cloud: {behind:.0%} of its points are behind them"
+                yield (
+                    "cameras.cam_from_world",
+                    found,
+                    "axes x right, y down, z forward; those of OpenGL and Blender have y up and z "
+                    "back: negate the second and third row",
+                )
+
     @property
     def observed(self) -> Bool[Tensor, "point view"]:
         """True where a view sees a point."""
@@ -92,6 +121,14 @@ class Mesh(Record):
     albedo: Float[Tensor, "vertex channel"] | None = None
     confidence: Float[Tensor, " vertex"] | None = None
     expected_error: Float[Tensor, " vertex"] | None = None
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List faces that name no vertex, and vertices that are nowhere."""
+        count = len(self.vertices_world)
+        if found := once(self.faces, lambda: beyond(self.faces, count), count):
+            yield "faces", found, f"indices of {count} vertices"
+        if found := once(self.vertices_world, lambda: not_finite(self.vertices_world)):
+            yield "vertices_world", found, "finite vertices"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -1,11 +1,13 @@
 """Photographs and the cameras that took them."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.records.faults import no_pinhole, not_rigid, once
 from pimper_torch.records.record import Record
 
 
@@ -34,6 +36,17 @@ class Views(Record):
     def num_views(self) -> int:
         """How many photographs there are."""
         return self.images.shape[0]
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List what is wrong with names and sizes; radiance may be anything, stages mask it."""
+        if len(self.names) != self.num_views or len(set(self.names)) < len(self.names):
+            found = f"are {len(self.names)}, {len(set(self.names))} of them different"
+            yield "names", found, f"a name of its own for each of {self.num_views} views"
+        raster = self.sizes_px.new_tensor([self.images.shape[3], self.images.shape[2]])
+        if bool(((self.sizes_px < 1) | (self.sizes_px > raster)).any()):
+            low, high = self.sizes_px.aminmax()
+            found = f"reach from {int(low)} to {int(high)}"
+            yield "sizes_px", found, f"width and height within the raster of {raster.tolist()}"
 
     @property
     def inside(self) -> Bool[Tensor, "view height width"]:
@@ -64,6 +77,14 @@ class Cameras(Record):
     def num_views(self) -> int:
         """How many cameras there are."""
         return self.intrinsics.shape[0]
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List matrices that are no pinhole's."""
+        K, pose = self.intrinsics, self.cam_from_world
+        if found := once(K, lambda: no_pinhole(K)):
+            yield "intrinsics", found, "f_x, s, c_x; 0, f_y, c_y; 0, 0, 1 in pixels, f above 0"
+        if found := once(pose, lambda: not_rigid(pose)):
+            yield "cam_from_world", found, "a rotation and a shift, camera axes x right, y down"
 
     @property
     def centers_world(self) -> Float[Tensor, "view 3"]:

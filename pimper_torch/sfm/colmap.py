@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from pimper_torch.errors import InputError, OutputError
-from pimper_torch.records import Lens
+from pimper_torch.records import Cameras, Lens
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.model import SparseModel
 
@@ -205,3 +205,18 @@ def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> A
         reconstruction.add_point3D(xyz, track, rgb[index])
     reconstruction.update_point_3d_errors()
     return reconstruction
+
+
+def pinhole_lenses(cameras: Cameras) -> tuple[Lens, ...]:
+    """Give every view its pinhole; views with equal ones share a camera."""
+    numbers: dict[tuple[float, ...], int] = {}
+    lenses = []
+    for K, (width, height) in zip(
+        cameras.intrinsics.detach().cpu().double(), cameras.sizes_px.tolist(), strict=True
+    ):
+        params = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        camera = numbers.setdefault((*params, width, height), len(numbers) + 1)
+        lenses.append(
+            Lens(camera=camera, model="PINHOLE", params=params, width=width, height=height)
+        )
+    return tuple(lenses)

@@ -16,8 +16,8 @@ from pimper_torch.evidence.datasets.pictures import (
 )
 from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble, mask_finder, read_views
 from pimper_torch.radiometry import SRGB, Encoding
-from pimper_torch.records import Cameras, Capture, Lens, SparseScene, Views
-from pimper_torch.sfm.colmap import read_model, write_binary
+from pimper_torch.records import Cameras, Capture, SparseScene, Views
+from pimper_torch.sfm.colmap import pinhole_lenses, read_model, write_binary
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct import Reconstruct
 
@@ -120,7 +120,7 @@ def write_colmap(
     nothing = torch.zeros(0, dtype=torch.long)
     model = SparseModel(
         names=files,
-        lenses=_lenses(cameras),
+        lenses=pinhole_lenses(cameras),
         cam_from_world=cameras.cam_from_world.detach().cpu().double(),
         points_world=points.double(),
         observation_point=nothing,
@@ -163,18 +163,3 @@ def _photographs(
         )
     ]
     return found[0], photographs
-
-
-def _lenses(cameras: Cameras) -> tuple[Lens, ...]:
-    """Give every view its pinhole; views with equal ones share a camera."""
-    numbers: dict[tuple[float, ...], int] = {}
-    lenses = []
-    for K, (width, height) in zip(
-        cameras.intrinsics.detach().cpu().double(), cameras.sizes_px.tolist(), strict=True
-    ):
-        params = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-        camera = numbers.setdefault((*params, width, height), len(numbers) + 1)
-        lenses.append(
-            Lens(camera=camera, model="PINHOLE", params=params, width=width, height=height)
-        )
-    return tuple(lenses)

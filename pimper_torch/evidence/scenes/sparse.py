@@ -6,10 +6,10 @@ from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.evidence.scenes.rendered import RenderedScene
-from pimper_torch.evidence.scenes.tracks import pinhole_lenses
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.records import Cameras, SparseScene
+from pimper_torch.sfm.colmap import pinhole_lenses
 
 
 def sparse_scene(

@@ -7,7 +7,8 @@ from torch import Tensor
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.records import Cameras, Lens, Mesh
+from pimper_torch.records import Cameras, Mesh
+from pimper_torch.sfm.colmap import pinhole_lenses
 from pimper_torch.sfm.model import SparseModel
 
 _STEEPEST = 0.2  # cosine below which a surface is too slanted for its features to be found
@@ -55,22 +56,6 @@ def true_model(
         observation_pixels=pixels[view, kept[point]],
     )
     return model, albedo[kept]
-
-
-def pinhole_lenses(cameras: Cameras) -> tuple[Lens, ...]:
-    """Tell COLMAP of pinholes that are all one camera."""
-    return tuple(
-        Lens(
-            camera=1,
-            model="PINHOLE",
-            params=(K[0][0], K[1][1], K[0][2], K[1][2]),
-            width=width,
-            height=height,
-        )
-        for K, (width, height) in zip(
-            cameras.intrinsics.tolist(), cameras.sizes_px.tolist(), strict=True
-        )
-    )
 
 
 def _scatter(

@@ -75,11 +75,16 @@ def test_a_view_without_data_does_no_harm(photographed, compared, sphere):
 
 def test_what_cannot_be_factorized_is_refused(photographed, sphere):
     _, scene, coarse = photographed(sphere)
-    three = scene.replace(views=scene.views.take(range(3)), cameras=scene.cameras.take(range(3)))
+    aside = torch.tensor([0.0, 60.0, -60.0])  # in front of the cameras, in no frame
+    three = scene.replace(
+        views=scene.views.take(range(3)),
+        cameras=scene.cameras.take(range(3)),
+        observation_view=scene.observation_view % 3,
+    )
     with pytest.raises(ReconstructionError, match="3 views are registered, and at least 4"):
         GlobalStereo()(three, coarse.replace(reference=1))
     with pytest.raises(ReconstructionError, match="sparse points"):
-        GlobalStereo()(scene.replace(points_world=scene.points_world + 100), coarse)
+        GlobalStereo()(scene.replace(points_world=scene.points_world + aside), coarse)
     masks = torch.zeros_like(scene.views.images[:, 0]) > 0
     masks[:3] = True
     seldom = scene.replace(views=scene.views.replace(masks=masks))

@@ -119,11 +119,16 @@ def test_missing_data_is_left_to_the_mask(photographed, compared, sphere):
 
 def test_what_cannot_be_reconstructed_is_refused(photographed, sphere):
     _, scene, coarse = photographed(sphere)
-    three = scene.replace(views=scene.views.take(range(3)), cameras=scene.cameras.take(range(3)))
+    aside = torch.tensor([0.0, 60.0, -60.0])  # in front of the cameras, in no frame
+    three = scene.replace(
+        views=scene.views.take(range(3)),
+        cameras=scene.cameras.take(range(3)),
+        observation_view=scene.observation_view % 3,
+    )
     with pytest.raises(ReconstructionError, match="3 views are registered, and at least 4"):
         Lim()(three, coarse.replace(reference=1))
     with pytest.raises(ReconstructionError, match="sparse points"):
-        Lim()(scene.replace(points_world=scene.points_world + 100), coarse)
+        Lim()(scene.replace(points_world=scene.points_world + aside), coarse)
     masks = torch.zeros_like(scene.views.images[:, 0]) > 0
     masks[:2] = True
     with pytest.raises(ReconstructionError, match="seen lit in 4 views"):

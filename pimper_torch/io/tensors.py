@@ -1,0 +1,129 @@
+"""A scene from tensors or arrays at hand: photographs, cameras, and what else is known."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Cameras, SparseScene, Views
+from pimper_torch.sfm.colmap import pinhole_lenses
+
+Array = Tensor | np.ndarray | Sequence[object]
+
+
+def scene_of(
+    images: Array,
+    intrinsics: Array,
+    cam_from_world: Array,
+    *,
+    points_world: Array | None = None,
+    observed: Array | None = None,
+    masks: Array | None = None,
+    names: Sequence[str] | None = None,
+) -> SparseScene:
+    """Put photographs without distortion beside cameras that are known.
+
+    Takes tensors, numpy arrays or nested lists. A chain takes the scene in the place of
+    photographs, and structure from motion does not run.
+
+    Args:
+        images: Linear radiance, ``view channel height width``; 1 is where the sensor saturates.
+            Bytes are taken for sRGB-coded and made linear by nobody: divide and decode them first.
+        intrinsics: ``K`` of every view, ``view 3 3``, or one for all, ``3 3``; in pixels, the
+            centre of the top-left pixel at (0.5, 0.5).
+        cam_from_world: ``view 4 4`` or ``view 3 4``, rigid; camera axes x right, y down, z forward.
+        points_world: A cloud, ``point 3``; none unless given. A chain then needs masks or a mesh.
+        observed: Which view sees which point, ``point view``. Without it, every view that has a
+            point in its frame and, where there are masks, on the object.
+        masks: True on the object, ``view height width``.
+        names: Of the views; numbers unless given.
+
+    Returns:
+        A scene of the images' floating-point type and device.
+
+    Raises:
+        InputError: A shape or a value that means nothing, or cameras that look the wrong way.
+    """
+    pictures = _floats(images, "images", "linear radiance, view channel height width")
+    if pictures.ndim != 4:
+        raise InputError(
+            f"images has shape {tuple(pictures.shape)}; needed: view channel height width."
+        )
+    count, _, height, width = pictures.shape
+    sizes = torch.tensor([[width, height]]).repeat(count, 1).to(pictures.device)
+    views = Views(
+        images=pictures,
+        sizes_px=sizes,
+        names=tuple(names) if names is not None else tuple(f"{view:03d}" for view in range(count)),
+        masks=None if masks is None else torch.as_tensor(masks).to(pictures.device).bool(),
+        focals_px=torch.full_like(pictures[:, 0, 0, 0], torch.nan),
+    )
+    matrices = _floats(intrinsics, "intrinsics", "K in pixels").to(pictures)
+    poses = _floats(cam_from_world, "cam_from_world", "rigid matrices").to(pictures)
+    cameras = Cameras(
+        intrinsics=matrices.expand(count, 3, 3) if matrices.ndim == 2 else matrices,
+        cam_from_world=_squared(poses),
+        sizes_px=sizes,
+    )
+    points = pictures.new_zeros(0, 3)
+    if points_world is not None:
+        points = _floats(points_world, "points_world", "a cloud, point 3").to(pictures)
+    pixels, seen = _observations(points, cameras, views)
+    if observed is not None:
+        given = torch.as_tensor(observed).to(pictures.device).bool()
+        if given.shape != seen.shape:
+            raise InputError(
+                f"observed has shape {tuple(given.shape)}; needed: {tuple(seen.shape)}, a row a "
+                "point, a column a view."
+            )
+        seen = given
+    point, view = seen.nonzero(as_tuple=True)
+    scene = SparseScene(
+        views=views,
+        cameras=cameras,
+        points_world=points,
+        reprojection_errors_px=torch.zeros_like(points[:, 0]),
+        observation_point=point,
+        observation_view=view,
+        observation_pixels=pixels[view, point],
+        lenses=pinhole_lenses(cameras),
+    )
+    scene.check("scene_of")
+    return scene
+
+
+def _floats(values: Array, name: str, what: str) -> Tensor:
+    tensor = torch.as_tensor(values)
+    if not tensor.is_floating_point():
+        raise InputError(
+            f"{name} is {str(tensor.dtype).removeprefix('torch.')}; needed: {what}, in floating "
+            "point. Photographs as bytes are decoded by `load_views`."
+        )
+    return tensor
+
+
+def _squared(poses: Tensor) -> Tensor:
+    """Add the last row to matrices of three rows."""
+    if poses.ndim != 3 or poses.shape[1:] != (3, 4):
+        return poses
+    row = poses.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(poses), 1, 4)
+    return torch.cat([poses, row], dim=1)
+
+
+def _observations(
+    points: Float[Tensor, "point 3"], cameras: Cameras, views: Views
+) -> tuple[Float[Tensor, "view point 2"], Bool[Tensor, "point view"]]:
+    """Project the cloud, and mark where it falls into the frame, and onto the object."""
+    pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
+    sizes = cameras.sizes_px[:, None]
+    seen = (depth > 0) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
+    if views.masks is not None:
+        column, row = pixels.nan_to_num().clamp(-1, 1e6).long().unbind(dim=-1)
+        height, width = views.masks.shape[-2:]
+        view = torch.arange(len(pixels), device=pixels.device)[:, None]
+        seen &= views.masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return pixels, seen.mT

@@ -1,0 +1,129 @@
+"""What may be wrong with the values of a record; each tensor is looked through once."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+# Normals that stages make are unit to rounding; those of a file of 8 bits to 0.4 per cent a part.
+_UNIT = 0.02
+# Of a rotation, entry by entry: files with six digits reach 1e-6.
+_RIGID = 1e-3
+
+_sound: Any = WeakIdKeyDictionary()  # torch does not type it
+
+
+def once(tensor: Tensor, test: Callable[[], str], context: object = None) -> str:
+    """Give what ``test`` finds wrong with a tensor, or nothing where it found nothing before.
+
+    Args:
+        tensor: Looked through again only if it is another one, not if it was written into.
+        test: Says what was found; nothing if all is well.
+        context: What else the answer depends on, such as a number of vertices.
+    """
+    key = (test.__code__, context)
+    known = _sound.setdefault(tensor, set())
+    if key in known:
+        return ""
+    with torch.no_grad():
+        found = test()
+    if not found:
+        known.add(key)
+    return found
+
+
+def beyond(index: Int[Tensor, "..."], count: int) -> str:
+    """Say which indices name nothing among so many."""
+    if index.numel() == 0:
+        return ""
+    low, high = (int(value) for value in index.aminmax())
+    return f"reach from {low} to {high}" if low < 0 or high >= count else ""
+
+
+def not_finite(values: Float[Tensor, "..."], where: Bool[Tensor, "..."] | None = None) -> str:
+    """Say how many values are NaN or infinite."""
+    if values.numel() == 0 or bool(torch.stack(values.aminmax()).isfinite().all()):
+        return ""
+    bad = ~values.isfinite()
+    if where is not None:
+        bad = bad & where.reshape(where.shape + (1,) * (bad.ndim - where.ndim))
+    count = int(bad.sum())
+    return f"has {count} of {values.numel()} values that are not finite" if count else ""
+
+
+def outside(values: Float[Tensor, "..."], high: float) -> str:
+    """Say how many values are not finite, below 0 or above ``high``."""
+    bad = ~((values >= 0) & (values <= high) & values.isfinite())
+    count = int(bad.sum())
+    if count == 0:
+        return ""
+    share = f"{count} of {values.numel()} values outside [0, {high:g}]"
+    return f"has {share}, such as {float(values[bad][0]):.4g}"
+
+
+def not_unit(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"] | None) -> str:
+    """Say how many normals are not of unit length, and what they look like."""
+    length = normals.norm(dim=-1)
+    bad = ~((length - 1).abs() <= _UNIT)  # NaN is bad
+    if where is not None:
+        bad = bad & where
+    count = int(bad.sum())
+    if count == 0:
+        return ""
+    some = normals[bad]
+    if not bool(some.isfinite().all()):
+        return f"has {count} of {bad.numel()} normals that are not unit, some of them NaN"
+    coded = bool((some >= 0).all() and (some <= 1).all()) and count > 1
+    hint = "; they look coded as colours, 0 to 1: decode them as 2 n - 1" if coded else ""
+    return (
+        f"has {count} of {bad.numel()} normals that are not unit, of length "
+        f"{float(length[bad].min()):.3g} to {float(length[bad].max()):.3g}{hint}"
+    )
+
+
+def turned_away(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"]) -> str:
+    """Say how many normals of patches face away from the viewer."""
+    away = where & (normals[..., 2] >= 0)
+    count, among = int(away.sum()), int(where.sum())
+    if count == 0:
+        return ""
+    opengl = (
+        "; nearly all do: they look like OpenGL's, with y up and z to the viewer: negate both"
+        if count > 0.9 * among
+        else ""
+    )
+    return f"has {count} of {among} valid normals that face away{opengl}"
+
+
+def not_rigid(cam_from_world: Float[Tensor, "view 4 4"]) -> str:
+    """Say which matrices are no rotation and shift."""
+    rotation = cam_from_world[:, :3, :3].double()
+    eye = torch.eye(3, dtype=torch.float64, device=rotation.device)
+    off = (rotation @ rotation.mT - eye).abs().amax(dim=(1, 2))
+    last = cam_from_world.new_tensor([0.0, 0.0, 0.0, 1.0])
+    bad = ~(off <= _RIGID) | (cam_from_world[:, 3] != last).any(dim=1)
+    mirrored = torch.linalg.det(rotation) < 0
+    if bool((mirrored & ~bad).any()):
+        return f"has {int(mirrored.sum())} matrices that mirror: their determinant is -1"
+    if not bool(bad.any()):
+        return ""
+    view = int(bad.nonzero()[0, 0])
+    return (
+        f"has {int(bad.sum())} of {len(bad)} matrices that are not rigid, the first of view {view} "
+        f"(rows off by {float(off[view]):.2g}, last row {cam_from_world[view, 3].tolist()})"
+    )
+
+
+def no_pinhole(intrinsics: Float[Tensor, "view 3 3"]) -> str:
+    """Say which matrices are no ``K``."""
+    last = intrinsics.new_tensor([0.0, 0.0, 1.0])
+    focal = intrinsics.diagonal(dim1=1, dim2=2)[:, :2]
+    bad = ~(focal > 0).all(dim=1) | (intrinsics[:, 2] != last).any(dim=1)
+    bad |= intrinsics[:, 1, 0] != 0
+    if not bool(bad.any()):
+        return ""
+    view = int(bad.nonzero()[0, 0])
+    return f"has {int(bad.sum())} matrices that are no K, the first {intrinsics[view].tolist()}"
