@@ -23,58 +23,182 @@ if TYPE_CHECKING:
     from pimper_torch.chains.coarse_to_fine import CoarseToFine, CoarseToFineConfig
     from pimper_torch.chains.presets import load_chain, load_config, make_chain
     from pimper_torch.chains.published import Published, PublishedConfig
+    from pimper_torch.coarse.adapt import Adapt
+    from pimper_torch.coarse.enclose import Enclose
+    from pimper_torch.coarse.triangulate import Triangulate
+    from pimper_torch.fusion.fuse import Fuse
+    from pimper_torch.io.meshes import read_mesh
     from pimper_torch.io.photographs import load_views
     from pimper_torch.io.results import write_result
+    from pimper_torch.io.tensors import scene_of
+    from pimper_torch.meshing.extract import Extract
+    from pimper_torch.meshing.mend import Mend
+    from pimper_torch.outlines.outline import Outline
+    from pimper_torch.patches.decompose import Decompose
+    from pimper_torch.patches.warp import Warp
+    from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
     from pimper_torch.radiometry import Encoding
+    from pimper_torch.records import (
+        Cameras,
+        CoarseMesh,
+        DepthPatches,
+        Mesh,
+        Outlines,
+        PatchSet,
+        PatchViews,
+        PhotometricPatches,
+        Reconstruction,
+        Record,
+        SparseScene,
+        Surface,
+        SweptPatches,
+        Views,
+    )
     from pimper_torch.sfm.cache import user_cache
-    from pimper_torch.stage import Stage
+    from pimper_torch.sfm.reconstruct import Reconstruct
+    from pimper_torch.single_view.integration import integrate_normal_map
+    from pimper_torch.single_view.photometric_stereo.stereo import photometric_stereo
+    from pimper_torch.stage import Given, Stage
+    from pimper_torch.sweep.sweep import Sweep
+    from pimper_torch.viz.patches import by_facet, plot_in_view, plot_patch
 
 __all__ = [
+    "Adapt",
+    "Cameras",
     "Chain",
+    "CoarseMesh",
     "CoarseToFine",
     "CoarseToFineConfig",
     "ConfigError",
+    "Decompose",
+    "DepthPatches",
+    "Enclose",
     "Encoding",
+    "Extract",
+    "Factorize",
+    "FactorizeConfig",
+    "Fuse",
+    "Given",
     "InputError",
+    "Mend",
+    "Mesh",
+    "Outline",
+    "Outlines",
     "OutputError",
+    "PatchSet",
+    "PatchViews",
+    "PhotometricPatches",
     "PimperError",
     "PimperWarning",
     "Published",
     "PublishedConfig",
+    "Reconstruct",
+    "Reconstruction",
     "ReconstructionError",
+    "Record",
+    "SparseScene",
     "Stage",
     "Step",
+    "Surface",
+    "Sweep",
+    "SweptPatches",
+    "Triangulate",
+    "Views",
+    "Warp",
     "__version__",
+    "by_facet",
+    "integrate_normal_map",
     "load_chain",
     "load_config",
     "load_views",
     "make_chain",
+    "photometric_stereo",
+    "plot_in_view",
+    "plot_patch",
+    "read_mesh",
+    "scene_of",
     "user_cache",
     "write_result",
 ]
 
 # What needs torch is imported when it is asked for, so that the command line answers at once.
 _HOMES = {
-    "Encoding": "pimper_torch.radiometry",
-    "Chain": "pimper_torch.chains.chain",
-    "Step": "pimper_torch.chains.chain",
-    "CoarseToFine": "pimper_torch.chains.coarse_to_fine",
-    "CoarseToFineConfig": "pimper_torch.chains.coarse_to_fine",
-    "Published": "pimper_torch.chains.published",
-    "PublishedConfig": "pimper_torch.chains.published",
-    "Stage": "pimper_torch.stage",
-    "load_chain": "pimper_torch.chains.presets",
-    "load_config": "pimper_torch.chains.presets",
-    "make_chain": "pimper_torch.chains.presets",
-    "load_views": "pimper_torch.io.photographs",
-    "user_cache": "pimper_torch.sfm.cache",
-    "write_result": "pimper_torch.io.results",
+    "pimper_torch.chains.chain": (
+        "Chain",
+        "Step",
+    ),
+    "pimper_torch.chains.coarse_to_fine": (
+        "CoarseToFine",
+        "CoarseToFineConfig",
+    ),
+    "pimper_torch.chains.presets": (
+        "load_chain",
+        "load_config",
+        "make_chain",
+    ),
+    "pimper_torch.chains.published": (
+        "Published",
+        "PublishedConfig",
+    ),
+    "pimper_torch.coarse.adapt": ("Adapt",),
+    "pimper_torch.coarse.enclose": ("Enclose",),
+    "pimper_torch.coarse.triangulate": ("Triangulate",),
+    "pimper_torch.fusion.fuse": ("Fuse",),
+    "pimper_torch.io.meshes": ("read_mesh",),
+    "pimper_torch.io.photographs": ("load_views",),
+    "pimper_torch.io.results": ("write_result",),
+    "pimper_torch.io.tensors": ("scene_of",),
+    "pimper_torch.meshing.extract": ("Extract",),
+    "pimper_torch.meshing.mend": ("Mend",),
+    "pimper_torch.outlines.outline": ("Outline",),
+    "pimper_torch.patches.decompose": ("Decompose",),
+    "pimper_torch.patches.warp": ("Warp",),
+    "pimper_torch.photometry.factorize": (
+        "Factorize",
+        "FactorizeConfig",
+    ),
+    "pimper_torch.radiometry": ("Encoding",),
+    "pimper_torch.records": (
+        "Cameras",
+        "CoarseMesh",
+        "DepthPatches",
+        "Mesh",
+        "Outlines",
+        "PatchSet",
+        "PatchViews",
+        "PhotometricPatches",
+        "Reconstruction",
+        "Record",
+        "SparseScene",
+        "Surface",
+        "SweptPatches",
+        "Views",
+    ),
+    "pimper_torch.sfm.cache": ("user_cache",),
+    "pimper_torch.sfm.reconstruct": ("Reconstruct",),
+    "pimper_torch.single_view.integration": ("integrate_normal_map",),
+    "pimper_torch.single_view.photometric_stereo.stereo": ("photometric_stereo",),
+    "pimper_torch.stage": (
+        "Given",
+        "Stage",
+    ),
+    "pimper_torch.sweep.sweep": ("Sweep",),
+    "pimper_torch.viz.patches": (
+        "by_facet",
+        "plot_in_view",
+        "plot_patch",
+    ),
 }
 
 
 def __getattr__(name: str) -> object:
     if name == "__version__":
         return import_module("pimper_torch.io.version").installed_version()
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(home), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

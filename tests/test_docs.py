@@ -19,6 +19,7 @@ from pimper_torch.cli.main import main
 from pimper_torch.evidence.scenes import RenderedScene, render_shape, save_photographs, sparse_scene
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.io import results
@@ -115,9 +116,23 @@ def a_normal_map(_: pytest.MonkeyPatch) -> dict[str, object]:
     return {"normals": normals, "mask": mask, "K": K}
 
 
+def a_scene_in_tensors(_: pytest.MonkeyPatch) -> dict[str, object]:
+    scene, found = photographed()
+    vertices, faces = icosphere(2)
+    return {
+        "images": scene.views.images.float(),
+        "K": found.cameras.intrinsics,
+        "cam_from_world": found.cameras.cam_from_world,
+        "masks": scene.foreground,
+        "vertices": vertices,
+        "faces": faces,
+    }
+
+
 # What each block of Python takes for granted, by a word of its own.
 GIVEN: dict[str, Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
     "load_views": a_folder_of_photographs,
+    "scene_of": a_scene_in_tensors,
     "factorize_from_many": a_matrix_and_patches,
     "photometric_stereo(": photographs_of_one_viewpoint,
     "integrate_normal_map": a_normal_map,

@@ -8,6 +8,7 @@ from pathlib import Path
 from torch import nn
 
 from pimper_torch.config import require
+from pimper_torch.errors import InputError
 from pimper_torch.kernels.switch import Kernels, compile_all, using
 from pimper_torch.records import (
     Cameras,
@@ -90,12 +91,30 @@ class Chain(Stage):
 
     @abstractmethod
     def passes(
-        self, views: Views, sparse_model: Path | str | None, mesh: Mesh | None
+        self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
         """Run the stages up to the surface; give each pass's records, without reports."""
 
+    def placed(self, views: Views | SparseScene, sparse_model: Path | str | None) -> SparseScene:
+        """Give photographs with their cameras: those that come with them, or else find them.
+
+        Raises:
+            InputError: Cameras come twice.
+        """
+        if isinstance(views, Views):
+            return self.reconstruct(views, sparse_model)
+        if sparse_model is not None:
+            raise InputError(
+                f"{type(self).__name__}: cameras come twice, with the scene and as the model in "
+                f"{sparse_model}; needed: one of the two."
+            )
+        return views
+
     def steps(
-        self, views: Views, sparse_model: Path | str | None = None, mesh: Mesh | None = None
+        self,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None = None,
+        mesh: Mesh | None = None,
     ) -> Iterator[Step]:
         """Run the stages up to the surface, pass by pass; takes what :meth:`forward` takes.
 
@@ -116,13 +135,17 @@ class Chain(Stage):
             yield step.replace(reports=tuple(reports))
 
     def forward(
-        self, views: Views, sparse_model: Path | str | None = None, mesh: Mesh | None = None
+        self,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None = None,
+        mesh: Mesh | None = None,
     ) -> Reconstruction:
         """Reconstruct the surface that the photographs show.
 
         Args:
             views: Photographs, on the device that everything after structure from motion
-                is to run on.
+                is to run on; or a scene whose cameras are known, see
+                :func:`~pimper_torch.io.tensors.scene_of`.
             sparse_model: Folder of a COLMAP model of these photographs, used instead of
                 running structure from motion.
             mesh: A rough surface in that model's frame, of any floating-point type, used

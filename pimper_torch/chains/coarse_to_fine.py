@@ -117,16 +117,16 @@ class CoarseToFine(Chain):
         self._swap(stages)
 
     def passes(
-        self, views: Views, sparse_model: Path | str | None, mesh: Mesh | None
+        self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
-        scene = self.reconstruct(views, sparse_model)
+        scene = self.placed(views, sparse_model)
         outlines = self.outline(scene)
         scene = masked(scene, outlines, self.config.outline.margin)
-        views, cameras = scene.views, scene.cameras
+        cameras = scene.cameras
         rims = self.rim(outlines, cameras)
         coarse = self.enclose(scene, mesh, outlines, rims)
-        sources = self.warp.prepare(views) if isinstance(self.warp, Prepares) else None
+        sources = self.warp.prepare(scene.views) if isinstance(self.warp, Prepares) else None
         heights: SweptPatches | None = None
         surface: Surface | None = None
         first, last = self.config.scales[0], len(self.config.scales)
@@ -139,7 +139,7 @@ class CoarseToFine(Chain):
                     limit = bytes_of(self.config.max_memory)
                     require_memory(limit, patches, first, self.config.scales[-1])
                 heights = photometry_and_heights(
-                    self.warp, self.factorize, self.sweep, views, cameras, patches, sources
+                    self.warp, self.factorize, self.sweep, scene.views, cameras, patches, sources
                 )
                 if number == last:
                     sources = None  # as much memory as the photographs themselves

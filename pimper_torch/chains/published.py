@@ -93,10 +93,10 @@ class Published(Chain):
         self._swap(stages)
 
     def passes(
-        self, views: Views, sparse_model: Path | str | None, mesh: Mesh | None
+        self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
         """Run once through the stages."""
-        scene = self.reconstruct(views, sparse_model)
+        scene = self.placed(views, sparse_model)
         outlines = self.outline(scene)
         scene = masked(scene, outlines, self.config.outline.margin)
         coarse = self.triangulate(scene) if mesh is None else self.enclose(scene, mesh)

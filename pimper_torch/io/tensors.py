@@ -65,7 +65,7 @@ def scene_of(
     matrices = _floats(intrinsics, "intrinsics", "K in pixels").to(pictures)
     poses = _floats(cam_from_world, "cam_from_world", "rigid matrices").to(pictures)
     cameras = Cameras(
-        intrinsics=matrices.expand(count, 3, 3) if matrices.ndim == 2 else matrices,
+        intrinsics=matrices.expand(count, 3, 3) if matrices.shape == (3, 3) else matrices,
         cam_from_world=_squared(poses),
         sizes_px=sizes,
     )

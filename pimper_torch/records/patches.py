@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from pimper_torch.records.faults import beyond, not_finite, not_unit, once, outside, turned_away
 from pimper_torch.records.record import Record
@@ -113,6 +114,10 @@ class OverPatches(Record):
             if shape != tuple(own.inside.shape):
                 needed = f"{tuple(own.inside.shape)}, as its templates"
                 yield f"buckets[{place}]", f"has patches, height, width {shape}", needed
+            kinds = {leaf.dtype for leaf in tree_leaves(bucket) if leaf.is_floating_point()}
+            if kinds - {own.depth.dtype}:
+                found = ", ".join(sorted(map(str, kinds)))
+                yield f"buckets[{place}]", f"is of {found}", f"{own.depth.dtype}, as its templates"
             for name, found, needed in bucket.faults():
                 yield f"buckets[{place}].{name}", found, needed
 
@@ -296,6 +301,27 @@ class PhotometricPatches(OverPatches):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class OverPhotometry(OverPatches):
+    """What is known of all patches beyond their photometry.
+
+    Attributes:
+        photometric: Normals, albedo and light.
+    """
+
+    photometric: PhotometricPatches
+
+    @property
+    def patches(self) -> PatchSet:
+        """The decomposition underneath."""
+        return self.photometric.patches
+
+    def _part(self: AnyPatches, place: int, row: Tensor) -> AnyPatches:
+        photometric = self.photometric._part(place, row)  # type: ignore[attr-defined]
+        bucket = self.buckets[place].take(row)  # type: ignore[attr-defined]
+        return self.replace(photometric=photometric, buckets=(bucket,))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Heights(Record):
     """A bucket of patches swept for height under their light.
 
@@ -327,23 +353,16 @@ class Heights(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class SweptPatches(OverPatches):
+class SweptPatches(OverPhotometry):
     """Heights of all patches, with the photometry they were swept under.
 
     Attributes:
-        photometric: Normals, albedo and light.
         buckets: The heights.
         averaged: Samples in the window that costs were averaged over.
     """
 
-    photometric: PhotometricPatches
     buckets: tuple[Heights, ...]
     averaged: float
-
-    @property
-    def patches(self) -> PatchSet:
-        """The decomposition underneath."""
-        return self.photometric.patches
 
 
 class AlignVerdict(IntEnum):
@@ -396,24 +415,17 @@ class Depths(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class DepthPatches(OverPatches):
+class DepthPatches(OverPhotometry):
     """Relief of all patches, with the photometry it was integrated from.
 
     Attributes:
-        photometric: Normals, albedo and light the reliefs come from.
         buckets: The reliefs.
         mismatch: Root mean square distance of neighbouring reliefs where they overlap, scene
             units: before alignment, then after each of its rounds. ``None`` before it.
     """
 
-    photometric: PhotometricPatches
     buckets: tuple[Depths, ...]
     mismatch: Float[Tensor, " round"] | None = None
-
-    @property
-    def patches(self) -> PatchSet:
-        """The decomposition underneath."""
-        return self.photometric.patches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

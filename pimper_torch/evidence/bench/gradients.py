@@ -167,14 +167,13 @@ def _calls(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str,
     _place(chain, scene, coarse)
     chain.factorize = Whole(chain.factorize)
     hooks = [stage.register_forward_pre_hook(keep(name)) for name, stage in chain.named_children()]
-    chain(scene.views)
+    chain(scene)
     for hook in hooks:
         hook.remove()
     return calls
 
 
 def _place(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> None:
-    chain.reconstruct = Given(scene)
     chain.outline = Given(None)  # outlines jump as photographs change: everything is the object
     if isinstance(chain, Published):
         chain.triangulate = Given(coarse)
@@ -458,7 +457,7 @@ def _chain(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> Probe:
         mesh = coarse.mesh.replace(vertices_world=x["mesh"])
         moved = scene.replace(views=views, cameras=moved_cameras(scene.cameras, x["cameras"]))
         _place(chain, moved, coarse.replace(mesh=mesh))
-        result = chain(views)
+        result = chain(moved)
         found = result.mesh
         return {
             "vertices": found.vertices_world,

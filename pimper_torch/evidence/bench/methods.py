@@ -21,7 +21,6 @@ from pimper_torch.records import (
     Record,
     SparseScene,
 )
-from pimper_torch.stage import Given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -77,9 +76,9 @@ def _preset(name: str) -> Method:
     config = load_config(name)
 
     def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
-        chain = make_chain(config, reconstruct=Given(scene))
+        chain = make_chain(config)
         began = time.perf_counter()
-        result = chain(scene.views)
+        result = chain(scene)
         seconds = time.perf_counter() - began
         found = {key: value for report in result.report for key, value in report.figures.items()}
         return Outcome(

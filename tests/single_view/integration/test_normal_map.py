@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.linalg.rasters import RasterSystem
 from pimper_torch.single_view.integration.discontinuities import DiscontinuityConfig
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map
@@ -394,3 +394,54 @@ def test_a_map_whose_normals_all_fail_is_flat_and_not_valid():
     found = integrate_normal_map(torch.full((5, 6, 3), math.nan))
     assert (found.depth == 0).all()
     assert not found.valid.any()
+
+
+def dome(side=160):
+    line = torch.linspace(-1.05, 1.05, side, dtype=torch.float64)
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    depth = -(1 - x**2 - y**2).clamp_min(1e-9).sqrt()
+    return torch.stack([x, y, depth], dim=-1), x**2 + y**2 < 0.9, depth
+
+
+def test_arrays_and_masks_of_bytes_are_taken():
+    normals, mask, _ = dome(40)
+    found = integrate_normal_map(normals.numpy(), mask.numpy().astype("uint8") * 255).depth
+    expected = integrate_normal_map(normals, mask).depth
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            lambda n: n * torch.tensor([1.0, -1, -1]).double(),
+            "100% of them have z tow",
+        ),
+        (lambda n: 0.5 + 0.5 * n * torch.tensor([1.0, -1, -1]).double(), "decode them as 2 n - 1"),
+        (lambda n: n[..., :2], r"of shape \(40, 40, 2\); needed: floating point, height width 3"),
+        (lambda n: (127 * n).to(torch.int8), "normals are int8"),
+    ],
+)
+def test_normals_of_another_convention_are_refused(change, told):
+    normals, mask, _ = dome(40)
+    with pytest.raises(InputError, match=told):
+        integrate_normal_map(change(normals), mask)
+
+
+@pytest.mark.parametrize("noise_deg", [0.0, 3.0])
+def test_normals_whose_y_points_up_are_told(noise_deg):
+    normals, mask, _ = dome()
+    generator = torch.Generator().manual_seed(3)
+    spread = torch.randn(normals.shape, generator=generator, dtype=torch.float64)
+    normals = normals + noise_deg / 57.3 * spread
+    integrate_normal_map(normals, mask, method="weighted")  # silent: warnings are errors here
+    with pytest.warns(PimperWarning, match="as if y pointed up"):
+        integrate_normal_map(normals * torch.tensor([1.0, -1, 1]).double(), mask, method="weighted")
+
+
+def test_a_plane_is_a_surface_whichever_way_y_points():
+    plane = torch.tensor([0.3, 0.2, -0.9]).double().expand(60, 60, 3)
+    generator = torch.Generator().manual_seed(4)
+    rough = plane + 0.05 * torch.randn(60, 60, 3, generator=generator, dtype=torch.float64)
+    for normals in (plane, rough):
+        integrate_normal_map(normals, method="weighted")

@@ -1,0 +1,36 @@
+"""Log every record of a run, use a factorization of one's own, plot one patch."""
+
+import logging
+import sys
+
+import torch
+
+import pimper_torch as pt
+
+
+class WithoutHighlights(pt.Stage):
+    """The package's factorization, with albedo held below what nine in ten samples have."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.factorize = pt.Factorize(pt.FactorizeConfig(loss="squares"))
+
+    def forward(self, seen: pt.PatchViews) -> pt.PhotometricPatches:
+        found = self.factorize(seen)
+        limit = torch.cat([bucket.albedo[bucket.valid].flatten() for bucket in found.buckets])
+        most = float(limit.quantile(0.9))
+        held = [bucket.replace(albedo=bucket.albedo.clamp_max(most)) for bucket in found.buckets]
+        return found.replace(buckets=tuple(held))
+
+
+def main(scene: pt.SparseScene, mesh: pt.Mesh, picture: str) -> None:
+    chain = pt.load_chain("default", {"scales": [0.5, 1.0]}, factorize=WithoutHighlights())
+    for step in chain.steps(scene, mesh=mesh):
+        for record in (step.scene, step.coarse, step.photometric, step.heights, step.surface):
+            logging.getLogger("run").info("%s: %s", step.scale, record)
+    pt.plot_patch(step.heights[17]).savefig(picture)
+
+
+if __name__ == "__main__":
+    placed, rough = torch.load(sys.argv[1], weights_only=True)
+    main(placed, rough, sys.argv[2])

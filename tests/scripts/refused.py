@@ -1,0 +1,17 @@
+"""What a checker of types refuses: each line would pass for a module of torch's own."""
+
+import pimper_torch as pt
+
+
+class Wrong(pt.Stage):
+    def forward(self, seen: str) -> pt.PhotometricPatches:
+        raise NotImplementedError
+
+
+def refused(chain: pt.CoarseToFine, scene: pt.SparseScene) -> None:
+    chain.factorize("nonsense", 3)  # type: ignore[arg-type, call-arg]
+    chain.factorize = Wrong()  # type: ignore[assignment]
+    pt.Factorize()("nonsense")  # type: ignore[arg-type]
+    pt.Warp()(scene)  # type: ignore[call-arg, arg-type]
+    result = chain(scene)
+    result.mesh.vertices  # type: ignore[attr-defined]  # noqa: B018

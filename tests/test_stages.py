@@ -1,0 +1,139 @@
+"""What a swapped stage may get wrong is told where its record enters the next one."""
+
+import pytest
+import torch
+from torch import nn
+
+import pimper_torch as pt
+from pimper_torch.evidence.bench.gradients import small_scene
+from pimper_torch.stage import Given
+
+# Some of the few patches are not lit in enough views.
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+
+
+@pytest.fixture(scope="module")
+def factorized():
+    scene, coarse = small_scene(num_views=5, width=48)
+    patches = pt.Decompose()(coarse, scene.cameras)
+    seen = pt.Warp()(scene.views, scene.cameras, patches)
+    return scene, seen, pt.Factorize()(seen)
+
+
+def changed(found, **changes):
+    """Change fields of the first bucket."""
+    first, *rest = found.buckets
+    new = {name: change(getattr(first, name)) for name, change in changes.items()}
+    return found.replace(buckets=(first.replace(**new), *rest))
+
+
+def opengl(normals):
+    return normals * torch.tensor([1.0, -1, -1]).to(normals)
+
+
+def spoilt(normals):
+    return torch.where(torch.arange(len(normals))[:, None, None, None] == 0, torch.nan, normals)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "told"),
+    [
+        (lambda found: None, "photometric is NoneType; needed: PhotometricPatches"),
+        (lambda found: found.patches, "photometric is PatchSet; needed: PhotometricPatches"),
+        (lambda found: found.replace(buckets=()), "buckets are 0; needed: one for each of"),
+        (
+            lambda found: found.replace(buckets=found.buckets[::-1]),
+            r"buckets\[0\] has patches, height, width .*as its templates",
+        ),
+        (
+            lambda found: changed(found, normals_patch=lambda n: n.float()),
+            r"buckets\[0\] is of torch.float32, torch.float64; needed: torch.float64",
+        ),
+        (
+            lambda found: changed(found, normals_patch=spoilt),
+            r"normals_patch has .*some of them NaN",
+        ),
+        (lambda found: changed(found, normals_patch=lambda n: 2 * n), "of length 2 to 2"),
+        (
+            lambda found: changed(found, normals_patch=lambda n: 0.5 + 0.5 * opengl(n)),
+            "coded as colours, 0 to 1: decode them as 2 n - 1",
+        ),
+        (
+            lambda found: changed(found, normals_patch=opengl),
+            "they look like OpenGL's, with y up and z to the viewer: negate both",
+        ),
+        (lambda found: changed(found, confidence=lambda c: c + 2), "outside .0, 1., such as"),
+    ],
+)
+def test_a_factorization_of_ones_own_is_told_what_is_wrong(factorized, mistake, told):
+    scene, seen, found = factorized
+    with pytest.raises(pt.InputError, match=f"Sweep: .*{told}"):
+        pt.Sweep()(scene.views, scene.cameras, seen, mistake(found))
+
+
+def test_in_a_chain_the_message_names_the_stage_that_was_handed_it():
+    scene, coarse = small_scene(num_views=5, width=48)
+    chain = pt.load_chain("default", {"scales": [1.0]}, outline=Given(None), enclose=Given(coarse))
+    chain.factorize = Given(None)
+    with pytest.raises(pt.InputError, match=r"Sweep: photometric is NoneType.*the stage before"):
+        chain(scene)
+
+
+def test_what_stages_give_passes_and_is_looked_through_once(factorized, monkeypatch):
+    _, _, found = factorized
+    found.check("test")
+    calls = []
+    monkeypatch.setattr("pimper_torch.records.patches.not_unit", lambda *_: calls.append(1) or "")
+    found.check("test")
+    assert not calls
+    found.replace(
+        buckets=tuple(b.replace(normals_patch=+b.normals_patch) for b in found.buckets)
+    ).check("test")
+    assert len(calls) == len(found.buckets)
+
+
+def test_a_module_of_torchs_own_may_stand_for_a_stage():
+    class Plain(nn.Module):
+        def forward(self, surface):
+            return surface.mesh
+
+    scene, coarse = small_scene(num_views=5, width=48)
+    chain = pt.load_chain("default", {"scales": [1.0]}, outline=Given(None), enclose=Given(coarse))
+    chain.extract = Plain()
+    *_, last = chain.steps(scene)
+    assert len(chain.extract(last.surface).faces) == len(last.surface.faces)
+
+
+def test_patches_are_counted_indexed_and_walked_through(factorized):
+    _, seen, found = factorized
+    patches = found.patches
+    assert len(found) == len(patches) == len(patches.coarse.mesh.faces)
+    one = found[7]
+    assert len(one) == 1
+    assert one.patches.buckets[0].facet.tolist() == [7]
+    place = next(i for i, b in enumerate(patches.buckets) if (b.facet == 7).any())
+    row = patches.buckets[place].facet.tolist().index(7)
+    assert torch.equal(one.buckets[0].albedo[0], found.buckets[place].albedo[row])
+    assert torch.equal(seen[7].buckets[0].valid[0], seen.buckets[place].valid[row])
+    assert [int(each.patches.buckets[0].facet) for each in found] == list(range(len(found)))
+    with pytest.raises(IndexError, match="no patch stands on facet 99"):
+        found[99]
+
+
+def test_a_number_of_every_patch_is_drawn_in_a_view(factorized, tmp_path):
+    scene, seen, found = factorized
+    verdicts = pt.by_facet(found, "verdict")
+    for templates, bucket in zip(found.patches.buckets, found.buckets, strict=True):
+        assert torch.equal(verdicts[templates.facet], bucket.verdict.float())
+    residuals = pt.by_facet(found, "convergence.residual")
+    coarse = found.patches.coarse
+    pt.plot_in_view(coarse, scene.cameras, 0, residuals, "residual").savefig(tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 3000
+    for record in (found.patches, seen, found):
+        pt.plot_patch(record[3]).savefig(tmp_path / "b.png")
+    with pytest.raises(pt.InputError, match="one value a patch"):
+        pt.by_facet(found, "albedo")
+    with pytest.raises(pt.InputError, match="needed: one for each of"):
+        pt.plot_in_view(coarse, scene.cameras, 0, residuals[1:])
+    with pytest.raises(pt.InputError, match="needed: one, such as"):
+        pt.plot_patch(found)

@@ -1,0 +1,128 @@
+"""From tensors to a saved result, and looking inside a run, as a researcher would."""
+
+import logging
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import pimper_torch as pt
+from pimper_torch.evidence.bench.gradients import small_scene
+from pimper_torch.geometry.projection import project
+
+SCRIPT = Path(__file__).parent / "scripts" / "look_inside.py"
+
+
+@pytest.fixture(scope="module")
+def given():
+    """Photographs of a ball, its cameras, its cloud, and facets."""
+    return small_scene(num_views=6, width=64)
+
+
+def scene_of(scene, **changes):
+    fields = {
+        "images": scene.views.images.float(),
+        "intrinsics": scene.cameras.intrinsics,
+        "cam_from_world": scene.cameras.cam_from_world,
+    }
+    return pt.scene_of(**(fields | changes))
+
+
+def test_a_scene_of_tensors_is_that_of_structure_from_motion(given):
+    scene, _ = given
+    made = scene_of(scene, points_world=scene.points_world, observed=scene.observed)
+    assert torch.equal(made.observed, scene.observed)
+    assert torch.equal(made.cameras.intrinsics, scene.cameras.intrinsics.float())
+    point, view = made.observation_point, made.observation_view
+    pixels, _ = project(scene.points_world, scene.cameras.cam_from_world, scene.cameras.intrinsics)
+    torch.testing.assert_close(made.observation_pixels, pixels[view, point].float())
+    assert [lens.camera for lens in made.lenses] == [1] * 6  # one K: one camera
+
+
+def test_arrays_lists_one_pinhole_and_poses_of_three_rows_are_taken(given):
+    scene, _ = given
+    made = scene_of(
+        scene,
+        images=scene.views.images.float().numpy(),
+        intrinsics=scene.cameras.intrinsics[0].tolist(),
+        cam_from_world=scene.cameras.cam_from_world[:, :3].numpy(),
+        masks=np.ones((6, 48, 64), dtype=np.uint8),
+    )
+    torch.testing.assert_close(made.cameras.cam_from_world, scene.cameras.cam_from_world.float())
+    assert made.cameras.intrinsics.shape == (6, 3, 3)
+    assert made.views.masks.dtype == torch.bool
+
+
+def test_a_point_is_taken_to_be_seen_where_it_falls_on_the_object(given):
+    scene, _ = given
+    masks = torch.ones(6, 48, 64, dtype=torch.bool)
+    masks[2] = False
+    made = scene_of(scene, points_world=torch.tensor([[0.0, 0, 0], [50, 0, 0]]), masks=masks)
+    assert made.observed[0].tolist() == [True, True, False, True, True, True]
+    assert not made.observed[1].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"images": torch.zeros(3, 3)}, r"images has shape \(3, 3\); needed: view channel"),
+        ({"images": torch.zeros(6, 3, 48, 64, dtype=torch.uint8)}, "images is uint8; .*load_views"),
+        (
+            {"intrinsics": torch.eye(3)[:2]},
+            r"intrinsics is float32\[2, 3\]; needed: ",
+        ),
+        ({"intrinsics": -torch.eye(3)}, "6 matrices that are no K, the first"),
+        ({"cam_from_world": torch.eye(4).repeat(5, 1, 1)}, r"cam_from_world is float32\[5, 4, 4\]"),
+        (
+            {"cam_from_world": 2 * torch.eye(4).repeat(6, 1, 1)},
+            "6 of 6 matrices that are not rigid",
+        ),
+        ({"masks": torch.ones(6, 4, 4)}, r"masks is bool\[6, 4, 4\]"),
+        ({"names": ["a"] * 6}, "names are 6, 1 of them different"),
+        ({"points_world": [[0.0, 0, 1]], "observed": [[True]]}, r"observed has shape \(1, 1\)"),
+    ],
+)
+def test_what_is_no_scene_is_refused_by_name(given, change, told):
+    with pytest.raises(pt.InputError, match=told):
+        scene_of(given[0], **change)
+
+
+def test_cameras_of_another_convention_are_recognised(given):
+    scene, _ = given
+    opengl = scene.cameras.cam_from_world.clone()
+    opengl[:, 1:3] *= -1
+    with pytest.raises(pt.InputError, match=r"look away from the cloud: 100%.*OpenGL"):
+        scene_of(scene, cam_from_world=opengl, points_world=scene.points_world)
+    mirrored = scene.cameras.cam_from_world.clone()
+    mirrored[:, 0] *= -1
+    with pytest.raises(pt.InputError, match="mirror: their determinant is -1"):
+        scene_of(scene, cam_from_world=mirrored)
+
+
+@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+def test_from_tensors_to_a_saved_result(given, tmp_path):
+    scene, coarse = given
+    chain = pt.load_chain("default", {"scales": [1.0], "outline": {"object": "everything"}})
+    result = chain(scene_of(scene), mesh=coarse.mesh)
+    pt.write_result(result, chain.config, tmp_path / "out")
+    mesh = trimesh.load(tmp_path / "out" / "mesh.ply")
+    off = np.linalg.norm(mesh.vertices, axis=1) - 1  # the ball's own radius
+    assert np.abs(off).mean() < 0.01
+    assert (tmp_path / "out" / "sparse" / "cameras.bin").is_file()
+    with pytest.raises(pt.InputError, match="cameras come twice"):
+        chain(scene_of(scene), tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+def test_a_researcher_looks_into_a_run(given, tmp_path, caplog):
+    scene, coarse = given
+    main = runpy.run_path(str(SCRIPT))["main"]
+    with caplog.at_level(logging.INFO, logger="run"):
+        main(scene.to(torch.float32), coarse.mesh, tmp_path / "patch.png")
+    assert len(caplog.records) == 2 * 5
+    assert all(len(record.getMessage()) < 2000 for record in caplog.records)
+    assert (tmp_path / "patch.png").stat().st_size > 5000
+    assert sum(bool(line.strip()) for line in SCRIPT.read_text().splitlines()) <= 30
