@@ -47,7 +47,7 @@ def spoilt(normals):
         ),
         (
             lambda found: changed(found, normals_patch=lambda n: n.float()),
-            r"buckets\[0\] is of torch.float32, torch.float64; needed: torch.float64",
+            r"buckets\[0\].normals_patch is of torch.float32; needed: torch.float64",
         ),
         (
             lambda found: changed(found, normals_patch=spoilt),
@@ -86,9 +86,8 @@ def test_what_stages_give_passes_and_is_looked_through_once(factorized, monkeypa
     monkeypatch.setattr("pimper_torch.records.patches.not_unit", lambda *_: calls.append(1) or "")
     found.check("test")
     assert not calls
-    found.replace(
-        buckets=tuple(b.replace(normals_patch=+b.normals_patch) for b in found.buckets)
-    ).check("test")
+    others = [one.replace(normals_patch=one.normals_patch.clone()) for one in found.buckets]
+    found.replace(buckets=tuple(others)).check("test")
     assert len(calls) == len(found.buckets)
 
 

@@ -13,6 +13,8 @@ _UNIT = 0.02
 # Of a rotation, entry by entry: files with six digits reach 1e-6.
 _RIGID = 1e-3
 
+_ROUNDING = 1e-5  # of shares in single precision
+
 _sound: Any = WeakIdKeyDictionary()  # torch does not type it
 
 
@@ -56,7 +58,7 @@ def not_finite(values: Float[Tensor, "..."], where: Bool[Tensor, "..."] | None =
 
 def outside(values: Float[Tensor, "..."], high: float) -> str:
     """Say how many values are not finite, below 0 or above ``high``."""
-    bad = ~((values >= 0) & (values <= high) & values.isfinite())
+    bad = ~((values >= -_ROUNDING) & (values <= high + _ROUNDING) & values.isfinite())
     count = int(bad.sum())
     if count == 0:
         return ""

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
 from pimper_torch.records.faults import beyond, not_finite, not_unit, once, outside, turned_away
 from pimper_torch.records.record import Record
@@ -114,10 +113,6 @@ class OverPatches(Record):
             if shape != tuple(own.inside.shape):
                 needed = f"{tuple(own.inside.shape)}, as its templates"
                 yield f"buckets[{place}]", f"has patches, height, width {shape}", needed
-            kinds = {leaf.dtype for leaf in tree_leaves(bucket) if leaf.is_floating_point()}
-            if kinds - {own.depth.dtype}:
-                found = ", ".join(sorted(map(str, kinds)))
-                yield f"buckets[{place}]", f"is of {found}", f"{own.depth.dtype}, as its templates"
             for name, found, needed in bucket.faults():
                 yield f"buckets[{place}].{name}", found, needed
 
@@ -298,6 +293,17 @@ class PhotometricPatches(OverPatches):
 
     patches: PatchSet
     buckets: tuple[Photometry, ...]
+
+    def faults(self) -> Iterator[tuple[str, str, str]]:
+        """List normals of another floating-point type than the templates, too."""
+        yield from super(PhotometricPatches, self).faults()
+        for place, (bucket, own) in enumerate(
+            zip(self.buckets, self.patches.buckets, strict=False)
+        ):
+            found, needed = bucket.normals_patch.dtype, own.depth.dtype
+            if found != needed:
+                name = f"buckets[{place}].normals_patch"
+                yield name, f"is of {found}", f"{needed}, as its templates"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
