@@ -37,7 +37,7 @@ from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Mesh, Outlines, RimPoints, SparseScene
-from pimper_torch.rims.constraints import Rim
+from pimper_torch.rims.constraints import Rim, Rims
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.surfaces import simplified
 from pimper_torch.sfm.undistort import undistorted
@@ -87,7 +87,6 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
     enclose = Enclose()
     config = enclose.config
     rims = Rim()(outlines, scene.cameras)
-    assert rims is not None  # rendered outlines agree
     hull = rims.hull
     trusted = enclose.trusted(scene)
     inside = trusted[hull.depth_of(scene.points_world[trusted]) > 0]
@@ -100,7 +99,8 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
 
     def given(masked: bool) -> Surface:
         some = scene.replace(views=scene.views.replace(masks=outlines.masks if masked else None))
-        found = enclose(some).mesh
+        free = Rims.none(Outlines.everything(some.views), some.cameras)
+        found = enclose(some, free).mesh
         return found.vertices_world, found.faces
 
     def facets(some: Surface) -> Surface:
@@ -117,7 +117,7 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
             vertices[used],
             faces,
             num_faces=config.num_facets,
-            boundary_weight=config.boundary_weight,
+            boundary_weight=10.0,
         )
 
     def both() -> Surface:
@@ -130,7 +130,8 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
             normals_world=normalize(normals[unknown], dim=1),
             noise=torch.zeros(int(unknown.sum())),
         )
-        return poisson(joined_points(joined, filled), pixel, config.outlined)
+        cell = config.outlined.cell_px * pixel
+        return poisson(joined_points(joined, filled), cell, config.outlined.max_depth)
 
     return {
         "no outlines": lambda: given(False),

@@ -49,6 +49,7 @@ def reconstruction():
         Depths,
         Lens,
         Mesh,
+        Outlines,
         PatchSet,
         PhotometricPatches,
         Photometry,
@@ -141,6 +142,7 @@ def reconstruction():
     return Reconstruction(
         mesh=mesh,
         scene=scene,
+        outlines=Outlines.everything(scene.views),
         coarse=coarse,
         patches=DepthPatches(photometric=photometric, buckets=(depths,)),
         report=(

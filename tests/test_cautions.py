@@ -6,6 +6,7 @@ from torch import nn
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.errors import PimperWarning, caution, held
 from pimper_torch.evidence.bench.gradients import small_scene
+from pimper_torch.records import Outlines
 from pimper_torch.stage import Given
 
 
@@ -28,9 +29,10 @@ def rounds(messages):
         for message in left.pop(0):
             caution(message)
 
-    chain.outline = Given(None)
+    scene, _ = small_scene()
+    chain.outline = Given(Outlines.everything(scene.views))
     chain.factorize = Stub(factorize)
-    return list(chain.passes(small_scene()[0], None, None))
+    return list(chain.passes(scene, None, None))
 
 
 def test_the_last_rounds_figures_are_said_once():

@@ -149,7 +149,7 @@ class Dragging(nn.Module):
         self.fuse = fuse
         self.sound: list[Surface] = []
 
-    def forward(self, swept: SweptPatches, rims: Rims | None, expected: bool = True) -> Surface:
+    def forward(self, swept: SweptPatches, rims: Rims, expected: bool = True) -> Surface:
         surface: Surface = self.fuse(swept, rims, expected)
         self.sound.append(surface)
         vertices = surface.vertices_world.clone()
@@ -169,7 +169,7 @@ class Spy(nn.Module):
         self.stage = stage
         self.surface: Surface | None = None
 
-    def forward(self, swept: SweptPatches, surface: Surface, rims: Rims | None) -> CoarseMesh:
+    def forward(self, swept: SweptPatches, surface: Surface, rims: Rims) -> CoarseMesh:
         self.surface = surface
         found: CoarseMesh = self.stage(swept, surface, rims)
         return found

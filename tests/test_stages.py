@@ -20,6 +20,11 @@ def factorized():
     return scene, seen, pt.Factorize()(seen)
 
 
+def chain_on(scene, coarse):
+    everything = Given(pt.Outlines.everything(scene.views))
+    return pt.load_chain("default", {"scales": [1.0]}, outline=everything, enclose=Given(coarse))
+
+
 def changed(found, **changes):
     """Change fields of the first bucket."""
     first, *rest = found.buckets
@@ -73,7 +78,7 @@ def test_a_factorization_of_ones_own_is_told_what_is_wrong(factorized, mistake, 
 
 def test_in_a_chain_the_message_names_the_stage_that_was_handed_it():
     scene, coarse = small_scene(num_views=5, width=48)
-    chain = pt.load_chain("default", {"scales": [1.0]}, outline=Given(None), enclose=Given(coarse))
+    chain = chain_on(scene, coarse)
     chain.factorize = Given(None)
     with pytest.raises(pt.InputError, match=r"Sweep: photometric is NoneType.*the stage before"):
         chain(scene)
@@ -97,7 +102,7 @@ def test_a_module_of_torchs_own_may_stand_for_a_stage():
             return surface.mesh
 
     scene, coarse = small_scene(num_views=5, width=48)
-    chain = pt.load_chain("default", {"scales": [1.0]}, outline=Given(None), enclose=Given(coarse))
+    chain = chain_on(scene, coarse)
     chain.extract = Plain()
     *_, last = chain.steps(scene)
     assert len(chain.extract(last.surface).faces) == len(last.surface.faces)

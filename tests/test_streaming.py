@@ -12,8 +12,9 @@ from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.mesh_light import thinned
-from pimper_torch.records import StageReport
+from pimper_torch.records import Outlines, StageReport
 from pimper_torch.reporting import Silent
+from pimper_torch.rims.constraints import Rims
 from pimper_torch.stage import Given
 from pimper_torch.sweep.sweep import Sweep
 
@@ -111,7 +112,8 @@ class Listener(Silent):
 def in_rounds(listener, **changes):
     chain = pt.load_chain("default", {"scales": [0.5, 1.0], **changes}, listener)
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
-    chain.reconstruct, chain.outline = Given(scene), Given(None)
+    chain.reconstruct = Given(scene)
+    chain.outline = Given(Outlines.everything(scene.views))
     chain.enclose = Given(coarse)
     return chain, scene
 
@@ -126,7 +128,8 @@ def test_steps_show_the_records_of_every_pass_and_end_where_the_run_ends():
     assert torch.equal(chain.extract(steps[-1].surface).vertices_world, result.mesh.vertices_world)
     # The second pass stands on facets that were remeshed on the first one's surface.
     assert steps[0].coarse is chain.enclose.record
-    remeshed = chain.adapt(steps[0].heights, steps[0].surface, None)
+    rims = Rims.none(steps[0].outlines, scene.cameras)
+    remeshed = chain.adapt(steps[0].heights, steps[0].surface, rims)
     assert torch.equal(steps[1].coarse.mesh.faces, remeshed.mesh.faces)
 
 

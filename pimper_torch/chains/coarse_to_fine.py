@@ -102,17 +102,17 @@ class CoarseToFine(Chain):
         super().__init__(config.kernels, observer)
         self.reconstruct = Reconstruct(config.reconstruct, cache)
         self.outline = Outline(config.outline)
-        self.rim: Callable[[Outlines | None, Cameras], Rims | None] = Rim(config.rims)
-        self.enclose: Callable[
-            [SparseScene, Mesh | None, Outlines | None, Rims | None], CoarseMesh
-        ] = Enclose(config.enclose)
+        self.rim: Callable[[Outlines, Cameras], Rims] = Rim(config.rims)
+        self.enclose: Callable[[SparseScene, Rims, Mesh | None], CoarseMesh] = Enclose(
+            config.enclose
+        )
         self.decompose = Decompose(config.decompose)
         self.warp: Warping = Warp(config.warp)
         self.factorize: Factorizing = Factorize(config.factorize)
         self.sweep: Sweeping = Sweep(config.sweep)
-        self.fuse: Callable[[SweptPatches, Rims | None, bool], Surface] = Fuse(config.fuse)
+        self.fuse: Callable[[SweptPatches, Rims, bool], Surface] = Fuse(config.fuse)
         self.mend: Callable[[Surface], Surface] = Mend(config.mend)
-        self.adapt: Callable[[SweptPatches, Surface, Rims | None], CoarseMesh] = Adapt(config.adapt)
+        self.adapt: Callable[[SweptPatches, Surface, Rims], CoarseMesh] = Adapt(config.adapt)
         self.extract = Extract(config.extract)
         self._swap(stages)
 
@@ -125,7 +125,7 @@ class CoarseToFine(Chain):
         scene = masked(scene, outlines, self.config.outline.margin)
         cameras = scene.cameras
         rims = self.rim(outlines, cameras)
-        coarse = self.enclose(scene, mesh, outlines, rims)
+        coarse = self.enclose(scene, rims, mesh)
         sources = self.warp.prepare(scene.views) if isinstance(self.warp, Prepares) else None
         heights: SweptPatches | None = None
         surface: Surface | None = None

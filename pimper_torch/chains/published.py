@@ -33,6 +33,7 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer
+from pimper_torch.rims.constraints import Rims
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 
 
@@ -82,7 +83,7 @@ class Published(Chain):
         self.reconstruct = Reconstruct(config.reconstruct, cache)
         self.outline = Outline(config.outline)
         self.triangulate: Callable[[SparseScene], CoarseMesh] = Triangulate(config.triangulate)
-        self.enclose: Callable[[SparseScene, Mesh | None], CoarseMesh] = Enclose(config.enclose)
+        self.enclose: Callable[[SparseScene, Rims, Mesh], CoarseMesh] = Enclose(config.enclose)
         self.decompose = Decompose(config.decompose)
         self.warp: Callable[[Views, Cameras, PatchSet], PatchViews] = Warp(config.warp)
         self.factorize: Callable[[PatchViews], PhotometricPatches] = Factorize(config.factorize)
@@ -99,7 +100,10 @@ class Published(Chain):
         scene = self.placed(views, sparse_model)
         outlines = self.outline(scene)
         scene = masked(scene, outlines, self.config.outline.margin)
-        coarse = self.triangulate(scene) if mesh is None else self.enclose(scene, mesh)
+        if mesh is None:
+            coarse = self.triangulate(scene)
+        else:
+            coarse = self.enclose(scene, Rims.none(outlines, scene.cameras), mesh)
         patches = self.decompose(coarse, scene.cameras, None, 1.0)
         seen = self.warp(scene.views, scene.cameras, patches)
         heights = self.align(self.integrate(self.factorize(seen)))

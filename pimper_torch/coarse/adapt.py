@@ -87,7 +87,7 @@ class Adapt(Stage):
         self,
         swept: SweptPatches,
         surface: Surface,
-        rims: Rims | None = None,
+        rims: Rims,
     ) -> CoarseMesh:
         """Adapt the mesh that the patches stand on to the surface that was found.
 
@@ -105,11 +105,11 @@ class Adapt(Stage):
         ):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
-            enough = heights.num_views >= (_SEEING if rims is None else 1)
+            enough = heights.num_views >= (1 if rims.confine else _SEEING)
             seen = seen.index_copy(0, templates.facet, enough)
         spacing = float(patches.buckets[0].spacing[0].detach())
         inside = None
-        if rims is not None:
+        if rims.confine:
             mesh = patches.coarse.mesh
             seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
             inside = within(rims.hull, surface, patches.num_patches)

@@ -20,8 +20,11 @@ def cropped(scene: SparseScene, outlines: Outlines) -> SparseScene:
 
     Args:
         scene: Photographs and cameras.
-        outlines: Of all views; those not trusted mask their photographs too.
+        outlines: Of all views; those not trusted mask their photographs too. What leaves nothing
+            out gives the scene as it is.
     """
+    if outlines.source == "everything":
+        return scene
     boxes = _boxes(outlines, scene.cameras.sizes_px)
     low = boxes[:, 0]
     size = boxes[:, 1] - low

@@ -1,4 +1,4 @@
-"""The coarse surface inside outlines: points where there is texture, rims, smooth between them."""
+"""The coarse surface: points where there is texture, rims where outlines are, smooth between."""
 
 import math
 from dataclasses import dataclass
@@ -22,13 +22,14 @@ from pimper_torch.coarse.trim import (
     hanging_together,
     point_distances,
     supported_pieces,
+    too_far,
     without_small_holes,
 )
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.records import Cameras, Outlines, Record, RimPoints, SparseScene, Support
+from pimper_torch.records import Cameras, Record, RimPoints, SparseScene, Support
 from pimper_torch.rims.constraints import Rims
 from pimper_torch.sfm.surfaces import poisson_surface
 
@@ -43,6 +44,10 @@ _LEAST_POINTS = 16
 
 # Views that see something behind a face which is a lid; that show a lit one lit.
 _DENYING, _LIGHTING = 2, 2
+
+# Without outlines: pixels from all points, beyond which seen faces without any go, and with them
+# what hangs together with them further than the second from all points.
+_GAP_PX, _BRINK_PX = 40.0, 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +124,6 @@ class FineSurface(Record):
 def outlined_surface(
     scene: SparseScene,
     trusted: Int[Tensor, " trusted"],
-    outlines: Outlines,
     rims: Rims,
     densify: DensifyConfig,
     config: OutlinedConfig,
@@ -129,22 +133,22 @@ def outlined_surface(
     Args:
         scene: Photographs, cameras and cloud.
         trusted: Points of the cloud inside the visual hull; an object without texture has none.
-        outlines: Of all views.
-        rims: What they say about the surface.
+        rims: What outlines say about the surface.
         densify: How photographs are matched.
         config: Settings.
 
     Returns:
-        What a view sees of the closed surface. It is closed except where nothing was
-        photographed, and where views look into an opening.
+        What a view sees of the closed surface, inside the outlines. It is closed except where
+        nothing was photographed, and where views look into an opening. Where outlines leave nothing
+        out, faces without points have to be near to some, and to show something in two views.
 
     Raises:
         ReconstructionError: Outlines and photographs tell of no surface.
     """
-    part = cropped(scene, outlines)
+    part = cropped(scene, rims.outlines)
     middle = rims.hull.corners_world.mean(dim=0).to(scene.points_world)
     cloud, maps = no_points(middle), None
-    if len(trusted) >= _LEAST_POINTS:
+    if len(trusted) >= _LEAST_POINTS or not rims.confine:
         found, maps, pixel = matched_cloud(part, trusted, densify, config.point_px)
         cloud = found.take(rims.hull.depth_of(found.points_world) > -config.tolerance_px * pixel)
         level = maps.level
@@ -155,12 +159,15 @@ def outlined_surface(
     said = evidence(vertices, faces, level, maps)
     middles = vertices[faces].mean(dim=1)
     support = supports(middles, cloud, rim, said, config.reach_px * pixel)
-    inside = rims.hull.holds(middles, config.tolerance_px * pixel)
+    if rims.confine:
+        inside = rims.hull.holds(middles, config.tolerance_px * pixel)
+    else:
+        inside = near_points(faces, middles, cloud, support, said, pixel)
     kept = seen_surface(vertices, faces, support, said, inside, pixel, config)
     if not bool(kept.any()):
         raise ReconstructionError(
-            f"coarse mesh: none of {len(faces)} faces inside the outlines is seen. Look at the "
-            "masks, or leave them out."
+            f"coarse mesh: none of {len(faces)} faces is seen by the photographs inside the "
+            "outlines. Look at the masks, leave them out, or bring a mesh of your own."
         )
     used, faces = torch.unique(faces[kept], return_inverse=True)
     return FineSurface(
@@ -201,9 +208,14 @@ def closed_surface(
             raise ReconstructionError(
                 f"coarse mesh: {len(cloud.points_world)} points were matched inside the outlines, "
                 f"and {len(touched.ray)} rays touch the surface there; some hundreds are needed. "
-                "Look at the masks, or bring a mesh of your own."
+                "Take photographs that overlap more, look at the masks, or bring a mesh of your "
+                "own."
             )
-        vertices, faces = poisson(joined_points(cloud, rim), pixel, config)
+        # Points alone know more than rims: their octree's cells are as wide as two of their grid's.
+        cell = (config.cell_px if len(touched.ray) else 2 * config.point_px) * pixel
+        vertices, faces = poisson(joined_points(cloud, rim), cell, config.max_depth)
+        if not len(touched.ray):
+            break
         normals = vertex_normals(vertices, faces)
         front = shown(vertices, faces, normals, rims.cameras, config.cell_px * pixel)
         places, normals = vertices[front], normals[front]
@@ -235,19 +247,50 @@ def shown(
 
 
 def poisson(
-    cloud: OrientedPoints, pixel: float, config: OutlinedConfig
+    cloud: OrientedPoints, cell: float, max_depth: int
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Put a closed surface through points; the arguments are those of :func:`closed_surface`."""
+    """Put a closed surface through points.
+
+    Args:
+        cloud: Points with outward normals.
+        cell: Side of the octree's cells, scene units.
+        max_depth: Of the octree, whatever the cell.
+    """
     points = cloud.points_world
     # COLMAP works in single precision: a cloud far from the origin is brought there.
     middle = points.median(dim=0).values
     extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
-    cells = extent / (config.cell_px * pixel)
-    depth = min(config.max_depth, max(4, round(math.log2(cells))))
+    cells = extent / cell
+    depth = min(max_depth, max(4, round(math.log2(cells))))
     vertices, faces = poisson_surface(
         points - middle, cloud.normals_world, depth=depth, point_weight=1.0
     )
     return vertices.to(points) + middle, faces.to(points.device)
+
+
+def near_points(
+    faces: Int[Tensor, "face 3"],
+    middle: Float[Tensor, "face 3"],
+    cloud: OrientedPoints,
+    support: Int[Tensor, " face"],
+    said: Evidence,
+    pixel: float,
+) -> Bool[Tensor, " face"]:
+    """Mark faces with points, and those between points that views see and that are near to some.
+
+    Args:
+        faces: Of the closed surface.
+        middle: Of them.
+        cloud: Matched points.
+        support: Of each face.
+        said: What the photographs say about each.
+        pixel: Size of one, scene units.
+    """
+    supported = support == Support.POINTS
+    distance = point_distances(middle, cloud.points_world)
+    between = (said.lit >= _LIGHTING) & (said.denied < _DENYING) & ~supported
+    far = too_far(faces, between, distance, _GAP_PX * pixel, _BRINK_PX * pixel)
+    return (supported & (said.seen >= _LIGHTING)) | (between & ~far)
 
 
 def supports(

@@ -179,14 +179,12 @@ class Fuse(Stage):
         super().__init__()
         self.config = config or FuseConfig()
 
-    def forward(
-        self, swept: SweptPatches, rims: Rims | None = None, expected: bool = True
-    ) -> Surface:
+    def forward(self, swept: SweptPatches, rims: Rims, expected: bool = True) -> Surface:
         """Fuse what is known of all patches.
 
         Args:
             swept: Photometry and swept heights of all patches.
-            rims: What outlines say about the surface; ``None`` without outlines.
+            rims: What outlines say about the surface.
             expected: Whether the expected error of every vertex is found.
 
         The convergence's residual is the root mean square distance that the surface moved, in
@@ -271,14 +269,15 @@ class Fuse(Stage):
         shared = None if common is None else alike(common, task.lattice.facet, upright)
         return [swept_heights(*told, task.correlated, shared)]
 
-    def _contacts(self, task: _Task, swept: SweptPatches, rims: Rims | None) -> list[Contacts]:
+    def _contacts(self, task: _Task, swept: SweptPatches, rims: Rims) -> list[Contacts]:
         """List the places that the surface passes through: the cloud's points, and rims."""
         ground, cloud = _ground(task), swept.patches.coarse.points
         found = []
         if self.config.points and cloud is not None:
             found.append(cloud_points(cloud, ground))
-        if self.config.rims and rims is not None:
-            found.append(rim_tangents(rims.touching(task.places, task.shape), ground))
+        touched = rims.touching(task.places, task.shape)
+        if self.config.rims and len(touched.ray):
+            found.append(rim_tangents(touched, ground))
         return found
 
     def _learnt(self, task: _Task, contacts: list[Contacts]) -> _Learnt:

@@ -112,7 +112,7 @@ def _write_all(
         write_ply(result.mesh, folder / "mesh.ply")
         write_glb(result.mesh, folder / "mesh.glb")
         write_model(result.scene, folder / "sparse")
-        if result.outlines is not None:
+        if result.outlines.source != "everything":
             _write_masks(result.outlines, result.scene, folder / "masks")
     with part(2, _PARTS):
         _write_maps(result, folder)

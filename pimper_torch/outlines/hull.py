@@ -100,6 +100,25 @@ class Hull(Record):
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Everywhere(Hull):
+    """The hull of outlines that leave nothing out."""
+
+    @classmethod
+    def of(cls, cameras: Cameras) -> "Everywhere":
+        """Make it, of the cameras' floating-point type and device."""
+        like = cameras.cam_from_world
+        return cls(
+            origin_world=like.new_zeros(3),
+            spacing=like.new_ones(()),
+            distance=like.new_full((1, 1, 1), torch.inf),
+        )
+
+    def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Say that points lie infinitely deep inside."""
+        return torch.full_like(points_world[..., 0], torch.inf)
+
+
 def visual_hull(
     outlines: Outlines,
     cameras: Cameras,

@@ -91,14 +91,14 @@ class Outline(Stage):
         self.config = config or OutlineConfig()
 
     @torch.no_grad()
-    def forward(self, scene: SparseScene) -> Outlines | None:
+    def forward(self, scene: SparseScene) -> Outlines:
         """Find outlines, or take the masks for them.
 
         Args:
             scene: Photographs, cameras and cloud.
 
         Returns:
-            ``None`` for everything: where it is asked for, or, with a
+            Everything where that is asked for, and, with a
             :class:`~pimper_torch.errors.PimperWarning` that says why, where outlines cannot be
             trusted.
 
@@ -106,8 +106,9 @@ class Outline(Stage):
             InputError: Masks are asked for, and none are given.
         """
         config, masks = self.config, scene.views.masks
+        everything = Outlines.everything(scene.views)
         if config.object == "everything":
-            return None
+            return everything
         if masks is not None:
             trusted = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
             return Outlines(inside=masks.float(), trusted=trusted, source="masks")
@@ -119,11 +120,11 @@ class Outline(Stage):
         cuts = self._cuts(scene)
         if cuts is None:
             _warn("the views' outlines have nothing in common")
-            return None
+            return everything
         doubt = self._doubt(agreement_of(cuts))
         if doubt:
             _warn(doubt)
-            return None
+            return everything
         cuts = settled(cuts)
         found = _at_full_size(cuts, scene.views)
         trusted = agreement_of(cuts).trusted(config.least_covered).to(found.device)
@@ -184,15 +185,15 @@ class Outline(Stage):
         return ""
 
 
-def masked(scene: SparseScene, outlines: Outlines | None, margin: float) -> SparseScene:
+def masked(scene: SparseScene, outlines: Outlines, margin: float) -> SparseScene:
     """Give the scene with outlines that were found for masks, a little wider where unsure.
 
     Args:
         scene: With photographs.
-        outlines: Masks that a person gave stay as they are.
+        outlines: Masks that a person gave stay as they are, whether or not they are the object.
         margin: Probability above which a pixel is used as the object's.
     """
-    if outlines is None or outlines.source == "masks":
+    if outlines.source != "found":
         return scene
     return scene.replace(views=scene.views.replace(masks=outlines.inside > margin))
 

@@ -33,7 +33,7 @@ class Reconstruction(Record):
     Attributes:
         mesh: One connected surface with vertex normals, albedo and confidence.
         scene: Cameras, undistorted photographs and the sparse cloud, in the mesh's frame.
-        outlines: Where every view shows the object; ``None`` where everything is.
+        outlines: Where every view shows the object.
         coarse: The facets.
         patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
         report: One entry a stage, in the order they ran.
@@ -44,7 +44,7 @@ class Reconstruction(Record):
     coarse: CoarseMesh
     patches: DepthPatches | SweptPatches
     report: tuple[StageReport, ...]
-    outlines: Outlines | None = None
+    outlines: Outlines
 
     @property
     def cameras(self) -> Cameras:

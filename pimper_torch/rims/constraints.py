@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.projection import triangulate_rays
-from pimper_torch.outlines.hull import Hull, visual_hull
+from pimper_torch.outlines.hull import Everywhere, Hull, visual_hull
 from pimper_torch.records import Cameras, Outlines, Record, RimPoints, RimRays
 from pimper_torch.rims.contours import RimConfig, rim_rays
 from pimper_torch.rims.touching import rim_points
@@ -25,14 +25,34 @@ class Rims(Record):
     """Rays that the surface is tangent to, and the hull that it lies in.
 
     Attributes:
+        outlines: Of all views.
         rays: Through the outlines of all trusted views.
         cameras: Of all views.
         hull: The visual hull of the same outlines.
     """
 
+    outlines: Outlines
     rays: RimRays
     cameras: Cameras
     hull: Hull
+
+    @classmethod
+    def none(cls, outlines: Outlines, cameras: Cameras) -> "Rims":
+        """Give rims that constrain nothing: no rays, and a hull that holds everything."""
+        like = cameras.cam_from_world
+        rays = RimRays(
+            view=torch.zeros(0, dtype=torch.long, device=like.device),
+            pixels=like.new_zeros(0, 2),
+            rays_world=like.new_zeros(0, 3),
+            normals_world=like.new_zeros(0, 3),
+            sigma_px=like.new_zeros(0),
+        )
+        return cls(outlines=outlines, rays=rays, cameras=cameras, hull=Everywhere.of(cameras))
+
+    @property
+    def confine(self) -> bool:
+        """Whether the object lies in a hull that outlines tell."""
+        return not isinstance(self.hull, Everywhere)
 
     def touching(
         self, points_world: Float[Tensor, "point 3"], normals_world: Float[Tensor, "point 3"]
@@ -43,6 +63,15 @@ class Rims(Record):
             points_world: Of the surface: a cloud or a mesh's vertices.
             normals_world: Theirs, unit, outward.
         """
+        if not self.confine:
+            rays, none = self.rays, points_world.new_zeros(0)
+            return RimPoints(
+                points_world=none.reshape(0, 3),
+                normals_world=none.reshape(0, 3),
+                variance=none,
+                view=rays.view,
+                ray=rays.view,
+            )
         return rim_points(self.rays, self.cameras, self.hull, points_world, normals_world)
 
 
@@ -54,18 +83,19 @@ class Rim(Stage):
         self.config = config or RimConfig()
 
     @torch.no_grad()
-    def forward(self, outlines: Outlines | None, cameras: Cameras) -> Rims | None:
+    def forward(self, outlines: Outlines, cameras: Cameras) -> Rims:
         """Cast rays through the outlines and build their visual hull.
 
         Args:
-            outlines: ``None`` where everything is the object.
+            outlines: Of all views.
             cameras: Of the same views.
 
         Returns:
-            ``None`` without outlines, and, with a warning, where they have no place in common.
+            Rims that constrain nothing where outlines leave nothing out, and, with a warning,
+            where they have no place in common.
         """
-        if outlines is None:
-            return None
+        if outlines.source == "everything":
+            return Rims.none(outlines, cameras)
         box = box_round(outlines, cameras)
         hull = None
         if box is not None:  # voxels need no more than single precision
@@ -80,9 +110,9 @@ class Rim(Stage):
                 ),
                 stacklevel=2,
             )
-            return None
+            return Rims.none(outlines, cameras)
         rays = rim_rays(outlines, cameras, self.config)
-        return Rims(rays=rays, cameras=cameras, hull=hull)
+        return Rims(outlines=outlines, rays=rays, cameras=cameras, hull=hull)
 
 
 def box_round(outlines: Outlines, cameras: Cameras) -> Float[Tensor, "2 3"] | None:

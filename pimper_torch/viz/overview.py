@@ -136,7 +136,7 @@ def _with_band(
 def _all_views(result: Reconstruction) -> Panel | None:
     """Show all photographs with their outlines; nothing where there are none."""
     outlines = result.outlines
-    if outlines is None:
+    if outlines.source == "everything":
         return None
     width_px = round(_DPI * _ACROSS * _PANEL_IN)
     tiles = outlined_thumbnails(
@@ -204,7 +204,8 @@ def _photograph(result: Reconstruction, own: Cameras) -> tuple[Picture, Picture,
     right, bottom = (int(corner) for corner in high.ceil())
     crop = slice(top, min(bottom, height)), slice(left, min(right, width))
     image = result.scene.views.images[reference][:, *crop].movedim(0, -1)
-    inside = None if result.outlines is None else _array(result.outlines.inside[reference][crop])
+    everything = result.outlines.source == "everything"
+    inside = None if everything else _array(result.outlines.inside[reference][crop])
     coarse = result.coarse.mesh
     pixels, _ = project(coarse.vertices_world, own.cam_from_world[0], own.intrinsics[0])
     corners = (pixels - pixels.new_tensor([left, top]))[coarse.faces]

@@ -5,6 +5,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.enclose import EncloseConfig
+from pimper_torch.coarse.outlined import OutlinedConfig
 from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.evidence.scenes.render import render_shape
 from pimper_torch.evidence.scenes.shapes import Sphere
@@ -16,7 +17,7 @@ from pimper_torch.records import Outlines
 SETTINGS = EncloseConfig(
     num_facets=600,
     densify=DensifyConfig(coarsest_px=120, levels=1, most_hypotheses=48),
-    hole_px=12.0,
+    outlined=OutlinedConfig(hole_px=12.0),
 )
 
 

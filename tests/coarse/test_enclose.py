@@ -11,13 +11,20 @@ from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals, face_pairs
-from pimper_torch.records import Mesh
+from pimper_torch.records import Mesh, Outlines, Support
+from pimper_torch.rims.constraints import Rims
 from tests.coarse.ball import SETTINGS, photographed
+
+
+def enclose(scene, mesh=None):
+    """Enclose what the photographs show, without outlines."""
+    rims = Rims.none(Outlines.everything(scene.views), scene.cameras)
+    return Enclose(SETTINGS)(scene, rims, mesh)
 
 
 @pytest.fixture(scope="module")
 def enclosed(round_about):
-    return Enclose(SETTINGS)(round_about)
+    return enclose(round_about)
 
 
 def test_views_all_round_give_one_closed_surface(enclosed):
@@ -48,13 +55,15 @@ def test_facets_carry_the_cloud(enclosed, round_about):
     assert ((points.points_world - corners.mean(dim=1)).norm(dim=-1) < 1.2 * reach).all()
     assert points.covariance_world.shape == (len(points.facet), 3, 3)
     assert not enclosed.is_point.any()
-    assert enclosed.support is None  # told where there are outlines
+    # A facet is 6 pixels wide, and a third of them have a point within 4.
+    assert (enclosed.support == Support.POINTS).float().mean() > 0.3
+    assert (enclosed.support >= Support.LIGHT).all()
 
 
 def test_a_few_views_on_an_arc_give_the_side_that_they_see():
     cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
     scene = photographed(cameras)
-    mesh = Enclose(SETTINGS)(scene).mesh
+    mesh = enclose(scene).mesh
     # Whatever is seen by nobody is gone, and black background gave nothing.
     assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 0.1
     assert mesh.vertices_world[:, 2].min() > -0.6
@@ -71,7 +80,7 @@ def test_masks_keep_the_rest_out():
     scene = photographed(cameras)
     masks = scene.views.inside.clone()
     masks[:, 50:] = False  # the lower half of the ball in every picture
-    mesh = Enclose(SETTINGS)(scene.replace(views=scene.views.replace(masks=masks))).mesh
+    mesh = enclose(scene.replace(views=scene.views.replace(masks=masks))).mesh
     assert mesh.vertices_world[:, 1].min() > -0.1  # y is up
     assert mesh.vertices_world[:, 1].max() > 0.6
 
@@ -79,7 +88,7 @@ def test_masks_keep_the_rest_out():
 def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_about):
     vertices, faces = icosphere(3)
     inside_out = Mesh(vertices_world=vertices, faces=faces.flip(1))
-    coarse = Enclose(SETTINGS)(round_about, inside_out)
+    coarse = enclose(round_about, inside_out)
     outward = face_normals(coarse.mesh.vertices_world, coarse.mesh.faces)
     middle = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
     assert ((outward * middle).sum(dim=-1) > 0).all()
@@ -91,7 +100,7 @@ def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_ab
 def test_a_small_mesh_that_is_brought_stays_as_it_is(round_about):
     vertices, faces = icosphere(1)
     assert vertices.dtype == torch.float64  # as files give it
-    coarse = Enclose(SETTINGS)(round_about, Mesh(vertices_world=vertices, faces=faces))
+    coarse = enclose(round_about, Mesh(vertices_world=vertices, faces=faces))
     assert coarse.mesh.vertices_world.dtype == round_about.cameras.intrinsics.dtype == torch.float32
     assert_close(coarse.mesh.vertices_world[coarse.mesh.faces], vertices.float()[faces])
 
@@ -108,13 +117,13 @@ def test_a_small_mesh_that_is_brought_stays_as_it_is(round_about):
 def test_a_mesh_that_cannot_be_used_is_refused(round_about, change, told):
     vertices, faces = change(*icosphere(1))
     with pytest.raises(InputError, match=told):
-        Enclose(SETTINGS)(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
+        enclose(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
 
 
 def test_without_points_to_trust_nothing_is_made(round_about):
     doubtful = round_about.replace(reprojection_errors_px=round_about.reprojection_errors_px + 100)
     with pytest.raises(ReconstructionError, match="0 of"):
-        Enclose(SETTINGS)(doubtful)
+        enclose(doubtful)
 
 
 def test_settings_out_of_range_are_refused():
@@ -122,8 +131,6 @@ def test_settings_out_of_range_are_refused():
         DensifyConfig(sources=2, best_sources=3)
     with pytest.raises(ConfigError, match="num_facets"):
         EncloseConfig(num_facets=3)
-    with pytest.raises(ConfigError, match="brink_px"):
-        EncloseConfig(gap_px=8.0, brink_px=9.0)
 
 
 def test_of_three_faces_at_an_edge_the_smallest_goes():

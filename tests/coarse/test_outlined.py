@@ -38,7 +38,7 @@ def enclosed(scene, some=lambda points: points[:, 2] > -2):
     """Enclose the ball with its outlines, on some points of its cloud."""
     errors = torch.where(some(scene.points_world), 0.5, 100.0)
     scene = scene.replace(reprojection_errors_px=errors.to(scene.reprojection_errors_px))
-    return Enclose(SETTINGS)(scene, None, outlines_of(scene.cameras))
+    return Enclose(SETTINGS)(scene, Rim()(outlines_of(scene.cameras), scene.cameras))
 
 
 def is_closed(mesh):

@@ -11,9 +11,21 @@ from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
-from pimper_torch.records import FacetPoints, RimPoints
+from pimper_torch.records import Cameras, FacetPoints, Outlines, RimPoints
 from pimper_torch.rims.constraints import Rims
 from pimper_torch.sweep.sweep import Sweep
+
+# Outlines that constrain nothing.
+FREE = Rims.none(
+    Outlines(
+        inside=torch.ones(1, 1, 1), trusted=torch.zeros(1, dtype=torch.bool), source="everything"
+    ),
+    Cameras(
+        intrinsics=torch.eye(3)[None],
+        cam_from_world=torch.eye(4)[None],
+        sizes_px=torch.ones(1, 2, dtype=torch.long),
+    ),
+)
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +48,7 @@ def off_plane(lifted, surface) -> torch.Tensor:
 @pytest.mark.parametrize("height", [-1.5, 1.0])
 def test_facets_beside_a_plane_come_to_lie_on_it(swept, height):
     lifted, given = swept(height)
-    surface = Fuse()(given)
+    surface = Fuse()(given, FREE)
     off = off_plane(lifted, surface).abs()
     assert off.quantile(0.9) < 0.05
     assert off.max() < 0.3
@@ -53,9 +65,9 @@ def test_facets_beside_a_plane_come_to_lie_on_it(swept, height):
 
 def test_heights_alone_do_and_slopes_alone_stay_where_they_are(swept):
     lifted, given = swept(1.0)
-    heights = Fuse(FuseConfig(slopes=False))(given)
+    heights = Fuse(FuseConfig(slopes=False))(given, FREE)
     assert off_plane(lifted, heights).abs().median() < 0.05
-    slopes = Fuse(FuseConfig(heights=False, points=False))(given)
+    slopes = Fuse(FuseConfig(heights=False, points=False))(given, FREE)
     # Nothing knows how high: the facets, which are parallel, stay a sample above.
     assert (off_plane(lifted, slopes) - lifted.height).abs().max() < 0.05
 
@@ -68,8 +80,8 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
         buckets.append(found.replace(normals_patch=normalize(wrong, dim=-1)))
     photometric = given.photometric.replace(buckets=tuple(buckets))
     tilted = given.replace(photometric=photometric)
-    kept = off_plane(lifted, Fuse()(tilted))
-    trusting = off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(tilted))
+    kept = off_plane(lifted, Fuse()(tilted, FREE))
+    trusting = off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(tilted, FREE))
     assert kept.std() < 0.1
     assert kept.std() < 0.5 * trusting.std()
 
@@ -84,7 +96,7 @@ def test_normals_at_right_angles_to_the_direction_of_heights_raise_no_fold(swept
         normals[:, size : 2 * size, size : 2 * size] = wrong
         buckets.append(found.replace(normals_patch=normals))
     photometric = given.photometric.replace(buckets=tuple(buckets))
-    surface = Fuse(FuseConfig(heights=False))(given.replace(photometric=photometric))
+    surface = Fuse(FuseConfig(heights=False))(given.replace(photometric=photometric), FREE)
     assert (off_plane(lifted, surface) - lifted.height).abs().max() < 1.0  # a fold: 5.6
 
 
@@ -113,13 +125,13 @@ def spoiled(given, **changes):
 def test_normals_and_confidences_that_cannot_be_are_refused(swept, changes, told):
     _, given = swept(0.5)
     with pytest.raises(InputError, match=told):
-        Fuse()(spoiled(given, valid=True, **changes))
+        Fuse()(spoiled(given, valid=True, **changes), FREE)
 
 
 def test_normals_that_are_not_valid_may_face_anywhere(swept):
     _, given = swept(0.5)
     away = spoiled(given, valid=False, normals_patch=torch.tensor([0.0, 0, 1]).double())
-    assert Fuse()(away).vertices_world.isfinite().all()
+    assert Fuse()(away, FREE).vertices_world.isfinite().all()
 
 
 def with_points(given, points, claimed: float):
@@ -148,11 +160,11 @@ def test_heights_that_err_alike_do_not_outvote_points(swept):
     # A shading that is wrong all over moves what views seem to agree on all over.
     wrong = tuple(b.replace(offset=b.offset + 1.5 * spacing) for b in given.buckets)
     misled = known.replace(buckets=wrong)
-    off = off_plane(lifted, Fuse()(misled))
+    off = off_plane(lifted, Fuse()(misled, FREE))
     assert off.abs().quantile(0.9) < 0.1
-    assert off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(misled)).median() > 0.5
+    assert off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(misled, FREE)).median() > 0.5
     # Heights that are right still help: they know more than a few points.
-    assert off_plane(lifted, Fuse()(known)).abs().quantile(0.9) < 0.05
+    assert off_plane(lifted, Fuse()(known, FREE)).abs().quantile(0.9) < 0.05
 
 
 class Touching(Rims):
@@ -166,10 +178,9 @@ class Touching(Rims):
             view=torch.zeros(len(points), dtype=torch.long),
             ray=torch.arange(len(points)),
         )
+        for name in ("outlines", "rays", "cameras", "hull"):
+            object.__setattr__(self, name, getattr(FREE, name))
         object.__setattr__(self, "told", told)
-
-    def faults(self):
-        return iter(())
 
     def touching(self, points_world, normals_world):
         return self.told
@@ -205,7 +216,7 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
         buckets.append(found.replace(normals_patch=normalize(wrong, dim=-1)))
     tilted = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
     points = near_plane(lifted, 0.3 * spacing, count=60)
-    surface = Fuse()(with_points(tilted, points, 0.02 * spacing))
+    surface = Fuse()(with_points(tilted, points, 0.02 * spacing), FREE)
     off = off_plane(lifted, surface)
     edges = face_edges(surface.faces)[0]
     edges = torch.cat([edges, edges.flip(1)])
@@ -239,7 +250,7 @@ def test_the_expected_error_is_the_true_one_on_noise_of_two_levels(swept):
     for points, turn in ((0.05, 0.02), (0.4, 0.1)):
         ratios, expected = [], []
         for seed in range(3):
-            surface = fuse(noisy(lifted, given, points, turn, seed))
+            surface = fuse(noisy(lifted, given, points, turn, seed), FREE)
             error = surface.expected_error / spacing
             off = off_plane(lifted, surface).abs()
             ratios.append(float((off / error).median() / 0.6745))
@@ -249,7 +260,7 @@ def test_the_expected_error_is_the_true_one_on_noise_of_two_levels(swept):
         median.append(sorted(expected)[1])
     assert 3 < median[1] / median[0] < 12  # noise is 8 and 5 times as large
     silent = Fuse(FuseConfig(heights=False, drift_rounds=1, noise_rounds=2, error_draws=0))
-    assert silent(noisy(lifted, given, 0.1, 0.05, 0)).expected_error is None
+    assert silent(noisy(lifted, given, 0.1, 0.05, 0), FREE).expected_error is None
 
 
 def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
@@ -264,7 +275,7 @@ def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
         found.replace(information=torch.zeros_like(found.information)) for found in given.buckets
     )
     photometric = given.photometric.replace(buckets=nothing)
-    surface = Fuse()(given.replace(photometric=photometric, buckets=blind))
+    surface = Fuse()(given.replace(photometric=photometric, buckets=blind), FREE)
     off = off_plane(lifted, surface)
     assert off.std() < 1e-4  # as flat as the facets, and where they were
     assert abs(float(off.mean()) - lifted.height) < 0.02
@@ -285,7 +296,7 @@ def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
     _, given = swept(0.8)
     buckets = [in_the_middle_of_each(b, lambda square: None) for b in given.photometric.buckets]
     photometric = given.photometric.replace(buckets=tuple(buckets))
-    whole, holed = Fuse()(given), Fuse()(given.replace(photometric=photometric))
+    whole, holed = Fuse()(given, FREE), Fuse()(given.replace(photometric=photometric), FREE)
     dark = holed.confidence == 0
     assert dark.any()
     off = (holed.albedo - whole.albedo)[dark].abs()
@@ -315,7 +326,7 @@ def with_dark_dents(given, spacings: float):
 
 def test_a_dent_that_nothing_tells_of_is_bridged(swept):
     lifted, given = swept(0.0)
-    surface = Fuse()(with_dark_dents(given, 5.0))
+    surface = Fuse()(with_dark_dents(given, 5.0), FREE)
     assert (surface.confidence == 0).any()
     assert off_plane(lifted, surface).abs().max() < 0.5
 
@@ -324,13 +335,13 @@ def test_what_is_continued_does_not_outvote_points(swept):
     lifted, given = swept(0.0)
     spacing = float(given.patches.buckets[0].spacing[0])
     holed = with_dark_dents(given, 0.0)
-    flat = Fuse()(holed)
+    flat = Fuse()(holed, FREE)
     (dark,) = torch.nonzero((flat.confidence == 0) & (flat.facet == 0), as_tuple=True)
     places = flat.vertices_world[dark].double()
     inner = (places - places.mean(dim=0)).norm(dim=1) < 2.5 * spacing
     raised = places[inner] + 0.5 * spacing * lifted.normal
     points = torch.cat([near_plane(lifted, 0.0, count=60), raised])
-    surface = Fuse()(with_points(holed, points, 0.02 * spacing))
+    surface = Fuse()(with_points(holed, points, 0.02 * spacing), FREE)
     off = off_plane(lifted, surface)
     assert off[dark[inner]].median() > 0.4
     assert off[surface.confidence > 0].median() < 0.05  # as stiff as lit ground: 0.2, like the bump
@@ -338,10 +349,10 @@ def test_what_is_continued_does_not_outvote_points(swept):
 
 def test_facets_that_views_see_stay_though_light_tells_nothing_of_them(swept):
     _, given = swept(0.8)
-    surface = Fuse()(given)
+    surface = Fuse()(given, FREE)
     dark = surface.replace(confidence=torch.zeros_like(surface.confidence))
     dark.confidence[0] = 1.0  # so that there is some confidence at all
-    kept = Adapt()(given, dark)
+    kept = Adapt()(given, dark, FREE)
     assert len(kept.mesh.faces) >= len(given.patches.coarse.mesh.faces)
 
 
@@ -360,7 +371,7 @@ def test_the_surface_has_the_slope_of_its_differences_by_normals_and_offsets(swe
         moved = [normalize(each, dim=-1) for each in moved] if turned else moved
         pairs = zip(held.buckets, moved, strict=True)
         new = held.replace(buckets=tuple(bucket.replace(**{name: each}) for bucket, each in pairs))
-        return Fuse()(given.replace(photometric=new) if turned else new).vertices_world
+        return Fuse()(given.replace(photometric=new) if turned else new, FREE).vertices_world
 
     here = torch.zeros((), dtype=torch.float64, requires_grad=True)
     surface = fused(here)

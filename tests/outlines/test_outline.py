@@ -11,6 +11,7 @@ from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
 from pimper_torch.outlines.parallax import plane_agreement
 from pimper_torch.outlines.pictures import working_pictures
 from pimper_torch.outlines.rounds import Cuts
+from pimper_torch.records import Outlines
 
 SMALL = OutlineConfig(size_px=240, num_voxels=60_000)
 
@@ -49,7 +50,7 @@ def test_used_masks_are_a_little_wider_than_outlines(staged):
     assert used is not None
     assert (used | ~outlines.masks).all()
     assert used.sum() > outlines.masks.sum()
-    assert masked(staged.scene, None, SMALL.margin) is staged.scene
+    assert masked(staged.scene, Outlines.everything(staged.scene.views), 0.25) is staged.scene
 
 
 def test_masks_that_are_given_are_believed(staged):
@@ -62,7 +63,7 @@ def test_masks_that_are_given_are_believed(staged):
     assert outlines.trusted.all()
     assert torch.equal(outlines.masks, drawn)
     assert masked(scene, outlines, 0.25) is scene
-    assert Outline(OutlineConfig(object="everything"))(scene) is None
+    assert Outline(OutlineConfig(object="everything"))(scene).source == "everything"
 
 
 def test_masks_are_asked_for_and_missing(staged):
@@ -76,7 +77,7 @@ def test_outlines_that_contradict_one_another_are_not_trusted(staged):
     shifted = [image.roll(90 * (view % 2) - 45, 2) for view, image in enumerate(views.images)]
     scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))
     with pytest.warns(PimperWarning, match=r"is taken for the object.*`outline.region`"):
-        assert Outline(SMALL)(scene) is None
+        assert Outline(SMALL)(scene).source == "everything"
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
@@ -90,7 +91,7 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(staged, mo
     monkeypatch.setattr(outline, "cut_in_rounds", lambda *_, **__: nonsense)
     overlap_percent = 100 * (share * 120 * 60) / ((240 - 60) * 60)
     with pytest.warns(PimperWarning, match=f"by {overlap_percent:.0f}% in the median"):
-        assert Outline(SMALL)(staged.scene) is None
+        assert Outline(SMALL)(staged.scene).source == "everything"
 
 
 def test_few_outlines_that_agree_are_not_enough(staged, monkeypatch):
@@ -102,7 +103,7 @@ def test_few_outlines_that_agree_are_not_enough(staged, monkeypatch):
     cuts = Cuts(masks=masks, margins_px=silhouettes, on_plane=False)
     monkeypatch.setattr(outline, "cut_in_rounds", lambda *_, **__: cuts)
     with pytest.warns(PimperWarning, match="only 5 of 12 outlines agree"):
-        assert Outline(SMALL)(staged.scene) is None
+        assert Outline(SMALL)(staged.scene).source == "everything"
 
 
 def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):

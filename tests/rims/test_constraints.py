@@ -41,12 +41,17 @@ def test_one_wrong_outline_in_twenty_cuts_nothing_off_where_they_were_found(came
         assert bool(rims.hull.holds(lost)) == kept
 
 
-def test_without_outlines_there_are_no_rims(cameras):
-    assert Rim()(None, cameras) is None
+def test_outlines_that_leave_nothing_out_constrain_nothing(cameras):
+    outlines = outlines_of(ball, cameras).replace(source="everything")
+    rims = Rim()(outlines, cameras)
+    assert not rims.confine
+    far = torch.tensor([[1e6, 0.0, 0.0]], dtype=torch.float64)
+    assert rims.hull.holds(far).all()
+    assert len(rims.touching(far, far).points_world) == 0
 
 
 def test_outlines_without_a_common_place_are_told_of(cameras):
     outlines = outlines_of(ball, cameras)
     nothing = outlines.replace(inside=torch.zeros_like(outlines.inside))
     with pytest.warns(PimperWarning, match="no place in common"):
-        assert Rim()(nothing, cameras) is None
+        assert not Rim()(nothing, cameras).confine

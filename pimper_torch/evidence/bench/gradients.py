@@ -25,6 +25,7 @@ from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
+    Outlines,
     PatchViews,
     PhotometricPatches,
     Record,
@@ -174,7 +175,8 @@ def _calls(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str,
 
 
 def _place(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> None:
-    chain.outline = Given(None)  # outlines jump as photographs change: everything is the object
+    # Outlines jump as photographs change: everything is the object.
+    chain.outline = Given(Outlines.everything(scene.views))
     if isinstance(chain, Published):
         chain.triangulate = Given(coarse)
     else:
