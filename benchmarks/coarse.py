@@ -85,16 +85,15 @@ def masks_of(folder: Path, scene: SparseScene) -> Outlines:
 def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surface]]:
     """List the surfaces to compare; the later ones share what the photographs told."""
     enclose = Enclose()
-    config = enclose.config
     rims = Rim()(outlines, scene.cameras)
     hull = rims.hull
     trusted = enclose.trusted(scene)
     inside = trusted[hull.depth_of(scene.points_world[trusted]) > 0]
     part = cropped(scene, outlines)
-    cloud, maps, pixel = matched_cloud(part, inside, config.densify, config.outlined.point_px)
-    away = config.outlined.tolerance_px * pixel
+    cloud, maps, pixel = matched_cloud(part, inside, enclose.densify, enclose.outlined.point_px)
+    away, cell = enclose.outlined.tolerance_px * pixel, enclose.outlined.cell_px * pixel
     cloud = cloud.take(hull.depth_of(cloud.points_world) > -away)
-    vertices, faces, rim = closed_surface(cloud, rims, pixel, config.outlined)
+    vertices, faces, rim = closed_surface(cloud, rims, pixel, enclose.outlined)
     joined = joined_points(cloud, _oriented(rim))
 
     def given(masked: bool) -> Surface:
@@ -107,16 +106,16 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
         vertices, faces = some
         said = evidence(vertices, faces, maps.level, maps)
         middle = vertices[faces].mean(dim=1)
-        support = supports(middle, cloud, rim, said, config.outlined.reach_px * pixel)
+        support = supports(middle, cloud, rim, said, enclose.outlined.reach_px * pixel)
         within = hull.depth_of(middle) > -max(away, float(hull.spacing))
-        kept = seen_surface(vertices, faces, support, said, within, pixel, config.outlined)
+        kept = seen_surface(vertices, faces, support, said, within, pixel, enclose.outlined)
         used, faces = torch.unique(faces[kept], return_inverse=True)
-        if len(faces) <= config.num_facets:
+        if len(faces) <= enclose.config.num_facets:
             return vertices[used], faces
         return simplified(
             vertices[used],
             faces,
-            num_faces=config.num_facets,
+            num_faces=enclose.config.num_facets,
             boundary_weight=10.0,
         )
 
@@ -130,13 +129,12 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
             normals_world=normalize(normals[unknown], dim=1),
             noise=torch.zeros(int(unknown.sum())),
         )
-        cell = config.outlined.cell_px * pixel
-        return poisson(joined_points(joined, filled), cell, config.outlined.max_depth)
+        return poisson(joined_points(joined, filled), cell, enclose.outlined.max_depth)
 
     return {
         "no outlines": lambda: given(False),
         "no outlines, photographs masked": lambda: given(True),
-        "Poisson of points": lambda: facets(poisson(cloud, pixel, config.outlined)),
+        "Poisson of points": lambda: facets(poisson(cloud, cell, enclose.outlined.max_depth)),
         "min-cut of points": lambda: facets(cut_surface(cloud, maps, hull)),
         "min-cut of points and rims": lambda: facets(cut_surface(cloud, maps, hull, rim)),
         "Poisson of points, rims, and the cut between": lambda: facets(both()),

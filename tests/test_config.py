@@ -1,3 +1,4 @@
+import re
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -232,6 +233,20 @@ def test_settings_say_which_chain_they_are_for():
         load_config("default", {"chain": "other"})
     with pytest.raises(ConfigError, match="no setting `sweep`"):
         load_config("paper", {"sweep": {"steps": 9}})
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"rounds": {"scales": [1.0]}}, "`rounds.scales` is `scales` now"),
+        ({"outline": {"num_voxels": 9}}, "is no setting: `Outline` takes `OutlineDetails` now"),
+        ({"enclose": {"gap_px": 9.0}}, "`enclose.gap_px` is no setting"),
+        ({"rims": {"per_view": 9}}, "`rims` is no setting: `rim_rays` takes a `RimConfig` now"),
+    ],
+)
+def test_a_former_name_of_a_setting_is_refused_with_what_it_is_now(changes, told):
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        load_config("default", changes)
 
 
 def test_changes_are_laid_over_a_preset():

@@ -41,7 +41,6 @@ from pimper_torch.records import (
 )
 from pimper_torch.reporting import Observer
 from pimper_torch.rims.constraints import Rim, Rims
-from pimper_torch.rims.contours import RimConfig
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
@@ -67,7 +66,6 @@ class CoarseToFineConfig:
     photographs: Encoding = field(default_factory=Encoding)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
     outline: OutlineConfig = field(default_factory=OutlineConfig)
-    rims: RimConfig = field(default_factory=RimConfig)
     enclose: EncloseConfig = field(default_factory=EncloseConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
@@ -102,7 +100,7 @@ class CoarseToFine(Chain):
         super().__init__(config.kernels, observer)
         self.reconstruct = Reconstruct(config.reconstruct, cache)
         self.outline = Outline(config.outline)
-        self.rim: Callable[[Outlines, Cameras], Rims] = Rim(config.rims)
+        self.rim: Callable[[Outlines, Cameras], Rims] = Rim()
         self.enclose: Callable[[SparseScene, Rims, Mesh | None], CoarseMesh] = Enclose(
             config.enclose
         )
@@ -122,7 +120,7 @@ class CoarseToFine(Chain):
         """Run the stages behind the coarse mesh once a scale."""
         scene = self.placed(views, sparse_model)
         outlines = self.outline(scene)
-        scene = masked(scene, outlines, self.config.outline.margin)
+        scene = masked(scene, outlines)
         cameras = scene.cameras
         rims = self.rim(outlines, cameras)
         coarse = self.enclose(scene, rims, mesh)

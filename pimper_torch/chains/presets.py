@@ -8,6 +8,7 @@ from torch import nn
 from pimper_torch.chains.coarse_to_fine import CoarseToFine, CoarseToFineConfig
 from pimper_torch.chains.published import Published, PublishedConfig
 from pimper_torch.config import build, find_config, overlay, read_mapping, require
+from pimper_torch.errors import ConfigError
 from pimper_torch.reporting import Observer
 
 Config = CoarseToFineConfig | PublishedConfig
@@ -28,12 +29,73 @@ def load_config(
     """
     path = find_config(name_or_path)
     settings = overlay(read_mapping(path), changes or {})
+    _refuse_former(settings, str(path))
     chain = settings.get("chain", CoarseToFineConfig.chain)
     found = [config for config in (CoarseToFineConfig, PublishedConfig) if config.chain == chain]
     names = f"{CoarseToFineConfig.chain} or {PublishedConfig.chain}"
     require(len(found) == 1, f"{path}: chain", chain, names)
     config: type[Config] = found[0]
     return build(config, settings, str(path))
+
+
+# Settings that had other names, and what each is now. Those that are the same for all photographs
+# are arguments of the stages in Python: `TriangulateDetails` and the like.
+_FORMER = {
+    "rounds.scales": "`scales`",
+    "rounds.all_round": "`chain`: coarse-to-fine sees all round, published one side",
+    "rims": "no setting: `rim_rays` takes a `RimConfig`",
+    "enclose.densify": "no setting: `Enclose` takes a `DensifyConfig`",
+    "enclose.outlined": "no setting: `Enclose` takes an `OutlinedConfig`",
+    "outline.margin": "no setting: 0.25",
+    **{
+        f"{stage}.{name}": f"no setting: `{stage.title()}` takes `{stage.title()}Details`"
+        for stage, names in {
+            "outline": (
+                "rounds num_voxels disagreeing plane_tolerance least_on_plane most_below_plane "
+                "least_covered least_overlap seed"
+            ),
+            "triangulate": (
+                "facet_edge_px fill_smoothing max_view_angle_deg min_track_length "
+                "max_reprojection_px min_angle_deg neighbours hiding_slope max_slope max_deviation "
+                "max_isolation max_tilt_deg max_stretch min_altitude min_tip_deg min_coverage "
+                "dark_share smoothing_rounds"
+            ),
+        }.items()
+        for name in names.split()
+    },
+    **{
+        f"enclose.{name}": "no setting: `Enclose` takes an `OutlinedConfig`"
+        for name in [
+            "cell_px",
+            "max_depth",
+            "point_weight",
+            "reach_px",
+            "least_views",
+            "gap_px",
+            "brink_px",
+            "hole_px",
+            "min_share",
+            "boundary_weight",
+            "max_distance_px",
+            "smoothing_rounds",
+            "threads",
+        ]
+    },
+}
+
+
+def _refuse_former(settings: Mapping[str, object], where: str, section: str = "") -> None:
+    """Refuse a setting under a name that it had, and tell what it is now.
+
+    Raises:
+        ConfigError: Names both.
+    """
+    for key, value in settings.items():
+        name = f"{section}.{key}" if section else str(key)
+        if name in _FORMER:
+            raise ConfigError(f"{where}: `{name}` is {_FORMER[name]} now.")
+        if isinstance(value, Mapping):
+            _refuse_former(value, where, name)
 
 
 def make_chain(

@@ -99,7 +99,7 @@ class Published(Chain):
         """Run once through the stages."""
         scene = self.placed(views, sparse_model)
         outlines = self.outline(scene)
-        scene = masked(scene, outlines, self.config.outline.margin)
+        scene = masked(scene, outlines)
         if mesh is None:
             coarse = self.triangulate(scene)
         else:

@@ -1,6 +1,6 @@
 """Coarse mesh all round: facets on everything that a few views see, without a reference view."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -52,8 +52,6 @@ class EncloseConfig:
         min_track_length: Views that must have seen a point of the sparse cloud.
         max_reprojection_px: Mean reprojection error it may have.
         min_angle_deg: Widest angle between rays it must have.
-        densify: The search for depth maps.
-        outlined: The surface through points and rims.
     """
 
     reference: str = ""
@@ -61,8 +59,6 @@ class EncloseConfig:
     min_track_length: int = 3
     max_reprojection_px: float = 1.5
     min_angle_deg: float = 4.0
-    densify: DensifyConfig = field(default_factory=DensifyConfig)
-    outlined: OutlinedConfig = field(default_factory=OutlinedConfig)
 
     def __post_init__(self) -> None:
         require(self.num_facets >= 4, "num_facets", self.num_facets, "4 or more")
@@ -72,9 +68,15 @@ class EncloseConfig:
 class Enclose(Stage):
     """Enclose the object in facets; the result is a constant to autograd."""
 
-    def __init__(self, config: EncloseConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: EncloseConfig | None = None,
+        densify: DensifyConfig | None = None,
+        outlined: OutlinedConfig | None = None,
+    ) -> None:
         super().__init__()
         self.config = config or EncloseConfig()
+        self.densify, self.outlined = densify or DensifyConfig(), outlined or OutlinedConfig()
 
     @torch.no_grad()
     def forward(self, scene: SparseScene, rims: Rims, mesh: Mesh | None = None) -> CoarseMesh:
@@ -110,14 +112,14 @@ class Enclose(Stage):
                     "be trusted, and at least 4 are needed. Take more photographs, or relax the "
                     "filters of `enclose`."
                 )
-            fine = outlined_surface(scene, trusted, rims, config.densify, config.outlined)
+            fine = outlined_surface(scene, trusted, rims, self.densify, self.outlined)
             vertices, faces, pixel = fine.vertices_world, fine.faces, fine.pixel
         if len(faces) > config.num_facets:
             vertices, faces = _few(vertices, faces, config.num_facets)
         if fine is not None:
             faces = two_faces_an_edge(vertices, faces)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
-            pieces = supported_pieces(vertices, faces, whole, config.outlined.min_share)
+            pieces = supported_pieces(vertices, faces, whole, self.outlined.min_share)
             vertices, faces = _used(vertices, faces[pieces])
         normals = smooth_over_mesh(vertex_normals(vertices, faces), faces, _SMOOTHING)
         return CoarseMesh(

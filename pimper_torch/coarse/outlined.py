@@ -82,7 +82,7 @@ class OutlinedConfig:
     min_share: float = 0.01
 
     def __post_init__(self) -> None:
-        name = "enclose.outlined"
+        name = "outlined"
         require(self.cell_px > 0, f"{name}.cell_px", self.cell_px, "above 0")
         require(2 <= self.max_depth <= 12, f"{name}.max_depth", self.max_depth, "2 to 12")
         require(self.touches >= 1, f"{name}.touches", self.touches, "1 or more")

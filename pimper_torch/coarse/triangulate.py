@@ -42,9 +42,24 @@ class TriangulateConfig:
     Attributes:
         reference: Name or stem of the frontal photograph; empty chooses it.
         num_points: About how many vertices to spread over the visible side.
+        fill: Put vertices on a smooth surface where the cloud has none.
+    """
+
+    reference: str = ""
+    num_points: int = 250
+    fill: bool = True
+
+    def __post_init__(self) -> None:
+        require(self.num_points >= 4, "num_points", self.num_points, "4 or more")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TriangulateDetails:
+    """Which points and triangles count, the same for all photographs.
+
+    Attributes:
         facet_edge_px: Distance of vertices in the reference view; 0 derives it from
             ``num_points``.
-        fill: Put vertices on a smooth surface where the cloud has none.
         fill_smoothing: Of that surface; 0 passes through every point.
         max_view_angle_deg: Points count that were seen by a view turned less than this
             from the reference.
@@ -72,10 +87,7 @@ class TriangulateConfig:
         smoothing_rounds: Of the vertex normals, over the mesh.
     """
 
-    reference: str = ""
-    num_points: int = 250
     facet_edge_px: float = 0.0
-    fill: bool = True
     fill_smoothing: float = 1e-6
     max_view_angle_deg: float = 40.0
     min_track_length: int = 3
@@ -94,25 +106,16 @@ class TriangulateConfig:
     dark_share: float = 0.12
     smoothing_rounds: int = 1
 
-    def __post_init__(self) -> None:
-        require(self.num_points >= 4, "num_points", self.num_points, "4 or more")
-        require(self.facet_edge_px >= 0, "facet_edge_px", self.facet_edge_px, "0 or more")
-        require(self.min_track_length >= 2, "min_track_length", self.min_track_length, "2 or more")
-        require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
-        require(self.neighbours >= 3, "neighbours", self.neighbours, "3 or more")
-        require(self.hiding_slope > 0, "hiding_slope", self.hiding_slope, "above 0")
-        require(0 <= self.min_tip_deg < 60, "min_tip_deg", self.min_tip_deg, "in [0, 60)")
-        require(0 <= self.min_coverage <= 1, "min_coverage", self.min_coverage, "in [0, 1]")
-        require(0 <= self.dark_share < 1, "dark_share", self.dark_share, "in [0, 1)")
-        require(self.fill_smoothing >= 0, "fill_smoothing", self.fill_smoothing, "0 or more")
-
 
 class Triangulate(Stage):
     """Span facets between trustworthy points; the result is a constant to autograd."""
 
-    def __init__(self, config: TriangulateConfig | None = None) -> None:
+    def __init__(
+        self, config: TriangulateConfig | None = None, details: TriangulateDetails | None = None
+    ) -> None:
         super().__init__()
         self.config = config or TriangulateConfig()
+        self.details = details or TriangulateDetails()
 
     @torch.no_grad()
     def forward(self, scene: SparseScene) -> CoarseMesh:
@@ -131,7 +134,7 @@ class Triangulate(Stage):
         points = scene.points_world[index]
         pixels, _ = _project(points, cameras, reference)
         quality = torch.where(on_hull(pixels), quality + quality.amax(), quality)
-        edge_px = config.facet_edge_px
+        edge_px = self.details.facet_edge_px
         if edge_px > 0:
             chosen = spread(pixels, quality, 0.8 * edge_px)
         else:
@@ -157,7 +160,7 @@ class Triangulate(Stage):
         used, faces = torch.unique(faces, return_inverse=True)
         vertices = vertices[used]
         normals = smooth_over_mesh(
-            vertex_normals(vertices, faces), faces, self.config.smoothing_rounds
+            vertex_normals(vertices, faces), faces, self.details.smoothing_rounds
         )
         mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=normals)
         return with_cloud(scene, index, mesh, reference, source[used])
@@ -166,21 +169,21 @@ class Triangulate(Stage):
         self, scene: SparseScene, reference: int
     ) -> tuple[Int[Tensor, " trusted"], Float[Tensor, " trusted"]]:
         """List the points that pass every filter, and how good each is."""
-        config, cameras, observed = self.config, scene.cameras, scene.observed
+        details, cameras, observed = self.details, scene.cameras, scene.observed
         length = observed.sum(dim=1)
         angle = triangulation_angles(scene.points_world, observed, cameras.centers_world)
-        near = views_near(cameras, reference, config.max_view_angle_deg)
+        near = views_near(cameras, reference, details.max_view_angle_deg)
         pixels, depth = _project(scene.points_world, cameras, reference)
         within = ((pixels > 0) & (pixels < cameras.sizes_px[reference])).all(dim=1) & (depth > 0)
         tests = {
             f"in front of {scene.views.names[reference]} and inside its frame": within,
             "seen by a view near it": observed[:, near].any(dim=1),
-            f"seen by {config.min_track_length} views or more": length >= config.min_track_length,
-            f"reprojected within {config.max_reprojection_px} px": (
-                scene.reprojection_errors_px <= config.max_reprojection_px
+            f"seen by {details.min_track_length} views or more": length >= details.min_track_length,
+            f"reprojected within {details.max_reprojection_px} px": (
+                scene.reprojection_errors_px <= details.max_reprojection_px
             ),
-            f"seen under {config.min_angle_deg} degrees or more": (
-                angle >= torch.deg2rad(angle.new_tensor(config.min_angle_deg))
+            f"seen under {details.min_angle_deg} degrees or more": (
+                angle >= torch.deg2rad(angle.new_tensor(details.min_angle_deg))
             ),
         }
         keep = torch.stack(list(tests.values())).all(dim=0)
@@ -191,8 +194,8 @@ class Triangulate(Stage):
                     pixels[index],
                     transform(cameras.cam_from_world[reference], scene.points_world[index]),
                     observed[index, reference],
-                    neighbours=min(2 * config.neighbours, len(index) - 1),
-                    slope=config.hiding_slope,
+                    neighbours=min(2 * details.neighbours, len(index) - 1),
+                    slope=details.hiding_slope,
                 )
                 index = index[~hidden]
         if len(index) >= 4:
@@ -200,13 +203,13 @@ class Triangulate(Stage):
             agree = neighbours_agree(
                 pixels[index],
                 points_cam,
-                neighbours=min(config.neighbours, len(index) - 1),
-                max_slope=config.max_slope,
-                max_deviation=config.max_deviation,
+                neighbours=min(details.neighbours, len(index) - 1),
+                max_slope=details.max_slope,
+                max_deviation=details.max_deviation,
             )
             index = index[agree]
         if len(index) >= 4:
-            index = index[well_accompanied(pixels[index], config.max_isolation)]
+            index = index[well_accompanied(pixels[index], details.max_isolation)]
         if len(index) < 4:
             counts = "; ".join(f"{int(passed.sum())} {test}" for test, passed in tests.items())
             raise ReconstructionError(
@@ -231,7 +234,7 @@ class Triangulate(Stage):
         pixels, _ = _project(vertices, cameras, reference)
         wanted = fill_pixels(pixels, faces, edge_px)
         known, depth = _project(points, cameras, reference)
-        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, self.config.fill_smoothing)
+        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, self.details.fill_smoothing)
         possible = inverse > 0.5 / depth.amax()
         rays = rays_through(
             wanted[possible], cameras.cam_from_world[reference], cameras.intrinsics[reference]
@@ -253,20 +256,20 @@ class Triangulate(Stage):
             cameras.centers_world[reference] - vertices[faces].mean(dim=1), dim=-1
         )
         facing = (normals * to_camera).sum(dim=-1)
-        steepest = torch.deg2rad(facing.new_tensor(self.config.max_tilt_deg)).cos()
+        steepest = torch.deg2rad(facing.new_tensor(self.details.max_tilt_deg)).cos()
         longest = side_lengths(vertices[faces]).amax(dim=1)
-        far = longest > self.config.max_stretch * longest.median()
+        far = longest > self.details.max_stretch * longest.median()
         faces = faces[(facing > steepest) & ~(far & (facing < 0.5))]  # 0.5: turned by 60 degrees
         gray = views.images[reference].mean(dim=0)
         u, v = pixels.long().unbind(dim=1)
         at_vertices = gray[v.clamp(0, gray.shape[0] - 1), u.clamp(0, gray.shape[1] - 1)]
-        shows_object = gray > self.config.dark_share * at_vertices.median()
+        shows_object = gray > self.details.dark_share * at_vertices.median()
         if views.masks is not None:
             shows_object = shows_object & views.masks[reference]
         shown = _shown(pixels[faces], shows_object)
-        thin = _altitude(pixels[faces]) < self.config.min_altitude
-        spikes = _sharp(pixels[faces], self.config.min_tip_deg)
-        return peel(faces, (shown < self.config.min_coverage) | thin, spikes)
+        thin = _altitude(pixels[faces]) < self.details.min_altitude
+        spikes = _sharp(pixels[faces], self.details.min_tip_deg)
+        return peel(faces, (shown < self.details.min_coverage) | thin, spikes)
 
 
 def peel(

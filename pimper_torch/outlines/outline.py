@@ -26,6 +26,7 @@ _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degree
 # Probabilities where a view's cut and the hull contradict each other by more than two pixels.
 _UNSURE_INSIDE, _UNSURE_OUTSIDE = 0.6, 0.3
 _SOFT = 0.5  # working pixels: the width of a border
+_USED = 0.25  # probability above which a pixel is used as the object's
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,55 +41,60 @@ class OutlineConfig:
         region: Box that the object is inside: smallest x, y, z, then largest, scene units; none
             unless given.
         size_px: Longer side of the pictures that are cut.
-        rounds: Of cutting and voting after the first cut.
-        num_voxels: Of the visual hull.
-        disagreeing: Share of the views that may see a voxel of the hull outside.
-        plane_tolerance: Distance up to which a point lies on the supporting plane, as a share of
-            the cameras' distance.
-        least_on_plane: Share of the points that lie on it.
-        most_below_plane: Share of the points that may lie below it.
-        least_covered: Share of a view's outline that the hull's silhouette must cover, or the
-            view is not trusted.
-        least_overlap: Intersection over union of outlines and silhouettes, in the median, below
-            which outlines are not trusted.
-        margin: Probability above which a pixel is used as the object's.
-        seed: Of the plane's trials.
     """
 
     object: Literal["auto", "masks", "everything"] = "auto"
     region: tuple[float, ...] = ()
     size_px: int = 640
-    rounds: int = 2
-    num_voxels: int = 500_000
-    disagreeing: float = 0.05
-    plane_tolerance: float = 0.004
-    least_on_plane: float = 0.08
-    most_below_plane: float = 0.05
-    least_covered: float = 0.9
-    least_overlap: float = 0.8
-    margin: float = 0.25
-    seed: int = 0
 
     def __post_init__(self) -> None:
         require(self.size_px >= 64, "size_px", self.size_px, "64 or more")
-        require(self.rounds >= 1, "rounds", self.rounds, "1 or more")
-        require(self.num_voxels >= 1000, "num_voxels", self.num_voxels, "1000 or more")
-        for name in ("disagreeing", "least_on_plane", "most_below_plane", "margin"):
-            require(0 <= getattr(self, name) < 1, name, getattr(self, name), "in [0, 1)")
-        for name in ("least_covered", "least_overlap"):
-            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "in (0, 1]")
-        require(self.plane_tolerance > 0, "plane_tolerance", self.plane_tolerance, "above 0")
         low, high = self.region[:3], self.region[3:]
         fits = len(self.region) in (0, 6) and all(a < b for a, b in zip(low, high, strict=True))
         require(fits, "region", self.region, "nothing, or smallest x, y, z, then largest")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutlineDetails:
+    """What of :class:`Outline` is the same for all photographs.
+
+    Chosen on the four rendered scenes and the skull (``benchmarks/outlines.py``).
+
+    Attributes:
+        rounds: Of cutting and voting after the first cut.
+        num_voxels: Of the visual hull.
+        disagreeing: Share of the views that may see a voxel of the hull outside.
+        plane_tolerance: Distance up to which a point lies on the supporting plane, as a share of
+            the cameras' distance.
+        min_on_plane: Share of the points that lie on it.
+        max_below_plane: Share of the points that may lie below it.
+        min_covered: Share of a view's outline that the hull's silhouette must cover, or the
+            view is not trusted.
+        min_overlap: Intersection over union of outlines and silhouettes, in the median, below
+            which outlines are not trusted.
+        seed: Of the plane's trials.
+    """
+
+    rounds: int = 2
+    num_voxels: int = 500_000
+    disagreeing: float = 0.05
+    plane_tolerance: float = 0.004
+    min_on_plane: float = 0.08
+    max_below_plane: float = 0.05
+    min_covered: float = 0.9
+    min_overlap: float = 0.8
+    seed: int = 0
+
+
 class Outline(Stage):
     """Find the object's outline in every view; a constant to autograd."""
 
-    def __init__(self, config: OutlineConfig | None = None) -> None:
+    def __init__(
+        self, config: OutlineConfig | None = None, details: OutlineDetails | None = None
+    ) -> None:
         super().__init__()
         self.config = config or OutlineConfig()
+        self.details = details or OutlineDetails()
 
     @torch.no_grad()
     def forward(self, scene: SparseScene) -> Outlines:
@@ -127,22 +133,23 @@ class Outline(Stage):
             return everything
         cuts = settled(cuts)
         found = _at_full_size(cuts, scene.views)
-        trusted = agreement_of(cuts).trusted(config.least_covered).to(found.device)
+        trusted = agreement_of(cuts).trusted(self.details.min_covered).to(found.device)
         return Outlines(inside=found, trusted=trusted, source="found")
 
     def _cuts(self, scene: SparseScene) -> Cuts | None:
-        config, scene = self.config, scene.to("cpu", torch.float32)
+        config, details = self.config, self.details
+        scene = scene.to("cpu", torch.float32)
         pictures = working_pictures(scene.views, scene.cameras, config.size_px)
         cameras, points = pictures.cameras, scene.points_world
         looked_at = gaze(cameras)
-        tolerance = config.plane_tolerance * float(looked_at.distance)
+        tolerance = details.plane_tolerance * float(looked_at.distance)
         plane = supporting_plane(
             points[well_tracked(scene)],
             cameras,
             tolerance=tolerance,
-            least_on=config.least_on_plane,
-            most_below=config.most_below_plane,
-            generator=torch.Generator().manual_seed(config.seed),
+            least_on=details.min_on_plane,
+            most_below=details.max_below_plane,
+            generator=torch.Generator().manual_seed(details.seed),
         )
         region = (
             torch.tensor(config.region, dtype=torch.float32).reshape(2, 3)
@@ -166,36 +173,35 @@ class Outline(Stage):
             return None
         return cut_in_rounds(
             cues,
-            rounds=config.rounds,
-            disagreeing=config.disagreeing,
-            num_voxels=config.num_voxels,
+            rounds=details.rounds,
+            disagreeing=details.disagreeing,
+            num_voxels=details.num_voxels,
         )
 
     def _doubt(self, agreement: Agreement) -> str:
         """Say why outlines cannot be trusted, or nothing."""
-        trusted = agreement.trusted(self.config.least_covered)
+        trusted = agreement.trusted(self.details.min_covered)
         overlap = float(agreement.overlap.median())
-        if overlap < self.config.least_overlap:
+        if overlap < self.details.min_overlap:
             return (
                 f"outlines overlap with the hull of all views by {overlap:.0%} in the median; "
-                f"needed: {self.config.least_overlap:.0%} (`outline.least_overlap`)"
+                f"needed: {self.details.min_overlap:.0%}"
             )
         if int(trusted.sum()) < max(3, len(trusted) / 2):
             return f"only {int(trusted.sum())} of {len(trusted)} outlines agree with the others"
         return ""
 
 
-def masked(scene: SparseScene, outlines: Outlines, margin: float) -> SparseScene:
+def masked(scene: SparseScene, outlines: Outlines) -> SparseScene:
     """Give the scene with outlines that were found for masks, a little wider where unsure.
 
     Args:
         scene: With photographs.
         outlines: Masks that a person gave stay as they are, whether or not they are the object.
-        margin: Probability above which a pixel is used as the object's.
     """
     if outlines.source != "found":
         return scene
-    return scene.replace(views=scene.views.replace(masks=outlines.inside > margin))
+    return scene.replace(views=scene.views.replace(masks=outlines.inside > _USED))
 
 
 def _warn(why: str) -> None:

@@ -14,10 +14,10 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Outlines
 
-SETTINGS = EncloseConfig(
-    num_facets=600,
-    densify=DensifyConfig(coarsest_px=120, levels=1, most_hypotheses=48),
-    outlined=OutlinedConfig(hole_px=12.0),
+SETTINGS = (
+    EncloseConfig(num_facets=600),
+    DensifyConfig(coarsest_px=120, levels=1, most_hypotheses=48),
+    OutlinedConfig(hole_px=12.0),
 )
 
 

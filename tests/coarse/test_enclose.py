@@ -19,7 +19,7 @@ from tests.coarse.ball import SETTINGS, photographed
 def enclose(scene, mesh=None):
     """Enclose what the photographs show, without outlines."""
     rims = Rims.none(Outlines.everything(scene.views), scene.cameras)
-    return Enclose(SETTINGS)(scene, rims, mesh)
+    return Enclose(*SETTINGS)(scene, rims, mesh)
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ def enclosed(scene, some=lambda points: points[:, 2] > -2):
     """Enclose the ball with its outlines, on some points of its cloud."""
     errors = torch.where(some(scene.points_world), 0.5, 100.0)
     scene = scene.replace(reprojection_errors_px=errors.to(scene.reprojection_errors_px))
-    return Enclose(SETTINGS)(scene, Rim()(outlines_of(scene.cameras), scene.cameras))
+    return Enclose(*SETTINGS)(scene, Rim()(outlines_of(scene.cameras), scene.cameras))
 
 
 def is_closed(mesh):
@@ -177,7 +177,7 @@ def test_too_few_points_and_rims_are_refused(round_about):
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(ConfigError, match=r"enclose\.outlined\.touches"):
+    with pytest.raises(ConfigError, match=r"outlined\.touches"):
         OutlinedConfig(touches=0)
-    with pytest.raises(ConfigError, match=r"enclose\.outlined\.cell_px"):
+    with pytest.raises(ConfigError, match=r"outlined\.cell_px"):
         OutlinedConfig(cell_px=0.0)

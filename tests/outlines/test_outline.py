@@ -7,13 +7,13 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.outlines import outline
 from pimper_torch.outlines.ground import Plane, gaze, supporting_plane
-from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
+from pimper_torch.outlines.outline import Outline, OutlineConfig, OutlineDetails, masked
 from pimper_torch.outlines.parallax import plane_agreement
 from pimper_torch.outlines.pictures import working_pictures
 from pimper_torch.outlines.rounds import Cuts
 from pimper_torch.records import Outlines
 
-SMALL = OutlineConfig(size_px=240, num_voxels=60_000)
+SMALL = OutlineConfig(size_px=240), OutlineDetails(num_voxels=60_000)
 
 
 def overlap(found, truth):
@@ -21,7 +21,7 @@ def overlap(found, truth):
 
 
 def test_a_ball_on_a_table_is_found_in_every_view(staged):
-    outlines = Outline(SMALL)(staged.scene)
+    outlines = Outline(*SMALL)(staged.scene)
     assert outlines is not None
     assert outlines.source == "found"
     assert outlines.trusted.all()
@@ -38,19 +38,19 @@ def test_an_object_without_a_point_is_found_by_parallax(staged):
         observation_view=scene.observation_view[kept],
         observation_pixels=scene.observation_pixels[kept],
     )
-    outlines = Outline(SMALL)(bare)
+    outlines = Outline(*SMALL)(bare)
     assert outlines is not None
     assert overlap(outlines.masks, staged.truth).median() > 0.9
 
 
 def test_used_masks_are_a_little_wider_than_outlines(staged):
-    outlines = Outline(SMALL)(staged.scene)
+    outlines = Outline(*SMALL)(staged.scene)
     assert outlines is not None
-    used = masked(staged.scene, outlines, SMALL.margin).views.masks
+    used = masked(staged.scene, outlines).views.masks
     assert used is not None
     assert (used | ~outlines.masks).all()
     assert used.sum() > outlines.masks.sum()
-    assert masked(staged.scene, Outlines.everything(staged.scene.views), 0.25) is staged.scene
+    assert masked(staged.scene, Outlines.everything(staged.scene.views)) is staged.scene
 
 
 def test_masks_that_are_given_are_believed(staged):
@@ -62,7 +62,7 @@ def test_masks_that_are_given_are_believed(staged):
     assert outlines.source == "masks"
     assert outlines.trusted.all()
     assert torch.equal(outlines.masks, drawn)
-    assert masked(scene, outlines, 0.25) is scene
+    assert masked(scene, outlines) is scene
     assert Outline(OutlineConfig(object="everything"))(scene).source == "everything"
 
 
@@ -77,7 +77,7 @@ def test_outlines_that_contradict_one_another_are_not_trusted(staged):
     shifted = [image.roll(90 * (view % 2) - 45, 2) for view, image in enumerate(views.images)]
     scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))
     with pytest.warns(PimperWarning, match=r"is taken for the object.*`outline.region`"):
-        assert Outline(SMALL)(scene).source == "everything"
+        assert Outline(*SMALL)(scene).source == "everything"
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
@@ -91,7 +91,7 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(staged, mo
     monkeypatch.setattr(outline, "cut_in_rounds", lambda *_, **__: nonsense)
     overlap_percent = 100 * (share * 120 * 60) / ((240 - 60) * 60)
     with pytest.warns(PimperWarning, match=f"by {overlap_percent:.0f}% in the median"):
-        assert Outline(SMALL)(staged.scene).source == "everything"
+        assert Outline(*SMALL)(staged.scene).source == "everything"
 
 
 def test_few_outlines_that_agree_are_not_enough(staged, monkeypatch):
@@ -103,7 +103,7 @@ def test_few_outlines_that_agree_are_not_enough(staged, monkeypatch):
     cuts = Cuts(masks=masks, margins_px=silhouettes, on_plane=False)
     monkeypatch.setattr(outline, "cut_in_rounds", lambda *_, **__: cuts)
     with pytest.warns(PimperWarning, match="only 5 of 12 outlines agree"):
-        assert Outline(SMALL)(staged.scene).source == "everything"
+        assert Outline(*SMALL)(staged.scene).source == "everything"
 
 
 def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
@@ -131,8 +131,8 @@ def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
 
 
 def test_the_region_keeps_what_is_outside_from_being_the_object(staged):
-    left = OutlineConfig(size_px=240, num_voxels=60_000, region=(-0.6, -0.6, 0.0, 0.0, 0.6, 1.1))
-    outlines = Outline(left)(staged.scene)
+    left = OutlineConfig(size_px=240, region=(-0.6, -0.6, 0.0, 0.0, 0.6, 1.1)), SMALL[1]
+    outlines = Outline(*left)(staged.scene)
     assert outlines is not None
     assert 0 < outlines.masks.sum() < 0.8 * staged.truth.sum()  # half a ball, as the box cuts it
 
