@@ -23,7 +23,7 @@ from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.memory import bytes_of, release_memory, require_memory
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.meshing.mend import Mend, MendConfig
+from pimper_torch.meshing.mend import Mend
 from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
@@ -72,7 +72,6 @@ class CoarseToFineConfig:
     factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
     sweep: SweepConfig = field(default_factory=SweepConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
-    mend: MendConfig = field(default_factory=MendConfig)
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
 
@@ -109,7 +108,7 @@ class CoarseToFine(Chain):
         self.factorize: Factorizing = Factorize(config.factorize)
         self.sweep: Sweeping = Sweep(config.sweep)
         self.fuse: Callable[[SweptPatches, Rims, bool], Surface] = Fuse(config.fuse)
-        self.mend: Callable[[Surface], Surface] = Mend(config.mend)
+        self.mend: Callable[[Surface], Surface] = Mend()
         self.adapt: Callable[[SweptPatches, Surface, Rims], CoarseMesh] = Adapt(config.adapt)
         self.extract = Extract(config.extract)
         self._swap(stages)

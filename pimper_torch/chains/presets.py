@@ -47,6 +47,18 @@ _FORMER = {
     "enclose.densify": "no setting: `Enclose` takes a `DensifyConfig`",
     "enclose.outlined": "no setting: `Enclose` takes an `OutlinedConfig`",
     "outline.margin": "no setting: 0.25",
+    "mend": "no setting: `Mend` takes a `MendConfig`",
+    **dict.fromkeys(
+        [
+            *("align.rows", "align.columns", "align.reach_samples"),
+            *("sweep.step_samples", "sweep.window_samples", "sweep.loss_scale", "sweep.max_slope"),
+            *("reconstruct.min_matches", "reconstruct.min_registration_points"),
+            *("reconstruct.min_share", "adapt.max_residual", "warp.pyramid_levels"),
+            *("enclose.min_track_length", "enclose.max_reprojection_px", "enclose.min_angle_deg"),
+            "refine.samples_per_vertex",
+        ],
+        "a constant",
+    ),
     **{
         f"{stage}.{name}": f"no setting: `{stage.title()}` takes `{stage.title()}Details`"
         for stage, names in {

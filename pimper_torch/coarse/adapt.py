@@ -42,6 +42,9 @@ _LEAST_AREA = 0.05
 # A facet that gets so many times longer has a corner that ran away.
 _MOST_STRETCH = 4.0
 
+# Photometric residual over the median facet's, above which a facet is split.
+_MOST_RESIDUAL = 3.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptConfig:
@@ -51,7 +54,6 @@ class AdaptConfig:
         max_departure: Distance, in samples, that nine in ten of a facet's lattice vertices may
             lie off its plane.
         max_spread_deg: Root mean square angle of the surface's normals within a facet.
-        max_residual: Photometric residual over the median facet's, where the caller has one.
         min_samples: A facet with fewer across (side of the equilateral triangle of its area) is
             never split.
         max_facets: The worst facets are split first, as long as there are no more than so many
@@ -62,7 +64,6 @@ class AdaptConfig:
 
     max_departure: float = 2.0
     max_spread_deg: float = 12.0
-    max_residual: float = 3.0
     min_samples: float = 12.0
     max_facets: int = 5000
     max_hole: float = 0.02
@@ -70,7 +71,6 @@ class AdaptConfig:
     def __post_init__(self) -> None:
         require(self.max_departure > 0, "adapt.max_departure", self.max_departure, "above 0")
         require(self.max_spread_deg > 0, "adapt.max_spread_deg", self.max_spread_deg, "above 0")
-        require(self.max_residual > 1, "adapt.max_residual", self.max_residual, "above 1")
         require(self.min_samples > 0, "adapt.min_samples", self.min_samples, "above 0")
         require(self.max_facets >= 1, "adapt.max_facets", self.max_facets, "1 or more")
         require(0 <= self.max_hole < 1, "adapt.max_hole", self.max_hole, "in [0, 1)")
@@ -293,7 +293,7 @@ def _severity(
     worst = torch.maximum(worst, spread.to(worst))
     if residual is not None:
         typical = residual.nanmedian()
-        relative = residual / torch.where(typical > 0, typical, torch.inf) / config.max_residual
+        relative = residual / torch.where(typical > 0, typical, torch.inf) / _MOST_RESIDUAL
         worst = torch.maximum(worst, relative.nan_to_num(nan=0.0).to(worst))
     return worst
 

@@ -36,6 +36,10 @@ _BORDER_WEIGHT = 10.0
 # Pixels of the finest depth maps from its facet that a point of the sparse cloud may lie.
 _NEAR_PX = 4.0
 
+# Of a point of the sparse cloud that is trusted: views that saw it, mean reprojection error, widest
+# angle between its rays.
+_MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 3, 1.5, 4.0
+
 # How often normals of vertices are averaged with their neighbours'.
 _SMOOTHING = 1
 
@@ -49,20 +53,13 @@ class EncloseConfig:
     Attributes:
         reference: Name or stem of the frontal photograph; empty chooses it.
         num_facets: About so many are left after simplification.
-        min_track_length: Views that must have seen a point of the sparse cloud.
-        max_reprojection_px: Mean reprojection error it may have.
-        min_angle_deg: Widest angle between rays it must have.
     """
 
     reference: str = ""
     num_facets: int = 3000
-    min_track_length: int = 3
-    max_reprojection_px: float = 1.5
-    min_angle_deg: float = 4.0
 
     def __post_init__(self) -> None:
         require(self.num_facets >= 4, "num_facets", self.num_facets, "4 or more")
-        require(self.min_track_length >= 2, "min_track_length", self.min_track_length, "2 or more")
 
 
 class Enclose(Stage):
@@ -109,8 +106,8 @@ class Enclose(Stage):
             if len(trusted) < 4 and not rims.confine:
                 raise ReconstructionError(
                     f"coarse mesh: {len(trusted)} of {len(scene.points_world)} sparse points can "
-                    "be trusted, and at least 4 are needed. Take more photographs, or relax the "
-                    "filters of `enclose`."
+                    f"be trusted ({_MIN_TRACK} views, {_MAX_ERROR_PX} px, {_MIN_ANGLE_DEG} "
+                    "degrees), and at least 4 are needed. Take more photographs."
                 )
             fine = outlined_surface(scene, trusted, rims, self.densify, self.outlined)
             vertices, faces, pixel = fine.vertices_world, fine.faces, fine.pixel
@@ -133,12 +130,12 @@ class Enclose(Stage):
 
     def trusted(self, scene: SparseScene) -> Int[Tensor, " trusted"]:
         """List the points of the cloud that enough views saw well enough."""
-        config, observed = self.config, scene.observed
+        observed = scene.observed
         angle = triangulation_angles(scene.points_world, observed, scene.cameras.centers_world)
         trusted = (
-            (observed.sum(dim=1) >= config.min_track_length)
-            & (scene.reprojection_errors_px <= config.max_reprojection_px)
-            & (angle >= torch.deg2rad(angle.new_tensor(config.min_angle_deg)))
+            (observed.sum(dim=1) >= _MIN_TRACK)
+            & (scene.reprojection_errors_px <= _MAX_ERROR_PX)
+            & (angle >= torch.deg2rad(angle.new_tensor(_MIN_ANGLE_DEG)))
         )
         return trusted.nonzero()[:, 0]
 

@@ -39,14 +39,12 @@ class WarpConfig:
         saturation_level: Radiance at or above which a pixel of any channel is missing.
         max_tilt_deg: A facet turned further from a view is not used there.
         occlusion_stride: Samples between the rays that test for occlusion.
-        pyramid_levels: How often an image may be halved for templates it sees from close.
     """
 
     dark_level: float = 0.01
     saturation_level: float = SATURATED
     max_tilt_deg: float = 75.0
     occlusion_stride: int = 4
-    pyramid_levels: int = LEVELS
 
     def __post_init__(self) -> None:
         require(0 <= self.dark_level < 1, "dark_level", self.dark_level, "in [0, 1)")
@@ -58,7 +56,6 @@ class WarpConfig:
         )
         require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
         require(self.occlusion_stride >= 1, "occlusion_stride", self.occlusion_stride, ">= 1")
-        require(self.pyramid_levels >= 1, "pyramid_levels", self.pyramid_levels, ">= 1")
 
 
 class Warp(Stage):
@@ -100,7 +97,7 @@ class Warp(Stage):
 
     def prepare(self, views: Views) -> Sources:
         """Prepare photographs for any number of calls, here and in the sweep."""
-        return prepare(views, self.config.saturation_level, self.config.pyramid_levels)
+        return prepare(views, self.config.saturation_level, LEVELS)
 
     def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Registered:
         images, config = sources.images.finest, self.config

@@ -27,6 +27,11 @@ from pimper_torch.sfm.scene import assemble_scene
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
 
+# Verified matches below which a pair of photographs does not count; points of the model that a view
+# must see to be added, and to stay in it (COLMAP's own); share of the photographs that the largest
+# component must hold when the model splits.
+_MIN_MATCHES, _MIN_POINTS, _MIN_SHARE = 15, 30, 0.6
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructConfig:
@@ -45,15 +50,10 @@ class ReconstructConfig:
         guided_pairs: Of each photograph, those with most matches, in which more are looked for
             along the epipolar lines.
         max_error_px: Distance from the epipolar line up to which a match is verified.
-        min_matches: Verified matches below which a pair of photographs does not count.
-        min_registration_points: Points of the model that a view must see to be added, and
-            to stay in it.
         starts: Most runs of the mapper after guided matching of more pairs, where photographs
             stayed unregistered or contradict their matches; each has other random numbers, and
             the last also counts points that only two views see. 0 is content with the first
             model.
-        min_share: Of the photographs that the largest component must hold when the model
-            splits.
         track_rounds: Of finding the points again in every view, by aligning what photographs
             show round them, and adjusting cameras to that; 0 leaves the features' places.
         threads: 0 for all cores. With 1 the result is the same bit for bit.
@@ -69,10 +69,7 @@ class ReconstructConfig:
     max_ratio: float = 0.8
     guided_pairs: int = 10
     max_error_px: float = 2.0
-    min_matches: int = 15
-    min_registration_points: int = 30
     starts: int = 3
-    min_share: float = 0.6
     track_rounds: int = 2
     threads: int = 0
     seed: int = 0
@@ -89,16 +86,8 @@ class ReconstructConfig:
         require(self.max_features >= 8, "max_features", self.max_features, "at least 8")
         require(0 < self.max_ratio <= 1, "max_ratio", self.max_ratio, "in (0, 1]")
         require(self.max_error_px > 0, "max_error_px", self.max_error_px, "more than 0")
-        require(self.min_matches >= 8, "min_matches", self.min_matches, "at least 8")
-        require(
-            self.min_registration_points >= 6,
-            "min_registration_points",
-            self.min_registration_points,
-            "at least 6",
-        )
         require(self.guided_pairs >= 0, "guided_pairs", self.guided_pairs, "0 or more")
         require(self.starts >= 0, "starts", self.starts, "0 or more")
-        require(0 < self.min_share <= 1, "min_share", self.min_share, "in (0, 1]")
         require(self.track_rounds >= 0, "track_rounds", self.track_rounds, "0 or more")
         require(self.threads >= 0, "threads", self.threads, "0 for all cores, or a number of them")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
@@ -123,12 +112,12 @@ class ReconstructConfig:
             matching=MatchSettings(
                 max_ratio=self.max_ratio,
                 max_error_px=self.max_error_px,
-                min_inliers=self.min_matches,
+                min_inliers=_MIN_MATCHES,
                 seed=self.seed,
                 threads=self.threads or -1,
             ),
             mapping=MapSettings(
-                min_inliers=self.min_registration_points,
+                min_inliers=_MIN_POINTS,
                 pairs_count=False,
                 seed=self.seed,
                 threads=self.threads or -1,
@@ -142,7 +131,7 @@ class ReconstructConfig:
         """How tracks are refined."""
         return TrackSettings(
             rounds=self.track_rounds,
-            fewest_points=self.min_registration_points,
+            fewest_points=_MIN_POINTS,
             threads=self.threads or -1,
         )
 
@@ -251,7 +240,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
         found = register(space, config.registration)
     release_memory()
     names = dict(zip(space.files, views.names, strict=True))
-    model = _chosen(found, names, config.min_share)
+    model = _chosen(found, names, _MIN_SHARE)
     numbers = [views.names.index(name) for name in model.names]
     model = refine_tracks(views.take(numbers), model, config.tracks)
     release_memory()

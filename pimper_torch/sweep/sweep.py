@@ -46,36 +46,37 @@ _LEAST_FACING = 0.05
 LEAST_SPREAD = 1e-4
 
 
+# Samples of the template between heights that are tried, and of the standard deviation of the
+# window that costs are averaged over.
+_STEP, _WINDOW = 0.7, 1.5
+
+# Of the robust cost, in standard deviations of the patch's residuals.
+_LOSS_SCALE = 2.0
+
+# Slope of the template off its facet, above which it is a cliff, where windows end.
+_CLIFF = 4.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepConfig:
     """Which heights are tried, and how they are judged.
 
     Attributes:
         steps: Tried on each side of the template.
-        step_samples: Between them, in samples of the template.
-        window_samples: Standard deviation of the window that costs are averaged over.
         num_views: At most so many views judge a sample: the best by angle, resolution and
             light of those that have it.
         min_views: A sample that fewer views may judge is left where it is.
-        loss_scale: Of the robust cost, in standard deviations of the patch's residuals.
-        max_slope: Of the template, off its facet: steeper is a cliff, where windows end.
     """
 
     steps: int = 4
-    step_samples: float = 0.7
-    window_samples: float = 1.5
     num_views: int = 16
     min_views: int = 3
-    loss_scale: float = 2.0
-    max_slope: float = 4.0
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, "sweep.steps", self.steps, "1 or more")
         require(self.min_views >= 2, "sweep.min_views", self.min_views, "2 or more")
         least = self.min_views
         require(self.num_views >= least, "sweep.num_views", self.num_views, "min_views or more")
-        for name in ("step_samples", "window_samples", "loss_scale", "max_slope"):
-            require(getattr(self, name) > 0, f"sweep.{name}", getattr(self, name), "above 0")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -143,7 +144,7 @@ class Sweep(Stage):
         return SweptPatches(
             photometric=photometric,
             buckets=tuple(side_by_side(one, list(buckets))),
-            averaged=window_size(self.config.window_samples),
+            averaged=window_size(_WINDOW),
         )
 
     def _sweep(
@@ -171,12 +172,12 @@ class Sweep(Stage):
         )
         how = self._compiled_costs if fast else self._costs
         costs, swept = how(templates, registered, photometry, carried, cameras, sources)
-        step = config.step_samples * templates.spacing
-        window = level_weight(templates.depth.detach(), swept, templates.spacing, config.max_slope)
-        averaged = window_size(config.window_samples)
+        step = _STEP * templates.spacing
+        window = level_weight(templates.depth.detach(), swept, templates.spacing, _CLIFF)
+        averaged = window_size(_WINDOW)
         # Near zero Cauchy's loss is the square over twice its scale's: now over the variance.
-        weight = config.loss_scale**2 * averaged / CORRELATED_SAMPLES
-        costs = weight * window_mean(costs, window, config.window_samples)
+        weight = _LOSS_SCALE**2 * averaged / CORRELATED_SAMPLES
+        costs = weight * window_mean(costs, window, _WINDOW)
         costs = costs.movedim(1, -1)
         place, curvature, found = parabola_minimum(costs)
         variance = posterior_variance(costs, curvature)
@@ -191,7 +192,7 @@ class Sweep(Stage):
 
     def _scale(self, photometry: Photometry) -> Float[Tensor, " patch"]:
         """Give the residuals of each patch that count as large."""
-        return self.config.loss_scale * photometry.convergence.residual.clamp_min(LEAST_SPREAD)
+        return _LOSS_SCALE * photometry.convergence.residual.clamp_min(LEAST_SPREAD)
 
     def _compiled_costs(
         self,
@@ -211,7 +212,7 @@ class Sweep(Stage):
             carried,
             cameras,
             sources,
-            ladder=config.step_samples * torch.arange(-config.steps, config.steps + 1.0),
+            ladder=_STEP * torch.arange(-config.steps, config.steps + 1.0),
             scale=self._scale(photometry),
             num_views=config.num_views,
             min_views=config.min_views,
@@ -230,7 +231,7 @@ class Sweep(Stage):
         """Give the cost of every height, and 1 where a sample is swept, else 0."""
         config = self.config
         rows = self._rows(templates, registered, photometry, carried, cameras)
-        step = config.step_samples * templates.spacing
+        step = _STEP * templates.spacing
         ladder = torch.arange(-config.steps, config.steps + 1, device=step.device).to(step)
         moves = step[rows.patch, None] * ladder
         radiance = self._look_up(rows, templates, moves, cameras, sources)

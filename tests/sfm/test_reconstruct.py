@@ -171,7 +171,6 @@ def test_photographs_of_noise_that_do_not_match_are_refused(generator):
         ("max_ratio", 1.5),
         ("starts", -1),
         ("guided_pairs", -1),
-        ("min_share", 0.0),
         ("threads", -1),
     ],
 )

@@ -50,6 +50,11 @@ _FILLED_VERTEX = 0.1
 _REWEIGHTINGS = 3
 
 
+# Lines of samples across each overlap, samples along each, and the distance of the outermost lines
+# from the edge in template samples: `paper` has overlaps of 6.
+_ROWS, _COLUMNS, _REACH = 3, 12, 5.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignConfig:
     """How patches are brought together.
@@ -59,10 +64,6 @@ class AlignConfig:
             published 3.
         curvature: Weight seams by the published ``k``; without it all weigh alike.
         rounds: How often the overlaps are met anew, as transformed so far, and solved.
-        rows: Lines of samples across each overlap.
-        columns: Samples along each line.
-        reach_samples: Distance of the outermost lines from the edge, in template samples;
-            about ``decompose.overlap_samples``.
         anchor: Weight of a facet's vertex, where the surface is known to pass, next to the
             agreement of a seam. Vertices that are points of the cloud count the less the
             less certain they are next to the disagreement at the seams.
@@ -79,9 +80,6 @@ class AlignConfig:
     offset: bool = True
     curvature: bool = True
     rounds: int = 3
-    rows: int = 3
-    columns: int = 12
-    reach_samples: float = 5.0
     anchor: float = 1.0
     points: float = 1.0
     prior: float = 3e-4
@@ -90,9 +88,6 @@ class AlignConfig:
 
     def __post_init__(self) -> None:
         require(self.rounds >= 1, "rounds", self.rounds, "1 or more")
-        require(self.rows >= 2, "rows", self.rows, "2 or more")
-        require(self.columns >= 3, "columns", self.columns, "3 or more")
-        require(self.reach_samples > 0, "reach_samples", self.reach_samples, "above 0")
         require(self.anchor >= 0, "anchor", self.anchor, "0 or more")
         require(self.points >= 0, "points", self.points, "0 or more")
         require(self.prior > 0, "prior", self.prior, "above 0")
@@ -181,7 +176,7 @@ class Align(Stage):
             SingularSystemError: Depths that are not finite.
         """
         config, patches = self.config, depths.patches
-        seams = find_seams(patches, config.rows, config.columns, config.reach_samples)
+        seams = find_seams(patches, _ROWS, _COLUMNS, _REACH)
         if len(seams.facets) == 0:
             return depths
         problem = _Problem(

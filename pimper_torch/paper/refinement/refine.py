@@ -23,7 +23,6 @@ class RefineConfig:
     """How finely the patches are joined, and how much seams are smoothed.
 
     Attributes:
-        samples_per_vertex: Template samples between neighbouring vertices of the surface.
             Time and memory fall with its square.
         smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
             ``1 / (r * spacing)^2``, the inverse square of a length. Where G is constant, a
@@ -38,13 +37,12 @@ class RefineConfig:
             outvote it, where three or more meet; infinite for the plain mean.
     """
 
-    samples_per_vertex: float = 1.0
     smoothing_radius_samples: float = 1.0
     hold_planes: bool = True
     outlier_samples: float = 4.0
 
     def __post_init__(self) -> None:
-        for name in ("samples_per_vertex", "smoothing_radius_samples", "outlier_samples"):
+        for name in ("smoothing_radius_samples", "outlier_samples"):
             value = getattr(self, name)
             require(value > 0, name, value, "above 0")
 
@@ -78,7 +76,7 @@ class Refine(Stage):
         """
         patches = depths.patches
         mesh = patches.coarse.mesh
-        spacing = vertex_spacing(patches, self.config.samples_per_vertex)
+        spacing = vertex_spacing(patches, 1.0)
         lattice = subdivide(mesh.vertices_world.detach(), mesh.faces, spacing)
         directions = ray_directions(lattice, patches.coarse).detach()
         union = unite(depths, lattice, directions, self.config.outlier_samples)

@@ -247,9 +247,6 @@ def test_gradients_run_from_depths_to_aligned_depths(
     "setting",
     [
         {"rounds": 0},
-        {"rows": 1},
-        {"columns": 2},
-        {"reach_samples": 0.0},
         {"anchor": -1.0},
         {"prior": 0.0},
         {"scale_limit": 1.0},

@@ -188,9 +188,7 @@ def test_relief_that_is_valid_nowhere_leaves_the_facets_without_confidence(cap):
     assert (surface.confidence == 0).all()
 
 
-@pytest.mark.parametrize(
-    "name", ["samples_per_vertex", "smoothing_radius_samples", "outlier_samples"]
-)
+@pytest.mark.parametrize("name", ["smoothing_radius_samples", "outlier_samples"])
 def test_settings_that_mean_nothing_are_refused(name):
     with pytest.raises(ConfigError, match=name):
         RefineConfig(**{name: 0.0})
