@@ -38,7 +38,7 @@ from pimper_torch.stage import Given
 from pimper_torch.viz.render import crop
 
 # Share of the views whose masks a point must lie in to be the object's: masks were drawn for
-# each view apart, and miss a pixel of the rim here and there.
+# each view apart, and miss a pixel of the contour here and there.
 IN_MASKS = 0.9
 
 # Neighbours that a plane is fitted to round a point, and the least cosine it must face a view by.
@@ -84,7 +84,7 @@ def main() -> None:
         write_colmap_model(carton_scene(options.data, capture), options.model)
         return
     named = {"reference": options.reference}
-    changes: dict[str, object] = {"enclose": named}
+    changes: dict[str, object] = {"coarse_surface": named}
     if isinstance(load_config(options.preset), PublishedConfig):
         changes["triangulate"] = named | {"num_points": options.num_points}
     pimper = load_chain(options.preset, changes)

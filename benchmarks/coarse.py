@@ -22,11 +22,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.cropping import cropped
-from pimper_torch.coarse.enclose import Enclose
+from pimper_torch.coarse.fine_surface import closed_surface, poisson, seen_surface, supports
 from pimper_torch.coarse.matched import matched_cloud
 from pimper_torch.coarse.oriented import OrientedPoints, joined_points
-from pimper_torch.coarse.outlined import closed_surface, poisson, seen_surface, supports
 from pimper_torch.coarse.select import frontal_view
+from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.coarse.trim import evidence, point_distances
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.datasets.rendered import read_rendered
@@ -36,15 +36,15 @@ from pimper_torch.evidence.metrics.in_view import compare_along_rays
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views
-from pimper_torch.records import Mesh, Outlines, RimPoints, SparseScene
-from pimper_torch.rims.constraints import Rim, Rims
+from pimper_torch.records import ContourPoints, Mesh, Silhouettes, SparseScene
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.surfaces import simplified
 from pimper_torch.sfm.undistort import undistorted
+from pimper_torch.silhouettes.contours import Contours, TraceContours
 
 Surface = tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
 
-# Facets of the cut count where they are so many pixels from all points and rims.
+# Facets of the cut count where they are so many pixels from all points and contours.
 _UNKNOWN_PX = 8.0
 
 
@@ -71,7 +71,7 @@ def main() -> None:
             sys.stdout.flush()
 
 
-def masks_of(folder: Path, scene: SparseScene) -> Outlines:
+def masks_of(folder: Path, scene: SparseScene) -> Silhouettes:
     """Read the true masks, undistorted as the photographs are."""
     views = load_views(folder / "photos", masks=folder / "masks")
     views = views.take([views.names.index(name) for name in scene.views.names])
@@ -79,48 +79,48 @@ def masks_of(folder: Path, scene: SparseScene) -> Outlines:
     for view, (_, mask) in enumerate(undistorted(views, scene.lenses)):
         inside[view, : mask.shape[0], : mask.shape[1]] = mask.to(inside)
     trusted = torch.ones(len(inside), dtype=torch.bool)
-    return Outlines(inside=inside, trusted=trusted, source="masks")
+    return Silhouettes(inside=inside, trusted=trusted, source="masks")
 
 
-def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surface]]:
+def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[], Surface]]:
     """List the surfaces to compare; the later ones share what the photographs told."""
-    enclose = Enclose()
-    rims = Rim()(outlines, scene.cameras)
-    hull = rims.hull
-    trusted = enclose.trusted(scene)
+    builder = CoarseSurface()
+    contours = TraceContours()(silhouettes, scene.cameras)
+    hull = contours.hull
+    trusted = builder.trusted(scene)
     inside = trusted[hull.depth_of(scene.points_world[trusted]) > 0]
-    part = cropped(scene, outlines)
-    cloud, maps, pixel = matched_cloud(part, inside, enclose.densify, enclose.outlined.point_px)
-    away, cell = enclose.outlined.tolerance_px * pixel, enclose.outlined.cell_px * pixel
+    part = cropped(scene, silhouettes)
+    cloud, maps, pixel = matched_cloud(part, inside, builder.densify, builder.fine.point_px)
+    away, cell = builder.fine.tolerance_px * pixel, builder.fine.cell_px * pixel
     cloud = cloud.take(hull.depth_of(cloud.points_world) > -away)
-    vertices, faces, rim = closed_surface(cloud, rims, pixel, enclose.outlined)
-    joined = joined_points(cloud, _oriented(rim))
+    vertices, faces, contour = closed_surface(cloud, contours, pixel, builder.outlined)
+    joined = joined_points(cloud, _oriented(contour))
 
     def given(masked: bool) -> Surface:
-        some = scene.replace(views=scene.views.replace(masks=outlines.masks if masked else None))
-        free = Rims.none(Outlines.everything(some.views), some.cameras)
-        found = enclose(some, free).mesh
+        some = scene.replace(views=scene.views.replace(masks=silhouettes.masks if masked else None))
+        free = Contours.none(Silhouettes.everything(some.views), some.cameras)
+        found = builder(some, free).mesh
         return found.vertices_world, found.faces
 
     def facets(some: Surface) -> Surface:
         vertices, faces = some
         said = evidence(vertices, faces, maps.level, maps)
         middle = vertices[faces].mean(dim=1)
-        support = supports(middle, cloud, rim, said, enclose.outlined.reach_px * pixel)
+        support = supports(middle, cloud, contour, said, builder.fine.reach_px * pixel)
         within = hull.depth_of(middle) > -max(away, float(hull.spacing))
-        kept = seen_surface(vertices, faces, support, said, within, pixel, enclose.outlined)
+        kept = seen_surface(vertices, faces, support, said, within, pixel, builder.outlined)
         used, faces = torch.unique(faces[kept], return_inverse=True)
-        if len(faces) <= enclose.config.num_facets:
+        if len(faces) <= builder.config.num_facets:
             return vertices[used], faces
         return simplified(
             vertices[used],
             faces,
-            num_faces=enclose.config.num_facets,
+            num_faces=builder.config.num_facets,
             boundary_weight=10.0,
         )
 
     def both() -> Surface:
-        corners, cells = cut_surface(cloud, maps, hull, rim)
+        corners, cells = cut_surface(cloud, maps, hull, contour)
         middle, normals = corners[cells].mean(dim=1), face_normals(corners, cells)
         unknown = point_distances(middle, joined.points_world) > _UNKNOWN_PX * pixel
         unknown &= hull.depth_of(middle) > hull.spacing
@@ -129,24 +129,24 @@ def ways(scene: SparseScene, outlines: Outlines) -> dict[str, Callable[[], Surfa
             normals_world=normalize(normals[unknown], dim=1),
             noise=torch.zeros(int(unknown.sum())),
         )
-        return poisson(joined_points(joined, filled), cell, enclose.outlined.max_depth)
+        return poisson(joined_points(joined, filled), cell, builder.fine.max_depth)
 
     return {
-        "no outlines": lambda: given(False),
-        "no outlines, photographs masked": lambda: given(True),
-        "Poisson of points": lambda: facets(poisson(cloud, cell, enclose.outlined.max_depth)),
+        "no silhouettes": lambda: given(False),
+        "no silhouettes, photographs masked": lambda: given(True),
+        "Poisson of points": lambda: facets(poisson(cloud, cell, builder.fine.max_depth)),
         "min-cut of points": lambda: facets(cut_surface(cloud, maps, hull)),
-        "min-cut of points and rims": lambda: facets(cut_surface(cloud, maps, hull, rim)),
-        "Poisson of points, rims, and the cut between": lambda: facets(both()),
-        "Poisson of points and rims": lambda: facets((vertices, faces)),
+        "min-cut of points and contours": lambda: facets(cut_surface(cloud, maps, hull, contour)),
+        "Poisson of points, contours, and the cut between": lambda: facets(both()),
+        "Poisson of points and contours": lambda: facets((vertices, faces)),
     }
 
 
-def _oriented(rim: RimPoints) -> OrientedPoints:
+def _oriented(contour: ContourPoints) -> OrientedPoints:
     return OrientedPoints(
-        points_world=rim.points_world,
-        normals_world=rim.normals_world,
-        noise=rim.variance.sqrt(),
+        points_world=contour.points_world,
+        normals_world=contour.normals_world,
+        noise=contour.variance.sqrt(),
     )
 
 

@@ -16,8 +16,8 @@ from torch import Tensor
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.oriented import OrientedPoints
 from pimper_torch.geometry.projection import project
-from pimper_torch.outlines.hull import Hull
-from pimper_torch.records import RimPoints
+from pimper_torch.records import ContourPoints
+from pimper_torch.silhouettes.hull import Hull
 
 # Capacities are integers there.
 _UNIT = 100
@@ -31,7 +31,7 @@ def cut_surface(
     cloud: OrientedPoints,
     maps: DepthMaps,
     hull: Hull,
-    rim: RimPoints | None = None,
+    contour: ContourPoints | None = None,
     *,
     most_points: int = 20_000,
     views_each: int = 3,
@@ -43,7 +43,7 @@ def cut_surface(
         cloud: Matched points.
         maps: Which views see a point: those whose depth is the point's.
         hull: Nothing is outside.
-        rim: Points that are seen from the view whose outline they lie on.
+        contour: Points that are seen from the view whose silhouette they lie on.
         most_points: Of the cloud; as many random ones come in between.
         views_each: Rays of each point, at most.
         seed: Of both.
@@ -53,10 +53,10 @@ def cut_surface(
     points = cloud.points_world[chosen].double()
     low, high = hull.corners_world.double()
     point, center = _rays(points.float(), maps, views_each)
-    if rim is not None:
-        point = torch.cat([point, len(points) + torch.arange(len(rim.ray))])
-        center = torch.cat([center, maps.level.cameras.centers_world[rim.view]])
-        points = torch.cat([points, rim.points_world.double()])
+    if contour is not None:
+        point = torch.cat([point, len(points) + torch.arange(len(contour.ray))])
+        center = torch.cat([center, maps.level.cameras.centers_world[contour.view]])
+        points = torch.cat([points, contour.points_world.double()])
     random = low + (high - low) * torch.rand(
         8 * len(points), 3, generator=generator, dtype=torch.float64
     )

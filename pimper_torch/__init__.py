@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from pimper_torch.chains.coarse_to_fine import CoarseToFine, CoarseToFineConfig
     from pimper_torch.chains.presets import load_chain, load_config, make_chain
     from pimper_torch.chains.published import Published, PublishedConfig
-    from pimper_torch.coarse.adapt import Adapt
-    from pimper_torch.coarse.enclose import Enclose
+    from pimper_torch.coarse.remesh import Remesh
+    from pimper_torch.coarse.surface import CoarseSurface
     from pimper_torch.coarse.triangulate import Triangulate
     from pimper_torch.fusion.fuse import Fuse
     from pimper_torch.io.meshes import read_mesh
@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from pimper_torch.io.results import write_result
     from pimper_torch.io.tensors import scene_of
     from pimper_torch.meshing.extract import Extract
-    from pimper_torch.meshing.mend import Mend
-    from pimper_torch.outlines.outline import Outline
+    from pimper_torch.meshing.repair import Repair
     from pimper_torch.patches.decompose import Decompose
     from pimper_torch.patches.warp import Warp
     from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
@@ -43,12 +42,12 @@ if TYPE_CHECKING:
         CoarseMesh,
         DepthPatches,
         Mesh,
-        Outlines,
         PatchSet,
         PatchViews,
         PhotometricPatches,
         Reconstruction,
         Record,
+        Silhouettes,
         SparseScene,
         Surface,
         SweptPatches,
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
     )
     from pimper_torch.sfm.cache import user_cache
     from pimper_torch.sfm.reconstruct import Reconstruct
+    from pimper_torch.silhouettes.find import FindSilhouettes
     from pimper_torch.single_view.integration import integrate_normal_map
     from pimper_torch.single_view.photometric_stereo.stereo import photometric_stereo
     from pimper_torch.stage import Given, Stage
@@ -63,27 +63,24 @@ if TYPE_CHECKING:
     from pimper_torch.viz.patches import by_facet, plot_in_view, plot_patch
 
 __all__ = [
-    "Adapt",
     "Cameras",
     "Chain",
     "CoarseMesh",
+    "CoarseSurface",
     "CoarseToFine",
     "CoarseToFineConfig",
     "ConfigError",
     "Decompose",
     "DepthPatches",
-    "Enclose",
     "Encoding",
     "Extract",
     "Factorize",
     "FactorizeConfig",
+    "FindSilhouettes",
     "Fuse",
     "Given",
     "InputError",
-    "Mend",
     "Mesh",
-    "Outline",
-    "Outlines",
     "OutputError",
     "PatchSet",
     "PatchViews",
@@ -96,6 +93,9 @@ __all__ = [
     "Reconstruction",
     "ReconstructionError",
     "Record",
+    "Remesh",
+    "Repair",
+    "Silhouettes",
     "SparseScene",
     "Stage",
     "Step",
@@ -140,8 +140,8 @@ _HOMES = {
         "Published",
         "PublishedConfig",
     ),
-    "pimper_torch.coarse.adapt": ("Adapt",),
-    "pimper_torch.coarse.enclose": ("Enclose",),
+    "pimper_torch.coarse.remesh": ("Remesh",),
+    "pimper_torch.coarse.surface": ("CoarseSurface",),
     "pimper_torch.coarse.triangulate": ("Triangulate",),
     "pimper_torch.fusion.fuse": ("Fuse",),
     "pimper_torch.io.meshes": ("read_mesh",),
@@ -149,8 +149,8 @@ _HOMES = {
     "pimper_torch.io.results": ("write_result",),
     "pimper_torch.io.tensors": ("scene_of",),
     "pimper_torch.meshing.extract": ("Extract",),
-    "pimper_torch.meshing.mend": ("Mend",),
-    "pimper_torch.outlines.outline": ("Outline",),
+    "pimper_torch.meshing.repair": ("Repair",),
+    "pimper_torch.silhouettes.find": ("FindSilhouettes",),
     "pimper_torch.patches.decompose": ("Decompose",),
     "pimper_torch.patches.warp": ("Warp",),
     "pimper_torch.photometry.factorize": (
@@ -163,7 +163,7 @@ _HOMES = {
         "CoarseMesh",
         "DepthPatches",
         "Mesh",
-        "Outlines",
+        "Silhouettes",
         "PatchSet",
         "PatchViews",
         "PhotometricPatches",

@@ -19,15 +19,15 @@ from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
     Mesh,
-    Outlines,
     PatchSet,
     PatchViews,
     PhotometricPatches,
+    Silhouettes,
     SparseScene,
     StageReport,
     Surface,
 )
-from pimper_torch.rims.constraints import Rims
+from pimper_torch.silhouettes.contours import Contours
 
 
 @runtime_checkable
@@ -161,16 +161,16 @@ def _(scene: SparseScene) -> dict[str, int | float]:
 
 
 @figures.register
-def _(outlines: Outlines) -> dict[str, int | float]:
+def _(silhouettes: Silhouettes) -> dict[str, int | float]:
     return {
-        "trusted_views": int(outlines.trusted.sum()),
-        "object_share": _mean(outlines.masks.flatten().float()),
+        "trusted_views": int(silhouettes.trusted.sum()),
+        "object_share": _mean(silhouettes.masks.flatten().float()),
     }
 
 
 @figures.register
-def _(rims: Rims) -> dict[str, int | float]:
-    return {"rim_rays": len(rims.rays.view)}
+def _(contours: Contours) -> dict[str, int | float]:
+    return {"contour_rays": len(contours.rays.view)}
 
 
 @figures.register

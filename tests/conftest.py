@@ -49,11 +49,11 @@ def reconstruction():
         Depths,
         Lens,
         Mesh,
-        Outlines,
         PatchSet,
         PhotometricPatches,
         Photometry,
         Reconstruction,
+        Silhouettes,
         SparseScene,
         StageReport,
         Templates,
@@ -142,7 +142,7 @@ def reconstruction():
     return Reconstruction(
         mesh=mesh,
         scene=scene,
-        outlines=Outlines.everything(scene.views),
+        silhouettes=Silhouettes.everything(scene.views),
         coarse=coarse,
         patches=DepthPatches(photometric=photometric, buckets=(depths,)),
         report=(

@@ -6,7 +6,7 @@ from torch import nn
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.errors import PimperWarning, caution, held
 from pimper_torch.evidence.bench.gradients import small_scene
-from pimper_torch.records import Outlines
+from pimper_torch.records import Silhouettes
 from pimper_torch.stage import Given
 
 
@@ -30,14 +30,14 @@ def rounds(messages):
             caution(message)
 
     scene, _ = small_scene()
-    chain.outline = Given(Outlines.everything(scene.views))
+    chain.silhouettes = Given(Silhouettes.everything(scene.views))
     chain.factorize = Stub(factorize)
     return list(chain.passes(scene, None, None))
 
 
 def test_the_last_rounds_figures_are_said_once():
     with pytest.warns(PimperWarning) as caught:
-        rounds([["9 of 10", "no rims"], ["5 of 10"], ["3 of 10"]])
+        rounds([["9 of 10", "no contours"], ["5 of 10"], ["3 of 10"]])
     assert [str(warning.message) for warning in caught] == ["3 of 10"]
 
 

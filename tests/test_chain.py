@@ -33,7 +33,7 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
 )
-from pimper_torch.rims.constraints import Rims
+from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Given
 
 log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figures
@@ -76,7 +76,7 @@ def photographed(shape: Shape, seed: int, **settings: object) -> RenderedScene:
 def small_chain(preset: str, scene: SparseScene) -> pt.Chain:
     chain = pt.load_chain(preset, SMALL[preset], reconstruct=Given(scene))
     if preset == "default":
-        chain.enclose = OneSide(num_points=20)
+        chain.coarse_surface = OneSide(num_points=20)
     return chain
 
 
@@ -149,8 +149,8 @@ class Dragging(nn.Module):
         self.fuse = fuse
         self.sound: list[Surface] = []
 
-    def forward(self, swept: SweptPatches, rims: Rims, expected: bool = True) -> Surface:
-        surface: Surface = self.fuse(swept, rims, expected)
+    def forward(self, swept: SweptPatches, contours: Contours, expected: bool = True) -> Surface:
+        surface: Surface = self.fuse(swept, contours, expected)
         self.sound.append(surface)
         vertices = surface.vertices_world.clone()
         vertices[self.dragged(surface), 0] += 0.3
@@ -169,19 +169,19 @@ class Spy(nn.Module):
         self.stage = stage
         self.surface: Surface | None = None
 
-    def forward(self, swept: SweptPatches, surface: Surface, rims: Rims) -> CoarseMesh:
+    def forward(self, swept: SweptPatches, surface: Surface, contours: Contours) -> CoarseMesh:
         self.surface = surface
-        found: CoarseMesh = self.stage(swept, surface, rims)
+        found: CoarseMesh = self.stage(swept, surface, contours)
         return found
 
 
 def test_a_fold_is_mended_before_a_round_or_the_mesh_builds_on_it():
     scene = photographed(Sphere(), 165, target=(0.0, 0.0, 1.0))
     pimper = small_chain("default", sparse_scene(scene, 150, torch.Generator().manual_seed(17)))
-    pimper.fuse, pimper.adapt = Dragging(pimper.fuse), Spy(pimper.adapt)
+    pimper.fuse, pimper.remesh = Dragging(pimper.fuse), Spy(pimper.remesh)
     result = pimper(scene.views)
     last = pimper.fuse.sound[-1]
-    for sound, found in ((pimper.fuse.sound[0], pimper.adapt.surface), (last, result.mesh)):
+    for sound, found in ((pimper.fuse.sound[0], pimper.remesh.surface), (last, result.mesh)):
         place = sound.vertices_world[Dragging.dragged(sound)]
         away = (found.vertices_world - place).norm(dim=1)
         assert away.min() < 0.01
@@ -208,14 +208,14 @@ def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene) -> ViewCo
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")  # facets at the rim
+@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")  # facets at the contour
 def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
     truth = potato_on_table(num_views=9, width=160, height=120)
     save_photographs(truth.views, tmp_path / "photos")
     save_masks(truth.foreground, truth.views.names, tmp_path / "masks")
     views = pt.load_views(tmp_path / "photos", masks=tmp_path / "masks")
     placed = sparse_scene(truth, 600, torch.Generator().manual_seed(17))
-    pimper = pt.load_chain("default", {"enclose": {"num_facets": 400}})
+    pimper = pt.load_chain("default", {"coarse_surface": {"num_facets": 400}})
     pimper.reconstruct = Given(placed.replace(views=views))
     result = pimper(views)
     facets = compared(result.coarse.mesh, result, truth)
@@ -256,7 +256,7 @@ def test_a_potato_is_reconstructed_from_files_better_than_published(preset, pota
     pimper = pt.load_chain(preset)
     pimper.reconstruct = Given(found)  # the same in both presets, and the longest stage
     with warnings.catch_warnings():
-        # A few facets on the rim may lack light, which may rightly be said.
+        # A few facets on the contour may lack light, which may rightly be said.
         warnings.simplefilter("ignore", PimperWarning)
         result = pimper(views)
     facets = Triangulate()(result.scene)

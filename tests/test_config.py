@@ -239,9 +239,12 @@ def test_settings_say_which_chain_they_are_for():
     ("changes", "told"),
     [
         ({"rounds": {"scales": [1.0]}}, "`rounds.scales` is `scales` now"),
-        ({"outline": {"num_voxels": 9}}, "is no setting: `Outline` takes `OutlineDetails` now"),
-        ({"enclose": {"gap_px": 9.0}}, "`enclose.gap_px` is no setting"),
-        ({"rims": {"per_view": 9}}, "`rims` is no setting: `rim_rays` takes a `RimConfig` now"),
+        ({"outline": {"num_voxels": 9}}, "`outline` is `silhouettes`, with object"),
+        ({"enclose": {"gap_px": 9.0}}, "`enclose` is `coarse_surface`, with reference"),
+        ({"rims": {"per_view": 9}}, "`rims` is no setting: `contour_rays` takes a `RayConfig` now"),
+        ({"triangulate": {"fill_smoothing": 9.0}}, "`Triangulate` takes `TriangulateDetails` now"),
+        ({"adapt": {"max_facets": 9}}, "`adapt` is `remesh` now"),
+        ({"sweep": {"step_samples": 9.0}}, "`sweep.step_samples` is a constant now"),
     ],
 )
 def test_a_former_name_of_a_setting_is_refused_with_what_it_is_now(changes, told):

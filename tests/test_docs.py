@@ -70,7 +70,7 @@ def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
     monkeypatch.setattr(Reconstruct, "forward", place)  # the longest stage
     draw = results.draw_overview
     monkeypatch.setattr(results, "draw_overview", lambda found, path: draw(found, path, 40))
-    few = {"enclose": {"num_facets": 100}}  # thousands take a third of a minute
+    few = {"coarse_surface": {"num_facets": 100}}  # thousands take a third of a minute
     monkeypatch.setattr(presets, "load_config", lambda name, _: load_config(name, few))
     return {}
 

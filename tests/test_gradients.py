@@ -52,7 +52,7 @@ def published():
     return probes(chain_of("paper"), *small_scene())
 
 
-@pytest.mark.parametrize("stage", ["warp", "decompose", "sweep", "fuse", "mend", "adapt"])
+@pytest.mark.parametrize("stage", ["warp", "decompose", "sweep", "fuse", "repair", "remesh"])
 def test_stages_of_the_rounds_agree_with_finite_differences(rounds, stage, generator):
     # What sways the surface little is told from rounding by longer steps.
     steps = (3e-6, 1e-6) if stage == "fuse" else (1e-6, 1e-7)

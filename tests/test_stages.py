@@ -21,8 +21,10 @@ def factorized():
 
 
 def chain_on(scene, coarse):
-    everything = Given(pt.Outlines.everything(scene.views))
-    return pt.load_chain("default", {"scales": [1.0]}, outline=everything, enclose=Given(coarse))
+    everything = Given(pt.Silhouettes.everything(scene.views))
+    return pt.load_chain(
+        "default", {"scales": [1.0]}, silhouettes=everything, coarse_surface=Given(coarse)
+    )
 
 
 def changed(found, **changes):

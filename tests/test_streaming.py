@@ -12,9 +12,9 @@ from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.mesh_light import thinned
-from pimper_torch.records import Outlines, StageReport
+from pimper_torch.records import Silhouettes, StageReport
 from pimper_torch.reporting import Silent
-from pimper_torch.rims.constraints import Rims
+from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Given
 from pimper_torch.sweep.sweep import Sweep
 
@@ -113,8 +113,8 @@ def in_rounds(listener, **changes):
     chain = pt.load_chain("default", {"scales": [0.5, 1.0], **changes}, listener)
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
     chain.reconstruct = Given(scene)
-    chain.outline = Given(Outlines.everything(scene.views))
-    chain.enclose = Given(coarse)
+    chain.silhouettes = Given(Silhouettes.everything(scene.views))
+    chain.coarse_surface = Given(coarse)
     return chain, scene
 
 
@@ -127,9 +127,9 @@ def test_steps_show_the_records_of_every_pass_and_end_where_the_run_ends():
     assert [report.name for report in result.report] == [*names, "extract"]
     assert torch.equal(chain.extract(steps[-1].surface).vertices_world, result.mesh.vertices_world)
     # The second pass stands on facets that were remeshed on the first one's surface.
-    assert steps[0].coarse is chain.enclose.record
-    rims = Rims.none(steps[0].outlines, scene.cameras)
-    remeshed = chain.adapt(steps[0].heights, steps[0].surface, rims)
+    assert steps[0].coarse is chain.coarse_surface.record
+    contours = Contours.none(steps[0].silhouettes, scene.cameras)
+    remeshed = chain.remesh(steps[0].heights, steps[0].surface, contours)
     assert torch.equal(steps[1].coarse.mesh.faces, remeshed.mesh.faces)
 
 

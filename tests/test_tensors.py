@@ -105,7 +105,7 @@ def test_cameras_of_another_convention_are_recognised(given):
 @pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
 def test_from_tensors_to_a_saved_result(given, tmp_path):
     scene, coarse = given
-    chain = pt.load_chain("default", {"scales": [1.0], "outline": {"object": "everything"}})
+    chain = pt.load_chain("default", {"scales": [1.0], "silhouettes": {"object": "everything"}})
     result = chain(scene_of(scene), mesh=coarse.mesh)
     pt.write_result(result, chain.config, tmp_path / "out")
     mesh = trimesh.load(tmp_path / "out" / "mesh.ply")

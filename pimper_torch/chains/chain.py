@@ -15,11 +15,11 @@ from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
     Mesh,
-    Outlines,
     PatchSet,
     PhotometricPatches,
     Reconstruction,
     Record,
+    Silhouettes,
     SparseScene,
     StageReport,
     Surface,
@@ -38,7 +38,7 @@ class Step(Record):
         scale: Of the photographs that templates were sampled for; 1 is their own size.
         last: Whether this step's surface is the result.
         scene: Cameras, undistorted photographs and the cloud.
-        outlines: Where every view shows the object.
+        silhouettes: Where every view shows the object.
         heights: Depth maps of all patches, with their normals, albedo and lights.
         surface: Joined over all facets, on the subdivided coarse mesh.
         reports: One of each stage that ran for this step, in order.
@@ -47,7 +47,7 @@ class Step(Record):
     scale: float
     last: bool
     scene: SparseScene
-    outlines: Outlines
+    silhouettes: Silhouettes
     heights: DepthPatches | SweptPatches
     surface: Surface
     reports: tuple[StageReport, ...] = ()
@@ -80,7 +80,7 @@ class Chain(Stage):
     """
 
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
-    outline: Callable[[SparseScene], Outlines]
+    silhouettes: Callable[[SparseScene], Silhouettes]
     decompose: Callable[[CoarseMesh, Cameras, Surface | None, float], PatchSet]
     extract: Callable[[Surface], Mesh]
 
@@ -166,7 +166,7 @@ class Chain(Stage):
         return Reconstruction(
             mesh=found,
             scene=step.scene,
-            outlines=step.outlines,
+            silhouettes=step.silhouettes,
             coarse=step.coarse,
             patches=step.heights,
             report=(*reports, *last),

@@ -15,16 +15,15 @@ from pimper_torch.chains.streaming import (
     Warping,
     photometry_and_heights,
 )
-from pimper_torch.coarse.adapt import Adapt, AdaptConfig
-from pimper_torch.coarse.enclose import Enclose, EncloseConfig
+from pimper_torch.coarse.remesh import Remesh, RemeshConfig
+from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.config import require
 from pimper_torch.errors import caution, held
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.memory import bytes_of, release_memory, require_memory
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.meshing.mend import Mend
-from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
+from pimper_torch.meshing.repair import Repair
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
@@ -33,15 +32,16 @@ from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     Mesh,
-    Outlines,
+    Silhouettes,
     SparseScene,
     Surface,
     SweptPatches,
     Views,
 )
 from pimper_torch.reporting import Observer
-from pimper_torch.rims.constraints import Rim, Rims
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.silhouettes.contours import Contours, TraceContours
+from pimper_torch.silhouettes.find import FindSilhouettes, SilhouetteConfig, masked
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
 
@@ -65,14 +65,14 @@ class CoarseToFineConfig:
     scales: tuple[float, ...] = (0.25, 0.5, 1.0)
     photographs: Encoding = field(default_factory=Encoding)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
-    outline: OutlineConfig = field(default_factory=OutlineConfig)
-    enclose: EncloseConfig = field(default_factory=EncloseConfig)
+    silhouettes: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    coarse_surface: CoarseSurfaceConfig = field(default_factory=CoarseSurfaceConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
     factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
     sweep: SweepConfig = field(default_factory=SweepConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
-    adapt: AdaptConfig = field(default_factory=AdaptConfig)
+    remesh: RemeshConfig = field(default_factory=RemeshConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
 
     def __post_init__(self) -> None:
@@ -98,18 +98,18 @@ class CoarseToFine(Chain):
         self.config = config = config or CoarseToFineConfig()
         super().__init__(config.kernels, observer)
         self.reconstruct = Reconstruct(config.reconstruct, cache)
-        self.outline = Outline(config.outline)
-        self.rim: Callable[[Outlines, Cameras], Rims] = Rim()
-        self.enclose: Callable[[SparseScene, Rims, Mesh | None], CoarseMesh] = Enclose(
-            config.enclose
+        self.silhouettes = FindSilhouettes(config.silhouettes)
+        self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
+        self.coarse_surface: Callable[[SparseScene, Contours, Mesh | None], CoarseMesh] = (
+            CoarseSurface(config.coarse_surface)
         )
         self.decompose = Decompose(config.decompose)
         self.warp: Warping = Warp(config.warp)
         self.factorize: Factorizing = Factorize(config.factorize)
         self.sweep: Sweeping = Sweep(config.sweep)
-        self.fuse: Callable[[SweptPatches, Rims, bool], Surface] = Fuse(config.fuse)
-        self.mend: Callable[[Surface], Surface] = Mend()
-        self.adapt: Callable[[SweptPatches, Surface, Rims], CoarseMesh] = Adapt(config.adapt)
+        self.fuse: Callable[[SweptPatches, Contours, bool], Surface] = Fuse(config.fuse)
+        self.repair: Callable[[Surface], Surface] = Repair()
+        self.remesh: Callable[[SweptPatches, Surface, Contours], CoarseMesh] = Remesh(config.remesh)
         self.extract = Extract(config.extract)
         self._swap(stages)
 
@@ -118,11 +118,11 @@ class CoarseToFine(Chain):
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
         scene = self.placed(views, sparse_model)
-        outlines = self.outline(scene)
-        scene = masked(scene, outlines)
+        silhouettes = self.silhouettes(scene)
+        scene = masked(scene, silhouettes)
         cameras = scene.cameras
-        rims = self.rim(outlines, cameras)
-        coarse = self.enclose(scene, rims, mesh)
+        contours = self.contours(silhouettes, cameras)
+        coarse = self.coarse_surface(scene, contours, mesh)
         sources = self.warp.prepare(scene.views) if isinstance(self.warp, Prepares) else None
         heights: SweptPatches | None = None
         surface: Surface | None = None
@@ -130,7 +130,7 @@ class CoarseToFine(Chain):
         for number, scale in enumerate(self.config.scales, start=1):
             with held() as cautions:
                 if heights is not None and surface is not None:
-                    coarse = self.adapt(heights, surface, rims)
+                    coarse = self.remesh(heights, surface, contours)
                 patches = self.decompose(coarse, cameras, surface, scale)
                 if number == 1:
                     limit = bytes_of(self.config.max_memory)
@@ -141,7 +141,7 @@ class CoarseToFine(Chain):
                 if number == last:
                     sources = None  # as much memory as the photographs themselves
                 release_memory()
-                surface = self.mend(self.fuse(heights, rims, number == last))
+                surface = self.repair(self.fuse(heights, contours, number == last))
             if number == last:  # what earlier passes would warn of as well
                 for message in cautions:
                     caution(message, stacklevel=3)
@@ -149,7 +149,7 @@ class CoarseToFine(Chain):
                 scale=scale,
                 last=number == last,
                 scene=scene,
-                outlines=outlines,
+                silhouettes=silhouettes,
                 heights=heights,
                 surface=surface,
             )

@@ -43,56 +43,30 @@ def load_config(
 _FORMER = {
     "rounds.scales": "`scales`",
     "rounds.all_round": "`chain`: coarse-to-fine sees all round, published one side",
-    "rims": "no setting: `rim_rays` takes a `RimConfig`",
-    "enclose.densify": "no setting: `Enclose` takes a `DensifyConfig`",
-    "enclose.outlined": "no setting: `Enclose` takes an `OutlinedConfig`",
-    "outline.margin": "no setting: 0.25",
-    "mend": "no setting: `Mend` takes a `MendConfig`",
+    "outline": "`silhouettes`, with object, region and size_px",
+    "rims": "no setting: `contour_rays` takes a `RayConfig`",
+    "enclose": "`coarse_surface`, with reference and num_facets",
+    "adapt": "`remesh`",
+    "mend": "no setting: `Repair` takes a `RepairConfig`",
+    "fuse.rims": "`fuse.contours`",
+    **{
+        f"triangulate.{name}": "no setting: `Triangulate` takes `TriangulateDetails`"
+        for name in [
+            *("facet_edge_px", "fill_smoothing", "max_view_angle_deg", "min_track_length"),
+            *("max_reprojection_px", "min_angle_deg", "neighbours", "hiding_slope", "max_slope"),
+            *("max_deviation", "max_isolation", "max_tilt_deg", "max_stretch", "min_altitude"),
+            *("min_tip_deg", "min_coverage", "dark_share", "smoothing_rounds"),
+        ]
+    },
     **dict.fromkeys(
         [
             *("align.rows", "align.columns", "align.reach_samples"),
             *("sweep.step_samples", "sweep.window_samples", "sweep.loss_scale", "sweep.max_slope"),
             *("reconstruct.min_matches", "reconstruct.min_registration_points"),
-            *("reconstruct.min_share", "adapt.max_residual", "warp.pyramid_levels"),
-            *("enclose.min_track_length", "enclose.max_reprojection_px", "enclose.min_angle_deg"),
-            "refine.samples_per_vertex",
+            *("reconstruct.min_share", "warp.pyramid_levels", "refine.samples_per_vertex"),
         ],
         "a constant",
     ),
-    **{
-        f"{stage}.{name}": f"no setting: `{stage.title()}` takes `{stage.title()}Details`"
-        for stage, names in {
-            "outline": (
-                "rounds num_voxels disagreeing plane_tolerance least_on_plane most_below_plane "
-                "least_covered least_overlap seed"
-            ),
-            "triangulate": (
-                "facet_edge_px fill_smoothing max_view_angle_deg min_track_length "
-                "max_reprojection_px min_angle_deg neighbours hiding_slope max_slope max_deviation "
-                "max_isolation max_tilt_deg max_stretch min_altitude min_tip_deg min_coverage "
-                "dark_share smoothing_rounds"
-            ),
-        }.items()
-        for name in names.split()
-    },
-    **{
-        f"enclose.{name}": "no setting: `Enclose` takes an `OutlinedConfig`"
-        for name in [
-            "cell_px",
-            "max_depth",
-            "point_weight",
-            "reach_px",
-            "least_views",
-            "gap_px",
-            "brink_px",
-            "hole_px",
-            "min_share",
-            "boundary_weight",
-            "max_distance_px",
-            "smoothing_rounds",
-            "threads",
-        ]
-    },
 }
 
 

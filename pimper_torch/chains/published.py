@@ -8,11 +8,10 @@ from typing import ClassVar
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
-from pimper_torch.coarse.enclose import Enclose, EncloseConfig
+from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.outlines.outline import Outline, OutlineConfig, masked
 from pimper_torch.paper.alignment.align import Align, AlignConfig
 from pimper_torch.paper.integrate import Integrate, IntegrateConfig
 from pimper_torch.paper.refinement.refine import Refine, RefineConfig
@@ -33,8 +32,9 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer
-from pimper_torch.rims.constraints import Rims
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.silhouettes.contours import Contours
+from pimper_torch.silhouettes.find import FindSilhouettes, SilhouetteConfig, masked
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,9 +52,9 @@ class PublishedConfig:
     kernels: Kernels = "numba"
     photographs: Encoding = field(default_factory=Encoding)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
-    outline: OutlineConfig = field(default_factory=OutlineConfig)
+    silhouettes: SilhouetteConfig = field(default_factory=SilhouetteConfig)
     triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
-    enclose: EncloseConfig = field(default_factory=EncloseConfig)
+    coarse_surface: CoarseSurfaceConfig = field(default_factory=CoarseSurfaceConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
     factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
@@ -81,9 +81,11 @@ class Published(Chain):
         self.config = config = config or PublishedConfig()
         super().__init__(config.kernels, observer)
         self.reconstruct = Reconstruct(config.reconstruct, cache)
-        self.outline = Outline(config.outline)
+        self.silhouettes = FindSilhouettes(config.silhouettes)
         self.triangulate: Callable[[SparseScene], CoarseMesh] = Triangulate(config.triangulate)
-        self.enclose: Callable[[SparseScene, Rims, Mesh], CoarseMesh] = Enclose(config.enclose)
+        self.coarse_surface: Callable[[SparseScene, Contours, Mesh], CoarseMesh] = CoarseSurface(
+            config.coarse_surface
+        )
         self.decompose = Decompose(config.decompose)
         self.warp: Callable[[Views, Cameras, PatchSet], PatchViews] = Warp(config.warp)
         self.factorize: Callable[[PatchViews], PhotometricPatches] = Factorize(config.factorize)
@@ -98,16 +100,21 @@ class Published(Chain):
     ) -> Iterator[Step]:
         """Run once through the stages."""
         scene = self.placed(views, sparse_model)
-        outlines = self.outline(scene)
-        scene = masked(scene, outlines)
+        silhouettes = self.silhouettes(scene)
+        scene = masked(scene, silhouettes)
         if mesh is None:
             coarse = self.triangulate(scene)
         else:
-            coarse = self.enclose(scene, Rims.none(outlines, scene.cameras), mesh)
+            coarse = self.coarse_surface(scene, Contours.none(silhouettes, scene.cameras), mesh)
         patches = self.decompose(coarse, scene.cameras, None, 1.0)
         seen = self.warp(scene.views, scene.cameras, patches)
         heights = self.align(self.integrate(self.factorize(seen)))
         surface = self.refine(heights)
         yield Step(
-            scale=1.0, last=True, scene=scene, outlines=outlines, heights=heights, surface=surface
+            scale=1.0,
+            last=True,
+            scene=scene,
+            silhouettes=silhouettes,
+            heights=heights,
+            surface=surface,
         )

@@ -52,7 +52,7 @@ def light(module: str, name: str) -> Any:  # noqa: ANN401 - whatever the module 
     Classes of the package that are made here are not those of the package itself: they serve to
     read a command line, which is read again if it is sound.
 
-    >>> light("pimper_torch.coarse.enclose", "EncloseConfig")().num_facets
+    >>> light("pimper_torch.coarse.surface", "CoarseSurfaceConfig")().num_facets
     3000
     """
     source = _source(module)

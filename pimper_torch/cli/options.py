@@ -58,10 +58,10 @@ class InputOptions:
             from motion.
         mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB), used instead of the
             one that the photographs themselves give.
-        object: Whether outlines of the object are found (auto), taken from masks, or everything is
-            the object, as for walls, reliefs and scenes; as `--outline.object`.
+        object: Whether silhouettes of the object are found (auto), taken from masks, or everything
+            is the object, as for walls, reliefs and scenes; as `--silhouettes.object`.
         region: Box that the object is inside, smallest and largest corner in scene units, such as
-            (-1,-1,0,1,1,2); as `--outline.region`.
+            (-1,-1,0,1,1,2); as `--silhouettes.region`.
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -138,17 +138,17 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         args=list(arguments),
         config=(LEVELS,),
     )
-    outline = job.config.outline
+    silhouettes = job.config.silhouettes
     if job.inputs.object:
-        outline = dataclasses.replace(outline, object=job.inputs.object)
+        silhouettes = dataclasses.replace(silhouettes, object=job.inputs.object)
     if job.inputs.region:
-        outline = dataclasses.replace(outline, region=tuple(map(float, job.inputs.region)))
-    job = dataclasses.replace(job, config=dataclasses.replace(job.config, outline=outline))
+        silhouettes = dataclasses.replace(silhouettes, region=tuple(map(float, job.inputs.region)))
+    job = dataclasses.replace(job, config=dataclasses.replace(job.config, silhouettes=silhouettes))
     if job.common.reference:
         named = job.common.reference
         config = job.config
         config = dataclasses.replace(
-            config, enclose=dataclasses.replace(config.enclose, reference=named)
+            config, coarse_surface=dataclasses.replace(config.coarse_surface, reference=named)
         )
         if isinstance(config, PublishedConfig):
             config = dataclasses.replace(

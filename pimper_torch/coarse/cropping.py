@@ -5,31 +5,31 @@ from jaxtyping import Int
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import crop_intrinsics
-from pimper_torch.records import Outlines, SparseScene
+from pimper_torch.records import Silhouettes, SparseScene
 
-# Pixels kept round the outlines: windows reach beyond what they match.
+# Pixels kept round the silhouettes: windows reach beyond what they match.
 _MARGIN = 8
 
 
-def cropped(scene: SparseScene, outlines: Outlines) -> SparseScene:
-    """Cut every photograph to its outline's bounding box, and mask it.
+def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
+    """Cut every photograph to its silhouette's bounding box, and mask it.
 
-    The photographs share one raster: the largest box's. Views without an outline keep their
+    The photographs share one raster: the largest box's. Views without an silhouette keep their
     left upper corner, masked. Cameras follow; observations keep their pixels, which are those
     of the photographs before undistortion.
 
     Args:
         scene: Photographs and cameras.
-        outlines: Of all views; those not trusted mask their photographs too. What leaves nothing
+        silhouettes: Of all views; those not trusted mask their photographs too. What leaves nothing
             out gives the scene as it is.
     """
-    if outlines.source == "everything":
+    if silhouettes.source == "everything":
         return scene
-    boxes = _boxes(outlines, scene.cameras.sizes_px)
+    boxes = _boxes(silhouettes, scene.cameras.sizes_px)
     low = boxes[:, 0]
     size = boxes[:, 1] - low
     width, height = size.amax(dim=0).tolist()
-    views, masks = scene.views, outlines.masks
+    views, masks = scene.views, silhouettes.masks
     images = views.images.new_zeros(views.num_views, views.images.shape[1], height, width)
     shown = torch.zeros_like(images[:, 0], dtype=torch.bool)
     intrinsics = scene.cameras.intrinsics.clone()
@@ -44,9 +44,9 @@ def cropped(scene: SparseScene, outlines: Outlines) -> SparseScene:
     )
 
 
-def _boxes(outlines: Outlines, sizes_px: Int[Tensor, "view 2"]) -> Int[Tensor, "view 2 2"]:
-    """Give the corners of boxes round the outlines, first inside, then outside."""
-    masks = outlines.masks
+def _boxes(silhouettes: Silhouettes, sizes_px: Int[Tensor, "view 2"]) -> Int[Tensor, "view 2 2"]:
+    """Give the corners of boxes round the silhouettes, first inside, then outside."""
+    masks = silhouettes.masks
     ends = []
     for along in (masks.any(dim=1), masks.any(dim=2)):  # columns, then rows
         places = torch.arange(along.shape[1], device=along.device)

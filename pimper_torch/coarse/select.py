@@ -34,7 +34,7 @@ def named_view(views: Views, name: str) -> int:
     if len(found) != 1:
         raise InputError(
             f"reference view: {len(found)} registered photographs are named {name!r}, and one "
-            f"is needed. Registered are: {', '.join(views.names)}."
+            f"is needed. Observations are: {', '.join(views.names)}."
         )
     return found[0]
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pimper_torch.fusion.evidence import LEAST_FACING, Evidence
 from pimper_torch.geometry.visibility import Hits, RayCaster
-from pimper_torch.records import FacetPoints, Record, RimPoints
+from pimper_torch.records import ContourPoints, FacetPoints, Record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -72,21 +72,21 @@ def cloud_points(points: FacetPoints, ground: Ground) -> Contacts:
     return Contacts(places=points.points_world.to(line), lines=line, variance=variance)
 
 
-def rim_tangents(rims: RimPoints, ground: Ground) -> Contacts:
-    """Let the surface touch the rays through the outlines.
+def contour_tangents(contours: ContourPoints, ground: Ground) -> Contacts:
+    """Let the surface touch the rays through the silhouettes.
 
     A ray lies in the plane that touches the surface there, so that where on the ray the place is
     matters little. Where directions run along that plane, heights cannot bring the surface to it.
 
     Differentiable; where the rays touch, and which vertex is nearest, is constant.
     """
-    line = ground.lines_at(rims.points_world)
-    facing = (line * rims.normals_world.to(line)).sum(dim=-1)
+    line = ground.lines_at(contours.points_world)
+    facing = (line * contours.normals_world.to(line)).sum(dim=-1)
     told = facing.detach() > LEAST_FACING
     return Contacts(
-        places=rims.points_world.to(line)[told],
+        places=contours.points_world.to(line)[told],
         lines=line[told],
-        variance=rims.variance.to(line)[told] / facing[told].square(),
+        variance=contours.variance.to(line)[told] / facing[told].square(),
     )
 
 

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.fusion.bands import CoarsePart
-from pimper_torch.fusion.contacts import Contacts, Ground, cloud_points, passing, rim_tangents
+from pimper_torch.fusion.contacts import Contacts, Ground, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.continuation import about_mean, continued, enclosed
 from pimper_torch.fusion.drift import MEDIAN_OF_TILT, Drift, alike, common_variance, drift
 from pimper_torch.fusion.estimate import Fused, fuse_evidence
@@ -38,7 +38,7 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
 )
-from pimper_torch.rims.constraints import Rims
+from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
 
 # Information that every vertex holds to where it is by, in units of one over its spacing
@@ -73,7 +73,7 @@ class FuseConfig:
         slopes: Whether normals take part.
         heights: Whether swept heights do.
         points: Whether the cloud's points do.
-        rims: Whether the rays through the outlines do.
+        contours: Whether the rays through the silhouettes do.
         drift_rounds: How often the tilt that all normals of a facet share, and the height that
             all swept heights of a facet are off by, are estimated, and the tilt taken out; 0
             trusts both at all wavelengths.
@@ -90,7 +90,7 @@ class FuseConfig:
     slopes: bool = True
     heights: bool = True
     points: bool = True
-    rims: bool = True
+    contours: bool = True
     drift_rounds: int = 2
     noise_rounds: int = 3
     outlier_samples: float = 4.0
@@ -102,7 +102,7 @@ class FuseConfig:
         require(self.drift_rounds >= 0, "fuse.drift_rounds", self.drift_rounds, "0 or more")
         require(self.error_draws >= 0, "fuse.error_draws", self.error_draws, "0 or more")
         require(self.noise_rounds >= 1, "fuse.noise_rounds", self.noise_rounds, "1 or more")
-        some = self.slopes or self.heights or self.points or self.rims
+        some = self.slopes or self.heights or self.points or self.contours
         require(some, "fuse.slopes", self.slopes, "true unless heights or points are")
 
 
@@ -157,7 +157,7 @@ class Fuse(Stage):
 
     Unknown is the height of every lattice vertex along the coarse mesh's smoothed normal.
     Evidence is linear in it: edges are at right angles to photometric normals, the sweep knows
-    heights, the cloud's points lie on the surface, rays through the outlines touch it, and where
+    heights, the cloud's points lie on the surface, rays through the silhouettes touch it, and where
     no light tells anything the surface keeps the slopes it has, or continues those of lit ground
     that encloses it (:mod:`~pimper_torch.fusion.continuation`). Across contours and folds, as seen
     along the directions, no normal can be followed, and heights go on differing as they do. Each
@@ -179,12 +179,12 @@ class Fuse(Stage):
         super().__init__()
         self.config = config or FuseConfig()
 
-    def forward(self, swept: SweptPatches, rims: Rims, expected: bool = True) -> Surface:
+    def forward(self, swept: SweptPatches, contours: Contours, expected: bool = True) -> Surface:
         """Fuse what is known of all patches.
 
         Args:
             swept: Photometry and swept heights of all patches.
-            rims: What outlines say about the surface.
+            contours: What silhouettes say about the surface.
             expected: Whether the expected error of every vertex is found.
 
         The convergence's residual is the root mean square distance that the surface moved, in
@@ -194,7 +194,7 @@ class Fuse(Stage):
             InputError: A normal, a confidence or a height that is none.
         """
         rough = self._task(swept, _COARSER * self.config.samples_per_vertex)
-        contacts = self._contacts(rough, swept, rims)
+        contacts = self._contacts(rough, swept, contours)
         learnt = self._learnt(rough, contacts)
         task = self._task(swept, self.config.samples_per_vertex)
         solved, solves = self._solved(task, contacts, learnt)
@@ -269,15 +269,15 @@ class Fuse(Stage):
         shared = None if common is None else alike(common, task.lattice.facet, upright)
         return [swept_heights(*told, task.correlated, shared)]
 
-    def _contacts(self, task: _Task, swept: SweptPatches, rims: Rims) -> list[Contacts]:
-        """List the places that the surface passes through: the cloud's points, and rims."""
+    def _contacts(self, task: _Task, swept: SweptPatches, contours: Contours) -> list[Contacts]:
+        """List the places that the surface passes through: the cloud's points, and contours."""
         ground, cloud = _ground(task), swept.patches.coarse.points
         found = []
         if self.config.points and cloud is not None:
             found.append(cloud_points(cloud, ground))
-        touched = rims.touching(task.places, task.shape)
-        if self.config.rims and len(touched.ray):
-            found.append(rim_tangents(touched, ground))
+        touched = contours.touching(task.places, task.shape)
+        if self.config.contours and len(touched.ray):
+            found.append(contour_tangents(touched, ground))
         return found
 
     def _learnt(self, task: _Task, contacts: list[Contacts]) -> _Learnt:

@@ -17,7 +17,7 @@ from pimper_torch.io.meshes import write_glb, write_ply, written_channels
 from pimper_torch.meshing.simplify import simplify
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Outlines, Reconstruction, SparseScene
+from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
 from pimper_torch.sfm.scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.overview import draw_overview
@@ -57,7 +57,7 @@ def write_result(
                      in the unit of the vertices; binary
     `mesh.glb`       the same for viewers, albedo linear as glTF wants it
     `sparse/`        COLMAP model, in the mesh's frame
-    `masks/`         the object's outline in every photograph as it was undistorted, PNG of its
+    `masks/`         the object's silhouette in every photograph as it was undistorted, PNG of its
                      name; none where everything is the object
     `normals.png`    reference view: red right, green up, blue to the viewer
     `albedo.png`     reference view, sRGB, scaled into [0, 1]
@@ -66,7 +66,7 @@ def write_result(
     `lights.json`    light of every view, averaged and for each patch, world frame
     `config.yaml`    every setting of the run
     `summary.json`   counts, times, memory, convergence
-    `overview.png`   contact sheet, every photograph with its outline below
+    `overview.png`   contact sheet, every photograph with its silhouette below
     ===============  ==============================================================
 
     The mesh is simplified, unless ``full_mesh``: every vertex of ``result.mesh`` is within a
@@ -112,8 +112,8 @@ def _write_all(
         write_ply(result.mesh, folder / "mesh.ply")
         write_glb(result.mesh, folder / "mesh.glb")
         write_model(result.scene, folder / "sparse")
-        if result.outlines.source != "everything":
-            _write_masks(result.outlines, result.scene, folder / "masks")
+        if result.silhouettes.source != "everything":
+            _write_masks(result.silhouettes, result.scene, folder / "masks")
     with part(2, _PARTS):
         _write_maps(result, folder)
     _write_json(lights_account(result), folder / "lights.json")
@@ -123,10 +123,10 @@ def _write_all(
         draw_overview(result, folder / "overview.png")
 
 
-def _write_masks(outlines: Outlines, scene: SparseScene, folder: Path) -> None:
+def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> None:
     folder.mkdir()
     names, sizes = scene.views.names, scene.cameras.sizes_px.tolist()
-    for name, mask, (width, height) in zip(names, outlines.masks, sizes, strict=True):
+    for name, mask, (width, height) in zip(names, silhouettes.masks, sizes, strict=True):
         drawn = mask[:height, :width].to(torch.uint8) * 255
         Image.fromarray(drawn.numpy()).save(folder / f"{Path(name).stem}.png")
 

@@ -53,6 +53,6 @@ def least_bent(
     rows, cols, values = (
         torch.from_numpy(part).to(side.device) for part in (*energy.coords, energy.data)
     )
-    (found,) = solutions(rows.long(), cols.long(), values, side, what="the mending")
+    (found,) = solutions(rows.long(), cols.long(), values, side, what="the repairing")
     (moved,) = torch.nonzero(free, as_tuple=True)
     return vertices.index_copy(0, moved, found.to(vertices))

@@ -9,7 +9,7 @@ from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.kernels import resample
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.patches.sources import Sources
-from pimper_torch.records import Cameras, Registered, Templates
+from pimper_torch.records import Cameras, Observations, Templates
 
 
 def resampled(
@@ -18,7 +18,7 @@ def resampled(
     templates: Templates,
     least_facing: float,
     dark_level: float,
-) -> Registered:
+) -> Observations:
     """Resample all views on a bucket of templates; nothing hides anything.
 
     Places are found in float64; images are looked up in float32.
@@ -58,11 +58,11 @@ def resampled(
         as_array(radiance),
         as_array(valid),
     )
-    return Registered(radiance=radiance, valid=valid)
+    return Observations(radiance=radiance, valid=valid)
 
 
 def hide(
-    registered: Registered, cameras: Cameras, sources: Sources, templates: Templates, stride: int
+    registered: Observations, cameras: Cameras, sources: Sources, templates: Templates, stride: int
 ) -> None:
     """Take away, in place, what the surface of the sources hides.
 

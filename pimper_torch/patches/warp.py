@@ -21,9 +21,9 @@ from pimper_torch.patches.sources import LEVELS, Sources, prepare
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,
+    Observations,
     PatchSet,
     PatchViews,
-    Registered,
     Templates,
     Views,
 )
@@ -99,7 +99,7 @@ class Warp(Stage):
         """Prepare photographs for any number of calls, here and in the sweep."""
         return prepare(views, self.config.saturation_level, LEVELS)
 
-    def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Registered:
+    def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
         images, config = sources.images.finest, self.config
         fast = images.dtype == torch.float32 and compiled_for(
             images,
@@ -117,7 +117,7 @@ class Warp(Stage):
         hide(found, cameras, sources, templates, config.occlusion_stride)
         return found
 
-    def _reference(self, cameras: Cameras, sources: Sources, templates: Templates) -> Registered:
+    def _reference(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
         world_from_patch = invert_rigid(templates.patch_from_world)
         num, height, width = templates.depth.shape
         points = transform(world_from_patch, templates.points_patch.reshape(num, -1, 3))
@@ -130,7 +130,7 @@ class Warp(Stage):
             self._seen_by(view, templates, points_world, outward, cameras, sources)
             for view in range(cameras.num_views)
         ]
-        return Registered(
+        return Observations(
             radiance=torch.stack([radiance for radiance, _ in seen], dim=1),
             valid=torch.stack([valid for _, valid in seen], dim=1),
         )

@@ -34,12 +34,12 @@ from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.photometry.verdicts import judge_data, warn_of_verdicts
 from pimper_torch.records import (
+    Observations,
     PatchVerdict,
     PatchViews,
     PhotometricPatches,
     Photometry,
     Record,
-    Registered,
     Templates,
 )
 from pimper_torch.stage import Stage
@@ -172,7 +172,7 @@ class _Bucket(Record):
     """Patches of like size, ready to be factorized."""
 
     templates: Templates
-    registered: Registered
+    registered: Observations
     normals: Float[Tensor, "patch height width 3"]
 
 
@@ -403,7 +403,7 @@ def _with_ambient(lights: Float[Tensor, "*batch rank"]) -> Float[Tensor, "..."]:
     return torch.cat([torch.zeros_like(lights[..., :1]), lights], dim=-1)
 
 
-def _lit(bucket: _Bucket, light: Illumination) -> Registered:
+def _lit(bucket: _Bucket, light: Illumination) -> Observations:
     """Leave out what lies in a cast shadow, or may."""
     registered, templates = bucket.registered, bucket.templates
     if light.caster is None:

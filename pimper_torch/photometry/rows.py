@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.records import Record, Registered, Templates
+from pimper_torch.records import Observations, Record, Templates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -28,7 +28,7 @@ class Rows(Record):
 
 
 def rows_of(
-    templates: Templates, registered: Registered, normals: Float[Tensor, "patch height width 3"]
+    templates: Templates, registered: Observations, normals: Float[Tensor, "patch height width 3"]
 ) -> Rows:
     """Put the samples inside each template in a row."""
     inside = templates.inside.flatten(1)

@@ -104,7 +104,7 @@ def upgrade_to_cone(
     S, L = H @ S, L @ torch.linalg.inv(H)
     sign = torch.where((weight * S[:, 0].sign()).sum(dim=1) < 0, -1.0, 1.0)[:, None, None]
     eta = minkowski(S)
-    # A time axis of the wrong sign is mended by -1; space axes are the alignment's affair.
+    # A time axis of the wrong sign is repaired by -1; space axes are the alignment's affair.
     mirror = torch.where(sign < 0, -torch.eye(4, dtype=S.dtype, device=S.device), eta @ eta)
     return Upgraded(
         lights=(L @ mirror).to(lights), shading=(mirror @ S).to(shading), lorentzian=lorentzian

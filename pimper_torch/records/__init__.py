@@ -1,18 +1,18 @@
 """Frozen data that travels between stages; no algorithms."""
 
-from pimper_torch.records.outlines import Outlines
+from pimper_torch.records.contours import ContourPoints, ContourRays
 from pimper_torch.records.patches import (
     AlignVerdict,
     Convergence,
     DepthPatches,
     Depths,
     Heights,
+    Observations,
     PatchSet,
     PatchVerdict,
     PatchViews,
     PhotometricPatches,
     Photometry,
-    Registered,
     StopCause,
     Surface,
     SweptPatches,
@@ -20,7 +20,6 @@ from pimper_torch.records.patches import (
 )
 from pimper_torch.records.reconstruction import Reconstruction, StageReport
 from pimper_torch.records.record import Record
-from pimper_torch.records.rims import RimPoints, RimRays
 from pimper_torch.records.scene import (
     CoarseMesh,
     FacetPoints,
@@ -30,6 +29,7 @@ from pimper_torch.records.scene import (
     Support,
     pairs_table,
 )
+from pimper_torch.records.silhouettes import Silhouettes
 from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
 from pimper_torch.records.views import Cameras, Views
 
@@ -38,6 +38,8 @@ __all__ = [
     "Cameras",
     "Capture",
     "CoarseMesh",
+    "ContourPoints",
+    "ContourRays",
     "Convergence",
     "DepthPatches",
     "Depths",
@@ -47,7 +49,7 @@ __all__ = [
     "Heights",
     "Lens",
     "Mesh",
-    "Outlines",
+    "Observations",
     "PatchSet",
     "PatchVerdict",
     "PatchViews",
@@ -55,9 +57,7 @@ __all__ = [
     "Photometry",
     "Reconstruction",
     "Record",
-    "Registered",
-    "RimPoints",
-    "RimRays",
+    "Silhouettes",
     "SparseScene",
     "StageReport",
     "StopCause",

@@ -156,7 +156,7 @@ class PatchSet(OverPatches):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Registered(Record):
+class Observations(Record):
     """A bucket of views resampled on templates: the matrices J and D of its patches.
 
     Attributes:
@@ -183,7 +183,7 @@ class PatchViews(OverPatches):
     """All views, registered on all templates."""
 
     patches: PatchSet
-    buckets: tuple[Registered, ...]
+    buckets: tuple[Observations, ...]
 
 
 class StopCause(IntEnum):

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from pimper_torch.records.outlines import Outlines
 from pimper_torch.records.patches import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
+from pimper_torch.records.silhouettes import Silhouettes
 from pimper_torch.records.views import Cameras
 
 
@@ -33,7 +33,7 @@ class Reconstruction(Record):
     Attributes:
         mesh: One connected surface with vertex normals, albedo and confidence.
         scene: Cameras, undistorted photographs and the sparse cloud, in the mesh's frame.
-        outlines: Where every view shows the object.
+        silhouettes: Where every view shows the object.
         coarse: The facets.
         patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
         report: One entry a stage, in the order they ran.
@@ -44,7 +44,7 @@ class Reconstruction(Record):
     coarse: CoarseMesh
     patches: DepthPatches | SweptPatches
     report: tuple[StageReport, ...]
-    outlines: Outlines
+    silhouettes: Silhouettes
 
     @property
     def cameras(self) -> Cameras:

@@ -153,8 +153,8 @@ class Support(IntEnum):
     """It closes the surface."""
     LIGHT = 1
     """Views show it lit, so that shading can tell its shape."""
-    RIM = 2
-    """Rays through the outlines touch it."""
+    CONTOUR = 2
+    """Rays through the silhouettes touch it."""
     POINTS = 3
     """Points matched between views lie on it."""
 

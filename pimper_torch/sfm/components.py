@@ -11,7 +11,7 @@ from pimper_torch.sfm.at_rest import Rest
 from pimper_torch.sfm.model import SparseModel, list_some
 
 FEWEST_VIEWS = 3
-# Points seen under less are of no use to the coarse surface (coarse/enclose.py).
+# Points seen under less are of no use to the coarse surface (coarse/surface.py).
 LEAST_ANGLE_DEG = 4.0
 ADVICE = (
     "Neighbouring photographs should overlap by two thirds and differ by less than about 20 "

@@ -14,7 +14,7 @@ from pimper_torch.records import Lens, Record, pairs_table
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SparseModel(Record):
-    """Registered views and the cloud that ties them together, in float64 on the CPU.
+    """Observations views and the cloud that ties them together, in float64 on the CPU.
 
     Attributes:
         names: Of the registered photographs.

@@ -14,6 +14,10 @@ from pimper_torch.errors import ReconstructionError
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.exchange import read_faces, write_cloud, write_faces
 
+# COLMAP's octree is dense down to this depth, or to the least that any call of the process asked
+# for: a call with less would change the surfaces of all calls after it.
+_DENSE_DEPTH = 5
+
 
 def poisson_surface(
     points: Float[Tensor, "point 3"],
@@ -28,7 +32,7 @@ def poisson_surface(
         points: On the surface, any unit.
         normals: Outward.
         depth: Of the octree: the longest side of the points' box is at most ``2 ** depth``
-            cells.
+            cells; 5 at least.
         point_weight: Of the points against the smoothness.
 
     Returns:
@@ -44,7 +48,7 @@ def poisson_surface(
     pycolmap = loaded()
 
     options = pycolmap.PoissonMeshingOptions()
-    options.depth, options.point_weight = depth, point_weight
+    options.depth, options.point_weight = max(_DENSE_DEPTH, depth), point_weight
     options.trim, options.color, options.num_threads = 0.0, False, 1
     with tempfile.TemporaryDirectory() as folder:
         cloud, surface = Path(folder) / "cloud.ply", Path(folder) / "surface.ply"

@@ -8,12 +8,12 @@ from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.kernels import sweep
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.patches.sources import Sources
-from pimper_torch.records import Cameras, Photometry, Registered, Templates
+from pimper_torch.records import Cameras, Observations, Photometry, Templates
 
 
 def compiled_costs(
     templates: Templates,
-    registered: Registered,
+    registered: Observations,
     photometry: Photometry,
     carried: Float[Tensor, "patch height width 3"],
     cameras: Cameras,

@@ -20,11 +20,11 @@ from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     Heights,
+    Observations,
     PatchViews,
     PhotometricPatches,
     Photometry,
     Record,
-    Registered,
     SweptPatches,
     Templates,
     Views,
@@ -152,7 +152,7 @@ class Sweep(Stage):
         cameras: Cameras,
         sources: Sources,
         coarse: CoarseMesh,
-        bucket: tuple[Templates, Registered, Photometry],
+        bucket: tuple[Templates, Observations, Photometry],
     ) -> Heights:
         config = self.config
         templates, registered, photometry = bucket
@@ -197,7 +197,7 @@ class Sweep(Stage):
     def _compiled_costs(
         self,
         templates: Templates,
-        registered: Registered,
+        registered: Observations,
         photometry: Photometry,
         carried: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
@@ -222,7 +222,7 @@ class Sweep(Stage):
     def _costs(
         self,
         templates: Templates,
-        registered: Registered,
+        registered: Observations,
         photometry: Photometry,
         carried: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
@@ -243,7 +243,7 @@ class Sweep(Stage):
     def _rows(
         self,
         templates: Templates,
-        registered: Registered,
+        registered: Observations,
         photometry: Photometry,
         carried: Float[Tensor, "patch height width 3"],
         cameras: Cameras,

@@ -1,4 +1,4 @@
-"""The contact sheet of a run: photographs with outlines, facets, normals, albedo, relief."""
+"""The contact sheet of a run: photographs with silhouettes, facets, normals, albedo, relief."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +12,8 @@ from pimper_torch.meshing.simplify import with_few_faces
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
-from pimper_torch.viz.outlines import TRUSTED, outlined_thumbnails
 from pimper_torch.viz.render import bounding_box, frame, shade, turn
+from pimper_torch.viz.silhouettes import TRUSTED, thumbnails
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 Box = tuple[float, float, float, float]  # left, bottom, width, height, shares of the sheet
@@ -38,7 +38,7 @@ class Panel:
         title: Above it.
         picture: sRGB in [0, 1], rows first.
         lines: Triangles to draw over it, pixels of ``picture``.
-        inside: Probability of the object, of which the outline is drawn over it.
+        inside: Probability of the object, of which the silhouette is drawn over it.
     """
 
     title: str
@@ -52,7 +52,7 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
 
     Shown in the reference view, cropped to the object: the photograph, the facets over it
     and shaded, the normals and albedo that the mesh carries, the mesh's own shape shaded,
-    and that again from 40 degrees to the left and to the right. Where outlines are known they
+    and that again from 40 degrees to the left and to the right. Where silhouettes are known they
     are drawn over the photograph, and below over small photographs of all views, red where a
     view is not trusted.
 
@@ -134,16 +134,16 @@ def _with_band(
 
 
 def _all_views(result: Reconstruction) -> Panel | None:
-    """Show all photographs with their outlines; nothing where there are none."""
-    outlines = result.outlines
-    if outlines.source == "everything":
+    """Show all photographs with their silhouettes; nothing where there are none."""
+    silhouettes = result.silhouettes
+    if silhouettes.source == "everything":
         return None
     width_px = round(_DPI * _ACROSS * _PANEL_IN)
-    tiles = outlined_thumbnails(
-        result.scene.views, outlines, width_px=width_px, across=_THUMBNAILS_ACROSS
+    tiles = thumbnails(
+        result.scene.views, silhouettes, width_px=width_px, across=_THUMBNAILS_ACROSS
     )
-    origin = "masks given" if outlines.source == "masks" else "outlines found"
-    trusted = f"{int(outlines.trusted.sum())} of {len(outlines.trusted)} views trusted"
+    origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
+    trusted = f"{int(silhouettes.trusted.sum())} of {len(silhouettes.trusted)} views trusted"
     return Panel(title=f"{origin}, {trusted}", picture=_array(tiles))
 
 
@@ -196,7 +196,7 @@ def headline(result: Reconstruction) -> str:
 
 
 def _photograph(result: Reconstruction, own: Cameras) -> tuple[Picture, Picture, Picture | None]:
-    """Crop the reference photograph and its outline to the object, and project the facets."""
+    """Crop the reference photograph and its silhouette to the object, and project the facets."""
     reference = result.coarse.reference
     width, height = (int(side) for side in own.sizes_px[0])
     low, high = bounding_box(own, result.mesh.vertices_world, _MARGIN)
@@ -204,8 +204,8 @@ def _photograph(result: Reconstruction, own: Cameras) -> tuple[Picture, Picture,
     right, bottom = (int(corner) for corner in high.ceil())
     crop = slice(top, min(bottom, height)), slice(left, min(right, width))
     image = result.scene.views.images[reference][:, *crop].movedim(0, -1)
-    everything = result.outlines.source == "everything"
-    inside = None if everything else _array(result.outlines.inside[reference][crop])
+    everything = result.silhouettes.source == "everything"
+    inside = None if everything else _array(result.silhouettes.inside[reference][crop])
     coarse = result.coarse.mesh
     pixels, _ = project(coarse.vertices_world, own.cam_from_world[0], own.intrinsics[0])
     corners = (pixels - pixels.new_tensor([left, top]))[coarse.faces]

@@ -89,14 +89,14 @@ def test_settings_are_read_as_the_command_reads_them():
 
 
 def test_what_takes_long_to_load_is_absent_and_stands_any_use():
-    assert light("pimper_torch.coarse.enclose", "torch") is ABSENT
-    assert light("pimper_torch.coarse.enclose", "Enclose") is ABSENT  # a module of torch's
-    assert light("pimper_torch.coarse.enclose", "EncloseConfig") is not ABSENT
-    assert light("pimper_torch.coarse.enclose", "require") is not ABSENT
+    assert light("pimper_torch.coarse.surface", "torch") is ABSENT
+    assert light("pimper_torch.coarse.surface", "CoarseSurface") is ABSENT  # a module of torch's
+    assert light("pimper_torch.coarse.surface", "CoarseSurfaceConfig") is not ABSENT
+    assert light("pimper_torch.coarse.surface", "require") is not ABSENT
     assert ABSENT.some.thing(3)[4] | int is ABSENT
     assert 3 in ABSENT
     with pytest.raises(ConfigError, match="num_facets"):
-        light("pimper_torch.coarse.enclose", "EncloseConfig")(num_facets=1)
+        light("pimper_torch.coarse.surface", "CoarseSurfaceConfig")(num_facets=1)
 
 
 def test_where_nothing_can_be_told_at_once_the_command_does(monkeypatch, capsys):

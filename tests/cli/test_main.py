@@ -15,9 +15,9 @@ from pimper_torch.errors import PimperWarning, ReconstructionError
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.io.version import installed_version
-from pimper_torch.outlines.outline import Outline
 from pimper_torch.radiometry import Encoding
-from pimper_torch.records import Mesh, Outlines
+from pimper_torch.records import Mesh, Silhouettes
+from pimper_torch.silhouettes.find import FindSilhouettes
 
 
 def run(*arguments):
@@ -53,7 +53,7 @@ def test_options_reach_their_places(photos, chain, tmp_path):
     assert code == 0
     config, views, sparse = chain.given
     assert views.images.shape[-2:] == (12, 16)
-    assert (config.reconstruct.starts, config.enclose.reference) == (7, "1.png")
+    assert (config.reconstruct.starts, config.coarse_surface.reference) == (7, "1.png")
     assert sparse == tmp_path
     written = yaml.safe_load((out / "config.yaml").read_text())
     assert written["reconstruct"]["starts"] == 7
@@ -79,12 +79,14 @@ def test_masks_are_read(photos, chain, tmp_path):
 
 
 def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, tmp_path):
-    """The outlines that a run found come back to the bit, whatever they look like."""
+    """The silhouettes that a run found come back to the bit, whatever they look like."""
     scene = reconstruction.scene
     inside = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(4))
     trusted = torch.tensor([True, True, False])
-    found = Outlines(inside=inside, trusted=trusted, source="found")
-    write_result(reconstruction.replace(outlines=found), CoarseToFineConfig(), tmp_path / "first")
+    found = Silhouettes(inside=inside, trusted=trusted, source="found")
+    write_result(
+        reconstruction.replace(silhouettes=found), CoarseToFineConfig(), tmp_path / "first"
+    )
     photos = tmp_path / "photos"
     photos.mkdir()
     for name, image in zip(scene.views.names, scene.views.images, strict=True):
@@ -94,10 +96,10 @@ def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, 
     assert run("reconstruct", photos, "-o", tmp_path / "second", "--masks", masks) == 0
     views = chain.given[1]
     assert views.names == scene.views.names
-    outlines = Outline()(scene.replace(views=views))
-    assert outlines.source == "masks"
-    assert torch.equal(outlines.masks, found.masks)
-    assert outlines.trusted.all()  # also of views whose outline was not trusted
+    silhouettes = FindSilhouettes()(scene.replace(views=views))
+    assert silhouettes.source == "masks"
+    assert torch.equal(silhouettes.masks, found.masks)
+    assert silhouettes.trusted.all()  # also of views whose silhouette was not trusted
 
 
 def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkeypatch):
@@ -207,7 +209,7 @@ def test_every_setting_is_an_option_with_its_help(capsys):
         run("demo", "--help")
     assert ended.value.code == 0
     told = capsys.readouterr().out
-    for name in ("--reconstruct.starts", "--enclose.reference", "--overwrite", "--preset"):
+    for name in ("--reconstruct.starts", "--coarse-surface.reference", "--overwrite", "--preset"):
         assert name in told
 
 

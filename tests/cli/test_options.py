@@ -115,14 +115,14 @@ def test_every_option_of_the_demo_reaches_the_chain(chain, tmp_path):
     (line,) = RUNS["demo"]
     assert run("demo", line, {}, tmp_path) == 0
     config, views, _ = chain.given
-    assert config.enclose.reference == "38"
+    assert config.coarse_surface.reference == "38"
     assert config.scales == (0.5,)
     assert max(views.images.shape[-2:]) == 60
 
 
 def test_the_reference_reaches_every_stage_that_has_one():
     published = parse("demo", ["--preset", "paper", "--reference", "38"]).config
-    assert published.enclose.reference == published.triangulate.reference == "38"
+    assert published.coarse_surface.reference == published.triangulate.reference == "38"
 
 
 def told(command, capsys):

@@ -4,20 +4,20 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DensifyConfig
-from pimper_torch.coarse.enclose import EncloseConfig
-from pimper_torch.coarse.outlined import OutlinedConfig
+from pimper_torch.coarse.fine_surface import FineSurfaceConfig
+from pimper_torch.coarse.surface import CoarseSurfaceConfig
 from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.evidence.scenes.render import render_shape
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
-from pimper_torch.records import Outlines
+from pimper_torch.records import Silhouettes
 
 SETTINGS = (
-    EncloseConfig(num_facets=600),
+    CoarseSurfaceConfig(num_facets=600),
     DensifyConfig(coarsest_px=120, levels=1, most_hypotheses=48),
-    OutlinedConfig(hole_px=12.0),
+    FineSurfaceConfig(hole_px=12.0),
 )
 
 
@@ -58,13 +58,13 @@ def all_round():
     return pinholes(frames, 180.0, 120, 100)
 
 
-def outlines_of(cameras):
-    """Outlines of the ball, by its rays."""
+def silhouettes_of(cameras):
+    """Silhouettes of the ball, by its rays."""
     width, height = cameras.sizes_px[0].tolist()
     pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
     rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)
     met = Sphere().intersect(cameras.centers_world[:, None], rays).isfinite()
-    return Outlines(
+    return Silhouettes(
         inside=met.float().reshape(-1, height, width),
         trusted=torch.ones(len(met), dtype=torch.bool),
         source="masks",

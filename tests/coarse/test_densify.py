@@ -138,9 +138,9 @@ def test_small_holes_are_closed_and_large_ones_and_crumbs_are_not():
     kept = (middle[:, 2] < 0.6) & ~(middle[:, 0] > 0.95)
     whole = torch.ones(len(faces), dtype=torch.bool)
     assert (supported_pieces(vertices, faces, whole, 0.9)).all()
-    mended = without_small_holes(vertices, faces, kept, 1.0)
-    assert mended[middle[:, 0] > 0.95].all()  # 0.3 of the area unit
-    assert not mended[middle[:, 2] > 0.6].any()  # 2.5
+    repaired = without_small_holes(vertices, faces, kept, 1.0)
+    assert repaired[middle[:, 0] > 0.95].all()  # 0.3 of the area unit
+    assert not repaired[middle[:, 2] > 0.6].any()  # 2.5
     crumbs = (middle[:, 2] < 0) | (middle[:, 2] > 0.97)
     pieces = supported_pieces(vertices, faces[crumbs], whole[crumbs], 0.05)
     assert (pieces == (middle[crumbs][:, 2] < 0)).all()
@@ -210,3 +210,16 @@ def test_a_view_agrees_with_those_that_see_the_same_surface_and_with_none_that_s
     wrong[3] *= 1.1
     count = agreeing(level, wrong, good, 2, others, 1.0)
     assert float((count[inner] == 1).double().mean()) > 0.98
+
+
+def test_a_poisson_surface_is_the_same_whatever_was_made_before_it():
+    vertices, _ = icosphere(4)
+    vertices = vertices.float()
+
+    def made(depth):
+        return poisson_surface(vertices, vertices, depth=depth, point_weight=1.0)
+
+    before = made(5)
+    made(3)
+    for one, other in zip(before, made(5), strict=True):
+        assert torch.equal(one, other)

@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
-from pimper_torch.fusion.contacts import Ground, cloud_points, passing, rim_tangents
+from pimper_torch.fusion.contacts import Ground, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.evidence import (
     Common,
     kept_slopes,
@@ -15,7 +15,7 @@ from pimper_torch.fusion.evidence import (
 )
 from pimper_torch.geometry.lattice import subdivide
 from pimper_torch.geometry.surfaces import face_edges
-from pimper_torch.records import FacetPoints, RimPoints
+from pimper_torch.records import ContourPoints, FacetPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -177,7 +177,7 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
     assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())
 
 
-def test_rims_are_planes_that_touch_the_surface(lattice, generator):
+def test_contours_are_planes_that_touch_the_surface(lattice, generator):
     # A plane that leans; directions that are not at right angles to it.
     slope = 0.3
     tilted = lattice.points + (slope * lattice.points[:, :1]) * UP
@@ -196,20 +196,20 @@ def test_rims_are_planes_that_touch_the_surface(lattice, generator):
     # Where on its ray the place is taken does not matter: 0.04 above the plane, all along.
     shifts = 0.2 * (torch.rand(30, 1, generator=generator, dtype=torch.float64) - 0.5)
     places = middle + 0.04 * normal + shifts * normalize(ray, dim=0)
-    rims = RimPoints(
+    contours = ContourPoints(
         points_world=places,
         normals_world=normal.expand(30, 3),
         variance=torch.full((30,), 1e-4).double(),
         view=torch.zeros(30, dtype=torch.long),
         ray=torch.arange(30),
     )
-    found = told_of(rim_tangents, rims, ground)
+    found = told_of(contour_tangents, contours, ground)
     facing = float(along[0] @ normal)
     assert_close(found.targets, torch.full((30,), 0.04 / facing).double())
     assert_close(1 / found.information, torch.full((30,), 1e-4 / facing**2).double())
     # What a direction runs along cannot be reached by heights: nothing is said.
-    beside = rims.replace(normals_world=torch.tensor([0.0, 1.0, 0.0]).double().expand(30, 3))
-    assert len(told_of(rim_tangents, beside, ground).targets) == 0
+    beside = contours.replace(normals_world=torch.tensor([0.0, 1.0, 0.0]).double().expand(30, 3))
+    assert len(told_of(contour_tangents, beside, ground).targets) == 0
 
 
 @pytest.mark.parametrize("kind", ["slopes", "kept_slopes", "kept_steps", "swept_heights"])
@@ -295,11 +295,11 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(lattice
     assert checks["all", "target"].numeric.abs().max() < 1e-6
 
 
-def test_a_rim_stays_where_it_is_as_the_surface_is_raised(lattice, generator):
+def test_a_contour_stays_where_it_is_as_the_surface_is_raised(lattice, generator):
     height = 0.1 * torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
     places = lattice.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
     leaning = UP + 0.2 * torch.randn(places.shape, generator=generator, dtype=torch.float64)
-    rims = RimPoints(
+    contours = ContourPoints(
         points_world=places,
         normals_world=normalize(leaning, dim=1),
         variance=torch.full_like(places[:, 0], 1e-4),
@@ -318,7 +318,7 @@ def test_a_rim_stays_where_it_is_as_the_surface_is_raised(lattice, generator):
             reach=9.0,
             finest=1e-3,
         )
-        found = told_of(rim_tangents, rims, ground)
+        found = told_of(contour_tangents, contours, ground)
         return {"target": found.targets, "information": found.information}
 
     inputs = {

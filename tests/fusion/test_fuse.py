@@ -6,18 +6,18 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.coarse.adapt import Adapt
+from pimper_torch.coarse.remesh import Remesh
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
-from pimper_torch.records import Cameras, FacetPoints, Outlines, RimPoints
-from pimper_torch.rims.constraints import Rims
+from pimper_torch.records import Cameras, ContourPoints, FacetPoints, Silhouettes
+from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.sweep.sweep import Sweep
 
-# Outlines that constrain nothing.
-FREE = Rims.none(
-    Outlines(
+# Silhouettes that constrain nothing.
+FREE = Contours.none(
+    Silhouettes(
         inside=torch.ones(1, 1, 1), trusted=torch.zeros(1, dtype=torch.bool), source="everything"
     ),
     Cameras(
@@ -167,18 +167,18 @@ def test_heights_that_err_alike_do_not_outvote_points(swept):
     assert off_plane(lifted, Fuse()(known, FREE)).abs().quantile(0.9) < 0.05
 
 
-class Touching(Rims):
-    """Rims that touch at given places, whatever the surface."""
+class Touching(Contours):
+    """Contours that touch at given places, whatever the surface."""
 
     def __init__(self, points, normal, sigma):
-        told = RimPoints(
+        told = ContourPoints(
             points_world=points,
             normals_world=normal.expand_as(points),
             variance=torch.full_like(points[:, 0], sigma**2),
             view=torch.zeros(len(points), dtype=torch.long),
             ray=torch.arange(len(points)),
         )
-        for name in ("outlines", "rays", "cameras", "hull"):
+        for name in ("silhouettes", "rays", "cameras", "hull"):
             object.__setattr__(self, name, getattr(FREE, name))
         object.__setattr__(self, "told", told)
 
@@ -186,18 +186,18 @@ class Touching(Rims):
         return self.told
 
 
-def test_rims_bring_the_surface_to_where_it_touches_them(swept):
+def test_contours_bring_the_surface_to_where_it_touches_them(swept):
     lifted, given = swept(1.0)
     spacing = float(given.patches.buckets[0].spacing[0])
     along = torch.tensor([1.0, 0.0, 0.0]).double()
     ray = normalize(along - (along @ lifted.normal) * lifted.normal, dim=0)
     points = near_plane(lifted, 0.0, count=60)
-    # A rim may touch anywhere on its ray, which lies in the plane.
+    # A contour may touch anywhere on its ray, which lies in the plane.
     points = points + 3 * spacing * torch.linspace(-1, 1, 60).double()[:, None] * ray
-    rims = Touching(points, lifted.normal, 0.1 * spacing)
+    contours = Touching(points, lifted.normal, 0.1 * spacing)
     silent = FuseConfig(heights=False, points=False)
-    assert off_plane(lifted, Fuse(silent)(given, rims)).abs().quantile(0.9) < 0.1
-    without = Fuse(FuseConfig(heights=False, points=False, rims=False))(given, rims)
+    assert off_plane(lifted, Fuse(silent)(given, contours)).abs().quantile(0.9) < 0.1
+    without = Fuse(FuseConfig(heights=False, points=False, contours=False))(given, contours)
     assert (off_plane(lifted, without) - lifted.height).abs().max() < 0.05
     # A tenth of them lie beside the object: the others outvote them.
     points[::10] += 5 * spacing * lifted.normal
@@ -352,7 +352,7 @@ def test_facets_that_views_see_stay_though_light_tells_nothing_of_them(swept):
     surface = Fuse()(given, FREE)
     dark = surface.replace(confidence=torch.zeros_like(surface.confidence))
     dark.confidence[0] = 1.0  # so that there is some confidence at all
-    kept = Adapt()(given, dark, FREE)
+    kept = Remesh()(given, dark, FREE)
     assert len(kept.mesh.faces) >= len(given.patches.coarse.mesh.faces)
 
 
@@ -384,4 +384,4 @@ def test_the_surface_has_the_slope_of_its_differences_by_normals_and_offsets(swe
 
 def test_without_any_evidence_nothing_can_be_fused():
     with pytest.raises(ConfigError, match="slopes"):
-        FuseConfig(slopes=False, heights=False, points=False, rims=False)
+        FuseConfig(slopes=False, heights=False, points=False, contours=False)

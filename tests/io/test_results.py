@@ -22,7 +22,7 @@ from pimper_torch.io.meshes import read_mesh, write_glb, write_ply, written_chan
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.records import Mesh, Outlines
+from pimper_torch.records import Mesh, Silhouettes
 from pimper_torch.viz.maps import albedo_scale
 
 
@@ -340,13 +340,15 @@ def test_the_sparse_model_shares_the_meshs_frame(reconstruction, tmp_path):
     assert np.allclose(image.cam_from_world() * vertex.numpy(), wanted, atol=1e-5)
 
 
-def test_outlines_are_written_as_masks_that_can_be_given(reconstruction, tmp_path):
+def test_silhouettes_are_written_as_masks_that_can_be_given(reconstruction, tmp_path):
     inside = torch.zeros(3, 40, 60)
     inside[:, 5:30, 10:50] = 0.9
     inside[:, :, 50:] = 0.4
     trusted = torch.tensor([True, True, False])
-    outlines = Outlines(inside=inside, trusted=trusted, source="found")
-    write_result(reconstruction.replace(outlines=outlines), Config(zeta=2.0), tmp_path / "out")
+    silhouettes = Silhouettes(inside=inside, trusted=trusted, source="found")
+    write_result(
+        reconstruction.replace(silhouettes=silhouettes), Config(zeta=2.0), tmp_path / "out"
+    )
     found = sorted(path.name for path in (tmp_path / "out" / "masks").iterdir())
     assert found == ["a.png", "b.png", "c.png"]
     drawn = np.array(Image.open(tmp_path / "out" / "masks" / "b.png"))

@@ -54,7 +54,7 @@ def test_every_point_near_a_facet_has_a_sample_and_samples_are_a_pixel_apart(
         enlarged = enlarge(corners, 5.0 * bucket.spacing[0])
         ab, ac = enlarged[:, 1] - enlarged[:, 0], enlarged[:, 2] - enlarged[:, 0]
         wanted = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs() / 2
-        # Whole samples along the rim, and corners clipped at twice the overlap: 3 %.
+        # Whole samples along the contour, and corners clipped at twice the overlap: 3 %.
         assert ((area - wanted).abs() / wanted < 0.03).all()
         reference = plane_mesh.reference
         pixels, _ = project(

@@ -12,7 +12,7 @@ from pimper_torch.patches.carry import coarse_normals
 from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.records import CoarseMesh, Mesh, PatchSet, PatchViews, Registered, Templates
+from pimper_torch.records import CoarseMesh, Mesh, Observations, PatchSet, PatchViews, Templates
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def scene(generator: torch.Generator) -> Callable[..., Scene]:
             radiance = shading[:, :, None] * rho.movedim(-1, 1)[:, None]
             valid = each.inside[:, None] & (shading > 0.05)
             radiance = torch.where(valid[:, :, None], radiance, 0)
-            buckets.append(Registered(radiance=radiance, valid=valid))
+            buckets.append(Observations(radiance=radiance, valid=valid))
             normals.append(bent)
             albedo.append(rho)
         seen = PatchViews(patches=patches, buckets=tuple(buckets))

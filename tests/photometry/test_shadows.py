@@ -43,7 +43,7 @@ def plane():
 
 
 def ellipse(points, direction):
-    """Signed distance, roughly, to the rim of a ball's shadow under a distant lamp."""
+    """Signed distance, roughly, to the contour of a ball's shadow under a distant lamp."""
     direction = normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
     middle = -HEIGHT * direction[:2] / direction[2]
     along = normalize(direction[:2], dim=0)
@@ -56,10 +56,10 @@ def test_a_distant_lamp_casts_the_ellipse_of_a_ball(ball_over_plane, plane):
     points, normals = plane
     direction = (0.5, 0.2, 0.9)
     found = cast_shadows(lamps([direction], True), ball_over_plane, points, normals, 1e-4)
-    rim = ellipse(points, direction)
-    clear = rim.abs() > 0.003  # the icosphere lies 0.0005 inside the ball
+    contour = ellipse(points, direction)
+    clear = contour.abs() > 0.003  # the icosphere lies 0.0005 inside the ball
     assert clear.float().mean() > 0.98
-    assert (found.lit[..., 0] == (rim > 0))[clear].all()
+    assert (found.lit[..., 0] == (contour > 0))[clear].all()
     assert 0.03 < (~found.lit).float().mean() < 0.2  # a shadow was there to be found
 
 
@@ -68,9 +68,9 @@ def test_a_near_lamp_overhead_casts_a_wider_circle(ball_over_plane, plane):
     lamp_height = 3.0
     found = cast_shadows(lamps([(0, 0, lamp_height)]), ball_over_plane, points, normals, 1e-4)
     opening = math.asin(RADIUS / (lamp_height - HEIGHT))
-    rim = points[..., :2].norm(dim=-1) - lamp_height * math.tan(opening)
-    clear = rim.abs() > 0.003
-    assert (found.lit[..., 0] == (rim > 0))[clear].all()
+    contour = points[..., :2].norm(dim=-1) - lamp_height * math.tan(opening)
+    clear = contour.abs() > 0.003
+    assert (found.lit[..., 0] == (contour > 0))[clear].all()
 
 
 def test_what_stands_behind_the_lamp_casts_no_shadow(ball_over_plane, plane):
@@ -98,11 +98,11 @@ def test_edges_nearer_than_the_guard_make_unsure_and_no_others(ball_over_plane, 
     found = cast_shadows(
         lamps([(0, 0, lamp_height)]), ball_over_plane, points, normals, 1e-4, guard=guard
     )
-    rim = points[..., :2].norm(dim=-1) - lamp_height * math.tan(
+    contour = points[..., :2].norm(dim=-1) - lamp_height * math.tan(
         math.asin(RADIUS / (lamp_height - HEIGHT))
     )
     sure = found.sure[..., 0]
-    near, far = rim.abs() < 0.95 * guard, rim.abs() > 1.2 * guard  # the edge is curved
+    near, far = contour.abs() < 0.95 * guard, contour.abs() > 1.2 * guard  # the edge is curved
     assert near.any()
     assert not sure[near].any()
     assert sure[far].all()

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from pimper_torch.records import Outlines
+from pimper_torch.records import Silhouettes
 from pimper_torch.viz.overview import Panel, _boxes, draw_overview, headline, panels
 
 
@@ -40,12 +40,12 @@ def test_a_grey_result_without_normals_and_albedo_is_drawn_too(reconstruction, t
     assert (tmp_path / "overview.png").stat().st_size > 10_000
 
 
-def test_outlines_are_drawn_over_the_photograph_and_all_views_below(reconstruction, tmp_path):
+def test_silhouettes_are_drawn_over_the_photograph_and_all_views_below(reconstruction, tmp_path):
     inside = torch.zeros(3, 40, 60)
     inside[:, 10:30, 20:40] = 1.0
     trusted = torch.tensor([True, False, True])
-    outlines = Outlines(inside=inside, trusted=trusted, source="found")
-    outlined = reconstruction.replace(outlines=outlines)
+    silhouettes = Silhouettes(inside=inside, trusted=trusted, source="found")
+    outlined = reconstruction.replace(silhouettes=silhouettes)
     shown = panels(outlined, 60)[0]
     assert shown.inside.shape == shown.picture.shape[:2]
     assert 0 < shown.inside.mean() < 1
@@ -61,14 +61,16 @@ def test_outlines_are_drawn_over_the_photograph_and_all_views_below(reconstructi
     assert yellow.sum() > 1.5 * red.sum()  # two views are trusted, one is not
 
 
-def test_an_outline_without_border_is_not_drawn(reconstruction, tmp_path):
+def test_an_silhouette_without_border_is_not_drawn(reconstruction, tmp_path):
     """Matplotlib would warn of a contour that is not there."""
-    outlines = Outlines(
+    silhouettes = Silhouettes(
         inside=torch.ones(3, 40, 60), trusted=torch.ones(3, dtype=torch.bool), source="masks"
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        draw_overview(reconstruction.replace(outlines=outlines), tmp_path / "overview.png", 60)
+        draw_overview(
+            reconstruction.replace(silhouettes=silhouettes), tmp_path / "overview.png", 60
+        )
 
 
 def test_gradients_do_not_hinder_drawing(reconstruction, tmp_path):

@@ -25,10 +25,10 @@ from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
-    Outlines,
     PatchViews,
     PhotometricPatches,
     Record,
+    Silhouettes,
     SparseScene,
     Views,
 )
@@ -120,7 +120,7 @@ def probes(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str,
 
     Args:
         chain: Its stages may be swapped; structure from motion and the coarse mesh are replaced
-            by ``scene`` and ``coarse``, and no outlines are looked for.
+            by ``scene`` and ``coarse``, and no silhouettes are looked for.
         scene: Float64.
         coarse: In the same frame.
     """
@@ -133,15 +133,15 @@ def probes(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str,
         "refine": _refine,
         "sweep": _sweep,
         "fuse": _fuse,
-        "mend": _mend,
-        "adapt": _adapt,
+        "repair": _mend,
+        "remesh": _adapt,
     }
     found = {
         name: make(getattr(chain, name), *calls[name])
         for name, make in makers.items()
         if name in calls
     }
-    if "adapt" in calls:
+    if "remesh" in calls:
         found["decompose"] = _decompose(chain.decompose, *calls["decompose"])
     return {**found, "chain": _chain(chain, scene, coarse)}
 
@@ -175,12 +175,12 @@ def _calls(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str,
 
 
 def _place(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> None:
-    # Outlines jump as photographs change: everything is the object.
-    chain.outline = Given(Outlines.everything(scene.views))
+    # Silhouettes jump as photographs change: everything is the object.
+    chain.silhouettes = Given(Silhouettes.everything(scene.views))
     if isinstance(chain, Published):
         chain.triangulate = Given(coarse)
     else:
-        chain.enclose = Given(coarse)
+        chain.coarse_surface = Given(coarse)
 
 
 def _gathered(buckets: Sequence[Record], name: str) -> Float[Tensor, " value"]:
@@ -344,7 +344,7 @@ def _sweep(
     return Probe(function=function, inputs=inputs, scales=scales)
 
 
-def _fuse(stage: nn.Module, swept: Any, rims: Any, expected: bool) -> Probe:  # noqa: ANN401
+def _fuse(stage: nn.Module, swept: Any, contours: Any, expected: bool) -> Probe:  # noqa: ANN401
     photometric = swept.photometric
     patches = photometric.patches
     spacing, cloud = _spacing(patches), patches.coarse.points
@@ -370,7 +370,7 @@ def _fuse(stage: nn.Module, swept: Any, rims: Any, expected: bool) -> Probe:  # 
                 photometric=photometric.replace(buckets=buckets, patches=carrying),
                 buckets=heights,
             ),
-            rims,
+            contours,
             expected,
         )
         return _of_surface(surface)
@@ -399,7 +399,7 @@ def _mend(stage: nn.Module, surface: Any) -> Probe:  # noqa: ANN401
     return Probe(function=function, inputs=inputs, scales={"vertices": scale})
 
 
-def _adapt(stage: nn.Module, swept: Any, surface: Any, rims: Any) -> Probe:  # noqa: ANN401
+def _adapt(stage: nn.Module, swept: Any, surface: Any, contours: Any) -> Probe:  # noqa: ANN401
     def function(x: Tensors) -> Tensors:
         found = stage(
             swept,
@@ -408,7 +408,7 @@ def _adapt(stage: nn.Module, swept: Any, surface: Any, rims: Any) -> Probe:  # n
                 normals_world=x["normals"],
                 confidence=x["confidence"],
             ),
-            rims,
+            contours,
         )
         return {"vertices": found.mesh.vertices_world, "normals": found.mesh.normals_world}
 

@@ -21,9 +21,9 @@ from pimper_torch.evidence.datasets.evidence import (
     depth_agreement,
     epipolar_agreement,
     match_features,
-    outline_overlap,
     points_in_sight,
     silhouette_mismatch,
+    silhouette_overlap,
 )
 from pimper_torch.evidence.datasets.findings import CheckReport, Comparison, Finding
 from pimper_torch.evidence.datasets.mistakes import CameraMistake, camera_mistakes
@@ -170,7 +170,7 @@ def _camera_tests(subject: _Subject) -> dict[str, Callable[[Cameras], float]]:
     mesh = subject.truth.mesh
     if mesh is not None and len(mesh.faces) and masks is not None:
         caster = RayCaster(mesh.vertices_world, mesh.faces)
-        tests["outlines"] = lambda cameras: outline_overlap(cameras, caster, masks)
+        tests["silhouettes"] = lambda cameras: silhouette_overlap(cameras, caster, masks)
     elif points is not None:
         points = points.to(subject.cameras.intrinsics)
         tests["points"] = lambda cameras: points_in_sight(cameras, points, masks)
@@ -202,7 +202,7 @@ def _named(
 def _half_pixel(
     subject: _Subject, findings: list[Finding], comparisons: list[Comparison]
 ) -> Cameras:
-    """Tell by the mesh's outline whether pixels are counted from centres or from corners."""
+    """Tell by the mesh's silhouette whether pixels are counted from centres or from corners."""
     mesh, masks = subject.truth.mesh, subject.masks
     if mesh is None or masks is None or len(mesh.faces) == 0:
         return subject.cameras
@@ -222,7 +222,7 @@ def _half_pixel(
     ]
     comparisons.append(
         Comparison(
-            evidence="outline",
+            evidence="silhouettes",
             hypotheses=tuple(shifts),
             scores=tuple(max(0.0, 1 - value) for value in off),
         )
@@ -237,7 +237,7 @@ def _half_pixel(
             meaning="the principal point is half a pixel off: the centre of the top-left pixel is "
             "(0.5, 0.5) here",
             remedy=f"add {added:g} to cx and cy",
-            evidence={"outline off, as given": off[0], "outline off, set right": off[best]},
+            evidence={"silhouette off, as given": off[0], "silhouette off, set right": off[best]},
         )
     )
     return candidates[best]

@@ -16,7 +16,7 @@ from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Mesh
 
 _CELLS = 40  # along an image's longer side, for coverage
-_OUTLINE_PX = 120  # longer side of masks whose outlines are compared
+_OUTLINE_PX = 120  # longer side of masks whose silhouettes are compared
 _RIM_RAYS, _RIM_SAMPLES = 80, 96  # a mask, a ray
 _FEATURE_PX = 480  # longer side of photographs in which features are sought
 
@@ -75,12 +75,12 @@ def depth_agreement(cameras: Cameras, depth: Float[Tensor, "view height width"])
     return float(np.mean(found)) if found else 0.0
 
 
-def outline_overlap(
+def silhouette_overlap(
     cameras: Cameras,
     caster: RayCaster,
     masks: Bool[Tensor, "view height width"],
 ) -> float:
-    """Tell how well a mesh's outlines overlap the masks: intersection over union, mean of views.
+    """Tell how well a mesh's silhouettes overlap the masks: intersection over union, mean of views.
 
     Seen at 120 pixels along the longer side.
     """

@@ -40,7 +40,7 @@ class CameraFigures(Record):
             cameras' rays through its true pixels meet, of the diagonal: no surface made with
             these cameras is nearer, but by chance. NaN where nobody knows the object.
         mean_bend_percent: The same once the points themselves were brought together: what
-            another alignment cannot mend.
+            another alignment cannot repair.
     """
 
     views: int

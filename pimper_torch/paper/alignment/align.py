@@ -300,7 +300,7 @@ class Align(Stage):
             # Before scales have been tried no disagreement is an outlier's fault.
             system = pulls if fresh and solve < 2 else self._believed(pulls, transforms, distance)
             terms = self._curvature_terms(system, transforms, distance)
-            # What tilts and shifts can mend says nothing about scales.
+            # What tilts and shifts can repair says nothing about scales.
             only_level = fresh and solve == 0
             transforms = solve_transforms(
                 _with_scales_held(system) if only_level else system, transforms, *terms

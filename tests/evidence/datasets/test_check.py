@@ -202,7 +202,7 @@ TOLD = [
 def test_a_pose_mistake_is_named_whatever_tells_it(whole, name, evidence):
     (finding,) = check_capture(with_pose(EVIDENCE[evidence](whole), name)).findings
     if evidence == "masks" and name in ("flipped_x", "flipped_y"):
-        # Outlines are the same for a body and its mirror image seen from the other side.
+        # Silhouettes are the same for a body and its mirror image seen from the other side.
         assert {finding.name, *finding.rivals} == {"flipped_x", "flipped_y"}
     else:
         assert finding.name == name
@@ -246,7 +246,7 @@ def test_rows_and_columns_of_k_exchanged_are_named(whole):
 @pytest.mark.parametrize(
     ("shift", "name"), [(-0.5, "pixels_counted_from_centers"), (0.5, "half_pixel_twice")]
 )
-def test_half_a_pixel_is_told_by_the_outline(whole, shift, name):
+def test_half_a_pixel_is_told_by_the_silhouette(whole, shift, name):
     K = whole.cameras.intrinsics.clone()
     K[:, :2, 2] += shift
     assert names(whole.replace(cameras=whole.cameras.replace(intrinsics=K))) == [name]
@@ -365,7 +365,7 @@ def test_a_mistake_is_refused_with_its_name_evidence_and_remedy(whole):
     require_consistent(whole)
     wrong = with_pose(whole, "world_from_cam")
     with pytest.raises(
-        InputError, match=r"world_from_cam: .*outlines, as given 0.*To do: invert them"
+        InputError, match=r"world_from_cam: .*silhouettes, as given 0.*To do: invert them"
     ):
         require_consistent(wrong)
     with pytest.warns(PimperWarning, match="world_from_cam"):

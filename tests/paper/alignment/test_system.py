@@ -98,7 +98,7 @@ def test_seams_name_each_inner_edge_once_with_rays_about_it(facets_over):
     seams = find_seams(patches, rows=3, columns=4, reach_samples=5.0)
     mesh = patches.coarse.mesh
     faces = {frozenset(face.tolist()) for face in mesh.faces}
-    assert len(seams.facets) == (3 * len(faces) - 16) // 2  # 16 edges on the outline
+    assert len(seams.facets) == (3 * len(faces) - 16) // 2  # 16 edges on the silhouette
     for seam, (a, b) in enumerate(seams.facets.tolist()):
         shared = sorted(set(mesh.faces[a].tolist()) & set(mesh.faces[b].tolist()))
         start, end = mesh.vertices_world[shared]

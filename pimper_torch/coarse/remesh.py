@@ -1,0 +1,387 @@
+"""The mesh adapts: facets that the surface has outgrown are split, unseen ones dropped."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.coarse.contradicted import contradicted, misfit_of
+from pimper_torch.coarse.inherit import UNSURE, fitted_normals, with_points
+from pimper_torch.coarse.splitting import mark_edges, split_edges
+from pimper_torch.coarse.trim import enclosed_holes
+from pimper_torch.config import require
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.components import vertex_fans
+from pimper_torch.geometry.surfaces import (
+    corners_of,
+    face_edges,
+    face_normals,
+    side_lengths,
+)
+from pimper_torch.geometry.visibility import ambient_occlusion
+from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
+from pimper_torch.silhouettes.contours import Contours
+from pimper_torch.silhouettes.hull import Hull
+from pimper_torch.stage import Stage
+
+# A lattice vertex lies on an edge when its coordinate opposite to it is below this: lattices
+# have far fewer than a million pieces.
+_ON_EDGE = 1e-6
+
+# Share of a facet's lattice vertices that must lie within the distance it is said to depart by.
+_DEPARTURE_SHARE = 0.9
+
+# Views that a facet has to show in to stay, without silhouettes, whatever light tells of it.
+_SEEING = 2
+
+# A facet smaller than this share of what it was before its corners moved has collapsed.
+_LEAST_AREA = 0.05
+
+# A facet that gets so many times longer has a corner that ran away.
+_MOST_STRETCH = 4.0
+
+# Photometric residual over the median facet's, above which a facet is split.
+_MOST_RESIDUAL = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemeshConfig:
+    """Which facets are split, and which dropped.
+
+    Attributes:
+        max_departure: Distance, in samples, that nine in ten of a facet's lattice vertices may
+            lie off its plane.
+        max_spread_deg: Root mean square angle of the surface's normals within a facet.
+        min_samples: A facet with fewer across (side of the equilateral triangle of its area) is
+            never split.
+        max_facets: The worst facets are split first, as long as there are no more than so many
+            afterwards.
+        max_hole: Facets without data stay when neighbours enclose them and they have no more
+            than this share of the mesh's area together.
+    """
+
+    max_departure: float = 2.0
+    max_spread_deg: float = 12.0
+    min_samples: float = 12.0
+    max_facets: int = 5000
+    max_hole: float = 0.02
+
+    def __post_init__(self) -> None:
+        require(self.max_departure > 0, "remesh.max_departure", self.max_departure, "above 0")
+        require(self.max_spread_deg > 0, "remesh.max_spread_deg", self.max_spread_deg, "above 0")
+        require(self.min_samples > 0, "remesh.min_samples", self.min_samples, "above 0")
+        require(self.max_facets >= 1, "remesh.max_facets", self.max_facets, "1 or more")
+        require(0 <= self.max_hole < 1, "remesh.max_hole", self.max_hole, "in [0, 1)")
+
+
+class Remesh(Stage):
+    """Fit the coarse mesh to a surface. See :func:`remesh`."""
+
+    def __init__(self, config: RemeshConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or RemeshConfig()
+
+    def forward(
+        self,
+        swept: SweptPatches,
+        surface: Surface,
+        contours: Contours,
+    ) -> CoarseMesh:
+        """Remesh the mesh that the patches stand on to the surface that was found.
+
+        Lengths count in samples of these patches; the residual is their photometry's. A facet
+        that shows in two views has data, whether or not it is lit there. Inside the silhouettes'
+        visual hull one view is enough, as at the ends of an arc, or none beside a facet that
+        shows: contours run through both. Facets outside the hull are dropped, and so are those
+        that the photographs contradict (:mod:`~pimper_torch.coarse.contradicted`).
+        """
+        patches = swept.patches
+        residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
+        seen = torch.zeros_like(residual, dtype=torch.bool)
+        for templates, found, heights in zip(
+            patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
+        ):
+            known = torch.where(found.determined, found.convergence.residual, torch.nan)
+            residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
+            enough = heights.num_views >= (1 if contours.confine else _SEEING)
+            seen = seen.index_copy(0, templates.facet, enough)
+        spacing = float(patches.buckets[0].spacing[0].detach())
+        inside = None
+        if contours.confine:
+            mesh = patches.coarse.mesh
+            seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
+            inside = within(contours.hull, surface, patches.num_patches)
+            if patches.coarse.support is not None:
+                misfit = torch.full_like(residual, torch.nan)
+                for templates, found in zip(
+                    patches.buckets, swept.photometric.buckets, strict=True
+                ):
+                    misfit[templates.facet] = misfit_of(found).to(misfit)
+                occlusion = ambient_occlusion(mesh.vertices_world, mesh.faces).to(misfit)
+                inside &= ~contradicted(mesh.faces, patches.coarse.support, misfit, occlusion)
+        return remesh(
+            patches.coarse,
+            surface,
+            spacing,
+            self.config,
+            residual=residual,
+            seen=seen,
+            inside=inside,
+        )
+
+
+def remesh(
+    coarse: CoarseMesh,
+    surface: Surface,
+    spacing: float,
+    config: RemeshConfig | None = None,
+    *,
+    residual: Float[Tensor, " facet"] | None = None,
+    seen: Bool[Tensor, " facet"] | None = None,
+    inside: Bool[Tensor, " facet"] | None = None,
+) -> CoarseMesh:
+    """Fit the coarse mesh to the surface that was found on it.
+
+    Every facet is split in four at most, neighbours are cut so that the mesh stays conforming
+    (see :mod:`~pimper_torch.coarse.splitting`), and all vertices, old and new, move onto the
+    surface. Where that would turn or flatten a facet, or draw it out to a needle, its vertices
+    stay on the old mesh.
+
+    Args:
+        coarse: The facets that ``surface`` is the lattice of.
+        surface: Lattice vertices on shared edges shared.
+        spacing: Of the samples that the next templates will have, scene units: the unit of the
+            settings.
+        config: Settings.
+        residual: Of the photometry, one a facet, in any unit; NaN for none.
+        seen: True for facets that have data whatever the surface's confidence says.
+        inside: False for facets that are not of the object, whatever data they have.
+
+    Returns:
+        The adapted mesh. Its normals are the piecewise linear fit to the surface's. A vertex
+        that was a point of the cloud and has moved is none any more: the point joins those on
+        the facets, in its own place with its own covariance. Points on facets that are dropped
+        are dropped. Unused vertices are gone, and so are vertices that touched two parts of the
+        mesh without joining them: each part has its own.
+
+    Raises:
+        InputError: The surface is not this mesh's lattice.
+
+    A surface without confidence anywhere drops no facet. Vertices and normals are differentiable in
+    the surface's and the old mesh's; which facets are split, dropped or moved is constant.
+    """
+    config = config or RemeshConfig()
+    _require_lattice(coarse, surface)
+    old = coarse.mesh.vertices_world
+    faces = coarse.mesh.faces
+    edges, face_edge = face_edges(faces)
+    corners, middles = _on_surface(old, faces, edges, face_edge, surface)
+    with torch.no_grad():
+        kept = _with_data(old, faces, surface, seen, config.max_hole)
+        if inside is not None and bool((kept & inside).any()):
+            kept = kept & inside
+        severity = _severity(corners, faces, surface, spacing, residual, config)
+        side = _side(corners, faces) / spacing
+        small = (side < config.min_samples) | ~kept
+        marked = _worst_first(old, faces, severity, small, kept, config.max_facets)
+        split = split_edges(old, faces, marked)
+    flat = torch.cat([old, old[edges[split.halved]].mean(dim=1)])
+    onto = torch.cat([corners, middles[split.halved]])
+    split_kept = kept[split.parent]
+    places = _without_folds(flat, onto, split.faces[split_kept])
+    source, new_faces = vertex_fans(split.faces[split_kept])
+    number = torch.full_like(split.parent, -1)
+    number[split_kept] = torch.arange(int(split_kept.sum()), device=faces.device)
+    mesh = Mesh(vertices_world=places[source], faces=new_faces)
+    mesh = mesh.replace(normals_world=fitted_normals(mesh, surface, split, number))
+    return with_points(coarse, mesh, split, number, source)
+
+
+def _require_lattice(coarse: CoarseMesh, surface: Surface) -> None:
+    count = len(coarse.mesh.faces)
+    found = int(surface.facet.max()) + 1 if len(surface.facet) else 0
+    if found == 0 or found > count:
+        raise InputError(
+            f"remesh: the surface lies on {found} facets, the coarse mesh has {count}; needed: the "
+            "surface that was made on this mesh. Hand over the two of the same round."
+        )
+
+
+def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]:
+    """Mark facets with a vertex of the surface that the hull holds, or with none of their own."""
+    inside = hull.holds(surface.vertices_world.detach())
+    outside = torch.bincount(surface.facet[~inside], minlength=count)
+    return torch.bincount(surface.facet[inside], minlength=count) >= outside.clamp_max(1)
+
+
+def _on_surface(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    edges: Int[Tensor, "edge 2"],
+    face_edge: Int[Tensor, "face 3"],
+    surface: Surface,
+) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "edge 3"]]:
+    """Find where vertices and middles of edges came to lie, the latter between two cuts."""
+    zeros = surface.barycentric < _ON_EDGE
+    count = zeros.sum(dim=1)
+    (at,) = torch.nonzero(count == 2, as_tuple=True)
+    corner = surface.barycentric[at].argmax(dim=1, keepdim=True)
+    name = faces[surface.facet[at]].gather(1, corner)[:, 0]
+    places = vertices.clone()
+    places[name] = surface.vertices_world[at].to(places)
+
+    (on,) = torch.nonzero(count == 1, as_tuple=True)
+    facet, opposite = surface.facet[on], zeros[on].long().argmax(dim=1, keepdim=True)
+    edge = face_edge[facet].gather(1, opposite)[:, 0]
+    far_slot = (faces[facet] == edges[edge, 1, None]).long().argmax(dim=1, keepdim=True)
+    along = surface.barycentric[on].gather(1, far_slot)[:, 0]
+    below, above = along <= 0.5, along >= 0.5
+    low = along.new_zeros(len(edges)).scatter_reduce(0, edge[below], along[below], "amax")
+    high = along.new_ones(len(edges)).scatter_reduce(0, edge[above], along[above], "amin")
+    start, end = places[edges[:, 0]], places[edges[:, 1]]
+    cut = surface.vertices_world[on].to(places)
+    first, last = below & (along == low[edge]), above & (along == high[edge])
+    start[edge[first]], end[edge[last]] = cut[first], cut[last]
+    gap = high - low
+    share = torch.where(gap > 0, (0.5 - low) / torch.where(gap > 0, gap, 1), 0)[:, None]
+    return places, (1 - share) * start + share * end
+
+
+def _with_data(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    surface: Surface,
+    seen: Bool[Tensor, " face"] | None,
+    max_hole: float,
+) -> Bool[Tensor, " face"]:
+    """Tell which facets stay: those with data, and small holes that those enclose."""
+    everything = torch.ones_like(faces[:, 0], dtype=torch.bool)
+    sure = surface.confidence > 0
+    inner = (surface.barycentric >= _ON_EDGE).all(dim=1)
+    if not bool(sure.any()):
+        return everything
+    inside = torch.bincount(surface.facet[inner], minlength=len(faces))
+    known = torch.bincount(surface.facet[inner & sure], minlength=len(faces)) > 0
+    # A facet too small to have vertices inside has data when all its corners have.
+    at_corner = (surface.barycentric > 1 - _ON_EDGE).any(dim=1) & sure
+    slot = surface.barycentric[at_corner].argmax(dim=1, keepdim=True)
+    told = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
+    told[faces[surface.facet[at_corner]].gather(1, slot)[:, 0]] = True
+    known = torch.where(inside > 0, known, told[faces].all(dim=1))
+    if seen is not None:
+        known = known | seen
+    if not bool(known.any()):
+        return everything
+    area = face_normals(vertices, faces).norm(dim=1) / 2
+    return known | enclosed_holes(vertices, faces, known, max_hole * float(area.sum()))
+
+
+def _severity(
+    corners: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    surface: Surface,
+    spacing: float,
+    residual: Float[Tensor, " face"] | None,
+    config: RemeshConfig,
+) -> Float[Tensor, " face"]:
+    """Give how much each facet exceeds what it may, the worst of its measures over its limit."""
+    limit = config.max_departure * spacing
+    worst = departures(corners, faces, surface) / limit
+    spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
+    worst = torch.maximum(worst, spread.to(worst))
+    if residual is not None:
+        typical = residual.nanmedian()
+        relative = residual / torch.where(typical > 0, typical, torch.inf) / _MOST_RESIDUAL
+        worst = torch.maximum(worst, relative.nan_to_num(nan=0.0).to(worst))
+    return worst
+
+
+def departures(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], surface: Surface
+) -> Float[Tensor, " face"]:
+    """Give the distance from each facet's plane that nine in ten of its lattice vertices keep.
+
+    Args:
+        vertices: The facets' corners, where their planes are to pass.
+        faces: The facets.
+        surface: Their lattice.
+    """
+    normals = normalize(face_normals(vertices, faces), dim=1)
+    middle = vertices[faces].mean(dim=1)
+    offset = surface.vertices_world.to(vertices) - middle[surface.facet]
+    away = (offset * normals[surface.facet]).sum(dim=1).abs()
+    order = away.argsort()
+    order = order[surface.facet[order].argsort(stable=True)]
+    count = torch.bincount(surface.facet, minlength=len(faces))
+    last = (_DEPARTURE_SHARE * (count - 1).clamp_min(0)).ceil().long()
+    place = (count.cumsum(dim=0) - count + last).clamp_max(len(order) - 1)
+    return torch.where(count > 0, away[order[place]], 0)
+
+
+def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
+    """Give the root mean square angle between the surface's normals and their facet's mean."""
+    weight = surface.confidence + UNSURE
+    total = weight.new_zeros(count, 3)
+    total = total.index_add(0, surface.facet, weight[:, None] * surface.normals_world)
+    mass = weight.new_zeros(count).index_add(0, surface.facet, weight)
+    length = total.norm(dim=1) / torch.where(mass > 0, mass, 1)
+    # Of small angles a from the mean, 1 - cos(a) is a^2 / 2.
+    return torch.where(mass > 0, (2 * (1 - length)).clamp_min(0).sqrt(), 0)
+
+
+def _side(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, " face"]:
+    """Give the side of the equilateral triangle of each facet's area."""
+    return (2 / 3**0.5 * face_normals(vertices, faces).norm(dim=1)).sqrt()
+
+
+def _worst_first(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    severity: Float[Tensor, " face"],
+    small: Bool[Tensor, " face"],
+    kept: Bool[Tensor, " face"],
+    max_facets: int,
+) -> Bool[Tensor, " edge"]:
+    """Mark the edges of as many of the worst facets as the limit allows; more mean more."""
+    _, face_edge = face_edges(faces)
+    wanted = torch.where(small, 0, severity)
+    order = wanted.argsort(descending=True, stable=True)
+    most, least = int((wanted > 1).sum()), 0
+
+    def marks(count: int) -> Bool[Tensor, " edge"]:
+        chosen = torch.zeros_like(small)
+        chosen[order[:count]] = True
+        return mark_edges(vertices, faces, chosen, small)
+
+    def facets(marked: Bool[Tensor, " edge"]) -> int:
+        return int((1 + marked[face_edge].sum(dim=1))[kept].sum())
+
+    found = marks(most)
+    if facets(found) <= max_facets:
+        return found
+    while most - least > 1:
+        middle = (most + least) // 2
+        least, most = (middle, most) if facets(marks(middle)) <= max_facets else (least, middle)
+    return marks(least)
+
+
+def _without_folds(
+    flat: Float[Tensor, "vertex 3"], onto: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, "vertex 3"]:
+    """Move vertices onto the surface, except where that folds, flattens or draws out facets."""
+    before = face_normals(flat, faces)
+    size = before.square().sum(dim=1)
+    longest = _MOST_STRETCH * side_lengths(flat[faces]).amax(dim=1)
+    moving = onto.isfinite().all(dim=1)
+    while True:
+        places = torch.where(moving[:, None], onto, flat)
+        along = (face_normals(places, faces) * before).sum(dim=1)
+        bad = (along <= _LEAST_AREA * size) | (side_lengths(places[faces]).amax(dim=1) > longest)
+        bad &= moving[faces].any(dim=1)
+        if not bool(bad.any()):
+            return places
+        moving[faces[bad].flatten()] = False

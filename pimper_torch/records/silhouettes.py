@@ -1,0 +1,38 @@
+"""Where every view shows the object."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.records.record import Record
+from pimper_torch.records.views import Views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Silhouettes(Record):
+    """The object's silhouette in every view.
+
+    Attributes:
+        inside: Probability that the pixel shows the object; 0 in the padding.
+        trusted: True for views whose silhouette agrees with the hull of the others.
+        source: ``masks`` that a person gave, ``found`` in the photographs, or ``everything``: no
+            view constrains the object.
+    """
+
+    inside: Float[Tensor, "view height width"]
+    trusted: Bool[Tensor, " view"]
+    source: Literal["masks", "found", "everything"]
+
+    @classmethod
+    def everything(cls, views: Views) -> "Silhouettes":
+        """Give silhouettes that leave nothing out."""
+        trusted = torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device)
+        return cls(inside=views.inside.float(), trusted=trusted, source="everything")
+
+    @property
+    def masks(self) -> Bool[Tensor, "view height width"]:
+        """True where the pixel more likely shows the object than not."""
+        return self.inside > 0.5

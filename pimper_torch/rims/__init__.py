@@ -1,1 +1,0 @@
-"""Outlines as constraints on the surface: it is tangent to the rays through them."""

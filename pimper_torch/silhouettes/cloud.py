@@ -1,0 +1,74 @@
+"""Which points of the cloud are the object's."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Cameras, Record, SparseScene
+from pimper_torch.silhouettes.ground import Gaze, Plane, well_tracked
+
+_CLEAR = 1.5  # tolerances above the plane: nearer points may lie on it
+_NEAR = 0.6  # of the cameras' distance: an object that fills photographs of 60 degrees
+# Without a plane: this quantile of the distances to the fixation point, and what beyond it is
+# the object's, and certainly is not.
+_MIDDLE, _WITHIN, _OUTSIDE = 0.7, 1.3, 2.6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SplitCloud(Record):
+    """The cloud's points, told apart.
+
+    Attributes:
+        own: The object's.
+        other: Certainly not; the rest may be either.
+    """
+
+    own: Bool[Tensor, " point"]
+    other: Bool[Tensor, " point"]
+
+
+def split_cloud(
+    scene: SparseScene,
+    gaze: Gaze,
+    plane: Plane | None,
+    tolerance: float,
+    box_world: Float[Tensor, "2 3"] | None,
+) -> SplitCloud:
+    """Tell the object's points from others.
+
+    With a plane they are what stands above it near the fixation point, without one what is near
+    that point.
+
+    Args:
+        scene: With tracks.
+        gaze: Where the cameras look.
+        plane: The object stands on.
+        tolerance: Of the plane, scene units.
+        box_world: What is outside is not the object.
+    """
+    points, good = scene.points_world, well_tracked(scene)
+    away = (points - gaze.fixation_world).norm(dim=1)
+    if plane is None:
+        middle = torch.quantile(away[good], _MIDDLE) if bool(good.any()) else away.sum()
+        own, other = away < _WITHIN * middle, away > _OUTSIDE * middle
+    else:
+        own = (plane.height_of(points) > _CLEAR * tolerance) & (away < _NEAR * gaze.distance)
+        other = ~own
+    if box_world is not None:
+        low, high = box_world.to(points)
+        inside = ((points >= low) & (points <= high)).all(dim=1)
+        own, other = own & inside, other | ~inside
+    return SplitCloud(own=good & own, other=good & other)
+
+
+def pixels_seen(
+    scene: SparseScene, cameras: Cameras, chosen: Bool[Tensor, " point"]
+) -> list[Float[Tensor, "_ 2"]]:
+    """Give where each view shows those of the chosen points that it observes."""
+    points = scene.points_world.cpu().float()
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    seen = (scene.observed & chosen[:, None]).cpu()
+    return [pixels[view, seen[:, view]] for view in range(cameras.num_views)]

@@ -1,0 +1,219 @@
+"""Rounds of cutting every view and of voting on what the cuts have in common."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from pimper_torch.records import Record, Silhouettes
+from pimper_torch.silhouettes.ground import Gaze, Plane
+from pimper_torch.silhouettes.hull import margins, visual_hull
+from pimper_torch.silhouettes.opencv import (
+    OBJECT,
+    convex_hull_of,
+    grab_cut,
+    signed_distance,
+    without_specks,
+)
+from pimper_torch.silhouettes.parallax import DISPUTED, plane_agreement
+from pimper_torch.silhouettes.pictures import Pictures, of_views
+from pimper_torch.silhouettes.seeds import (
+    filled,
+    is_deep,
+    labels_from_hull,
+    labels_from_points,
+    not_seen_through,
+    off_level,
+    off_plane,
+)
+
+# Points of the object that a view must observe, in the median, to be seeded by them.
+_LEAST_OBSERVED = 12
+_WELL = 2.0  # times as deep as is_deep asks for
+_CUTS = 2  # rounds of mixtures and cut inside GrabCut
+_SPECK = 2e-4  # share of the picture
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Cues(Record):
+    """What tells the object before anything is cut.
+
+    Attributes:
+        pictures: At the working size.
+        own_px: Pixels of the object's points, one tensor a view.
+        other_px: Of points that are not the object's.
+        plane: That the object stands on.
+        agreement: With the plane's texture.
+        gaze: Where the cameras look.
+        box_world: The object is inside.
+    """
+
+    pictures: Pictures
+    own_px: tuple[Float[Tensor, "_ 2"], ...]
+    other_px: tuple[Float[Tensor, "_ 2"], ...]
+    plane: Plane | None
+    agreement: Float[Tensor, "view height width"] | None
+    gaze: Gaze
+    box_world: Float[Tensor, "2 3"]
+
+    @property
+    def num_views(self) -> int:
+        """How many views there are."""
+        return len(self.own_px)
+
+    @property
+    def has_points(self) -> bool:
+        """Whether views observe enough points of the object to be seeded by them."""
+        counts = torch.tensor([len(pixels) for pixels in self.own_px])
+        return int(counts.median()) >= _LEAST_OBSERVED
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Cuts(Record):
+    """The object in every view, as the view itself and as all together have it.
+
+    Attributes:
+        masks: Each view's own cut.
+        margins_px: Inside the projection of the hull, pixels of the working size.
+        on_plane: Whether the object stands on a plane.
+    """
+
+    masks: Bool[Tensor, "view height width"]
+    margins_px: Float[Tensor, "view height width"]
+    on_plane: bool = False
+
+
+def cut_in_rounds(cues: Cues, *, rounds: int, disagreeing: float, num_voxels: int) -> Cuts | None:
+    """Cut every view, vote, and cut again from what the vote says.
+
+    Before every vote the plane's texture is learned anew where the cuts do not hide it: holes
+    that it is seen through stay open, and what stands before it stands out.
+
+    Returns:
+        ``None`` where the cuts have nothing in common.
+    """
+    masks = _first(cues)
+    for _ in range(rounds):
+        cues = _looked_behind(cues, masks)
+        masks = _filled(cues, masks)
+        seen = _voted(cues, masks | _likely(cues), disagreeing, num_voxels)
+        if seen is None:
+            return None
+        masks = _again(cues, masks, seen)
+    masks = _filled(_looked_behind(cues, masks), masks)
+    seen = _voted(cues, masks, disagreeing, num_voxels)
+    if seen is None:
+        return None
+    return Cuts(masks=masks, margins_px=seen, on_plane=cues.plane is not None)
+
+
+def _looked_behind(cues: Cues, masks: Bool[Tensor, "view height width"]) -> Cues:
+    """Learn the plane's texture where the cuts do not hide it; elsewhere keep what was known."""
+    if cues.plane is None or cues.agreement is None:
+        return cues
+    found = plane_agreement(cues.pictures, cues.plane, cues.gaze, masks)
+    return cues.replace(agreement=torch.where(found.isnan(), cues.agreement, found))
+
+
+def _filled(
+    cues: Cues, masks: Bool[Tensor, "view height width"]
+) -> Bool[Tensor, "view height width"]:
+    """Fill holes that the plane is not seen through."""
+    agreement = cues.agreement
+    if agreement is None:
+        return masks
+    return of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
+
+
+def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Cut from points and parallax; where hardly any points are the object's, parallax alone."""
+    height, width = cues.pictures.grey.shape[1:]
+
+    def first(view: int) -> Bool[Tensor, "height width"]:
+        own_px = cues.own_px[view]
+        agreement = None if cues.agreement is None else cues.agreement[view]
+        if agreement is not None and not cues.has_points:
+            return off_plane(agreement)
+        labels = labels_from_points(own_px, cues.other_px[view], agreement, (width, height))
+        margin = signed_distance(convex_hull_of(own_px, (width, height)))
+        return _cut(cues, view, labels, margin)
+
+    return of_views(first, cues.num_views)
+
+
+def _again(
+    cues: Cues,
+    masks: Bool[Tensor, "view height width"],
+    seen: Float[Tensor, "view height width"],
+) -> Bool[Tensor, "view height width"]:
+    """Cut from the last cut and the hull; drop what does not meet the hull."""
+
+    def again(view: int) -> Bool[Tensor, "height width"]:
+        own_px = cues.own_px[view]
+        agreement = None if cues.agreement is None else cues.agreement[view]
+        labels = labels_from_hull(seen[view], masks[view], own_px, agreement)
+        cut = _cut(cues, view, labels, seen[view])
+        return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
+
+    return of_views(again, cues.num_views)
+
+
+def _cut(
+    cues: Cues,
+    view: int,
+    labels: UInt8[Tensor, "height width"],
+    margin: Float[Tensor, "height width"],
+) -> Bool[Tensor, "height width"]:
+    """Cut a view, by colours that shadows change little where there is a plane for them to fall on.
+
+    Those cannot tell the grey inside of a vessel from a grey table: what is well inside is the
+    object's unless the plane is seen there.
+    """
+    if cues.agreement is None:
+        return grab_cut(cues.pictures.opponent[view], labels, _CUTS)
+    agreement = cues.agreement[view]
+    surrounded = not_seen_through(cues.own_px[view], agreement)
+    surrounded &= ~(agreement >= DISPUTED)
+    labels = torch.where(is_deep(margin / _WELL) & surrounded, OBJECT, labels)
+    return grab_cut(cues.pictures.opponent[view], labels, _CUTS)
+
+
+def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Mark what takes part in the vote though cuts may lack it, as the inside of a vessel.
+
+    That is what the object's points surround and the plane is not seen through, and what is
+    brighter or darker than the plane can be.
+    """
+    own_px, agreement = cues.own_px, cues.agreement
+    if agreement is None or not cues.has_points:
+        return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
+
+    def likely(view: int) -> Bool[Tensor, "height width"]:
+        return not_seen_through(own_px[view], agreement[view]) | off_level(agreement[view])
+
+    return of_views(likely, cues.num_views)
+
+
+def _voted(
+    cues: Cues, masks: Bool[Tensor, "view height width"], disagreeing: float, num_voxels: int
+) -> Float[Tensor, "view height width"] | None:
+    """Build the hull above the plane, and see it in every view."""
+    cameras = cues.pictures.cameras
+    silhouettes = Silhouettes(
+        inside=masks.float(), trusted=torch.ones(len(masks), dtype=torch.bool), source="found"
+    )
+    hull = visual_hull(
+        silhouettes, cameras, cues.box_world, num_voxels=num_voxels, disagreeing=disagreeing
+    )
+    if hull is None:
+        return None
+    if cues.plane is not None:
+        hull = hull.above(cues.plane.normal_world, cues.plane.offset)
+    height, width = masks.shape[1:]
+
+    def margin(view: int) -> Float[Tensor, "height width"]:
+        frame = cameras.cam_from_world[view]
+        return margins(hull, cameras.intrinsics[view], frame, (width, height))
+
+    return of_views(margin, len(masks))

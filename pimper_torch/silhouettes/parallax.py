@@ -1,0 +1,186 @@
+"""Plane parallax: what stands on a plane does not look as the plane does from elsewhere.
+
+All photographs are rectified to the plane. The median of what they show there is the plane's
+texture, without what stands on it and without shadows, which move with the light. Where a view
+agrees with it, it shows the plane; where it does not, something stands before it, textured or not.
+Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.parallel import side_by_side
+from pimper_torch.records import Cameras, Record
+from pimper_torch.silhouettes.ground import Gaze, Plane
+from pimper_torch.silhouettes.opencv import warped, window_means
+from pimper_torch.silhouettes.pictures import Pictures, of_views
+
+# Shares of the pictures' longer side.
+_WINDOW = 1 / 80  # windows that are compared: 9 px of 640
+_SHADING = 1 / 25  # what is smoother than this is light, not texture
+# Log radiance whose deviation in a window is below this is flat: a sensor's noise of 0.01.
+_FLAT = 0.008
+DISPUTED = 0.5
+_REACH = 1.0  # of the cameras' distance: the plane that is rectified, to each side
+_STEP = 2.0  # working pixels at the fixation point between samples of the plane
+# The same for brightness, where there is no texture.
+_FAR_REACH, _FAR_STEP = 2.0, 8.0
+_NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
+_LEAST_VIEWS = 3  # of which two agree
+_SAMPLES = 2**20  # of the plane, over all views, at once
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Sheet(Record):
+    """A raster on the plane.
+
+    Attributes:
+        world_from_sheet: Homogeneous pixels of the raster to world points, 3 x 3.
+        size_px: Samples each way.
+    """
+
+    world_from_sheet: Float[Tensor, "3 3"]
+    size_px: int
+
+
+def plane_agreement(
+    pictures: Pictures,
+    plane: Plane,
+    gaze: Gaze,
+    hidden: Bool[Tensor, "view height width"] | None = None,
+) -> Float[Tensor, "view height width"]:
+    r"""Say how well each view agrees with the plane's texture.
+
+    Agreement in a window is :math:`2\,\mathrm{cov} / (\mathrm{var} + \mathrm{var}')` of log
+    radiance without its smooth part.
+
+    Args:
+        pictures: At the working size.
+        plane: Supporting the object.
+        gaze: Its fixation point is the middle of what is looked at.
+        hidden: Where views do not show the plane, as far as is known. What they show there is
+            compared with the plane's texture, but is no part of it.
+
+    Returns:
+        Between -1 and 1; ``DISPUTED`` where views do not agree on what the plane looks like, as
+        where it is always hidden; NaN where it is flat, or few views see it; -1 where a view that
+        does not agree is brighter or darker than the others by more than light does it.
+    """
+    cameras, longer = pictures.cameras, max(pictures.grey.shape[1:])
+    hidden = torch.zeros_like(pictures.grey, dtype=torch.bool) if hidden is None else hidden
+
+    def textured(view: int) -> Float[Tensor, "height width"]:
+        return _textured(pictures.grey[view], hidden[view], longer)
+
+    texture = of_views(textured, cameras.num_views)
+    seen, radiance = (layer.masked_fill(hidden, torch.nan) for layer in (texture, pictures.grey))
+    common, spread = _common(seen, cameras, _sheet(cameras, plane, gaze, _REACH, _STEP))
+    far = _sheet(cameras, plane, gaze, _FAR_REACH, _FAR_STEP)
+    level, level_spread = _common(radiance, cameras, far)
+
+    def agreement_of(view: int) -> Float[Tensor, "height width"]:
+        agreement = _agreement(texture[view], common[view], spread[view], longer)
+        other = (pictures.grey[view] - level[view]).abs() > _NO_SHADOW
+        other &= level_spread[view] < _NO_SHADOW / 2
+        return torch.where(~(agreement > DISPUTED) & other, -1, agreement)
+
+    return of_views(agreement_of, cameras.num_views)
+
+
+def _common(
+    values: Float[Tensor, "view height width"], cameras: Cameras, sheet: Sheet
+) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
+    """Give the views' median of each place on the plane, and its spread, as each view sees it."""
+    maps = [cameras.intrinsics[v] @ _on_sheet(cameras, sheet, v) for v in range(len(values))]
+    square = (sheet.size_px, sheet.size_px)
+    seen = of_views(lambda view: warped(values[view], maps[view], square), len(values))
+    rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * sheet.size_px)), dim=1)
+    common, spread = torch.cat(list(side_by_side(_middle, rows, tracked=False)), dim=1)
+    size = (values.shape[2], values.shape[1])
+
+    def back(view: int) -> Float[Tensor, "layer height width"]:
+        to = torch.linalg.inv(maps[view])
+        return torch.stack([_before(warped(one, to, size), to) for one in (common, spread)])
+
+    common, spread = of_views(back, len(values)).unbind(dim=1)
+    return common, spread
+
+
+def _middle(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row column"]:
+    """Give the views' median and the spread round it; NaN where too few see the plane."""
+    common = seen.nanmedian(dim=0).values
+    spread = (seen - common).abs().nanmedian(dim=0).values
+    few = seen.isfinite().sum(dim=0) < _LEAST_VIEWS
+    return torch.stack([common, spread]).masked_fill(few, torch.nan)
+
+
+def _before(
+    layer: Float[Tensor, "height width"], sheet_from_pixels: Float[Tensor, "3 3"]
+) -> Float[Tensor, "height width"]:
+    """Forget what a homography puts before the camera though it lies behind, above the horizon."""
+    height, width = layer.shape
+    pixels = pixel_centers(width, height, like=layer)
+    scale = pixels @ sheet_from_pixels[2, :2] + sheet_from_pixels[2, 2]
+    return torch.where(scale > 0, layer, torch.nan)
+
+
+def _sheet(cameras: Cameras, plane: Plane, gaze: Gaze, reach: float, step_px: float) -> Sheet:
+    """Lay a raster on the plane about the foot of the fixation point."""
+    normal = plane.normal_world
+    axis = torch.eye(3)[normal.abs().argmin()].to(normal)
+    first = normalize(torch.linalg.cross(normal, axis), dim=0)
+    second = torch.linalg.cross(normal, first)
+    foot = gaze.fixation_world - plane.height_of(gaze.fixation_world) * normal
+    step = step_px * gaze.distance / cameras.intrinsics[:, 0, 0].median()
+    size = int(2 * reach * gaze.distance / step)
+    corner = foot - step * size / 2 * (first + second)
+    return Sheet(
+        world_from_sheet=torch.stack([step * first, step * second, corner], dim=1), size_px=size
+    )
+
+
+def _on_sheet(cameras: Cameras, sheet: Sheet, view: int) -> Float[Tensor, "3 3"]:
+    """Give the map from homogeneous pixels of the raster to a camera's frame."""
+    pose = cameras.cam_from_world[view]
+    moved = pose[:3, :3] @ sheet.world_from_sheet
+    moved[:, 2] += pose[:3, 3]
+    return moved
+
+
+def _textured(
+    grey: Float[Tensor, "height width"], hidden: Bool[Tensor, "height width"], longer: int
+) -> Float[Tensor, "height width"]:
+    """Take the light out: what varies smoothly, on the plane and on what hides it apart."""
+    window = _odd(_SHADING * longer)
+    off = hidden.to(grey)
+    sums = window_means(torch.stack([grey * off, off, grey * (1 - off), 1 - off]), window)
+    smooth = torch.where(hidden, sums[0] / sums[1], sums[2] / sums[3])
+    return grey - smooth
+
+
+def _agreement(
+    one: Float[Tensor, "height width"],
+    common: Float[Tensor, "height width"],
+    spread: Float[Tensor, "height width"],
+    longer: int,
+) -> Float[Tensor, "height width"]:
+    """Compare a view with the plane's texture window by window."""
+    known = common.isfinite() & spread.isfinite()
+    common, spread = torch.where(known, common, 0), torch.where(known, spread, 0)
+    layers = [one, common, one * one, common * common, one * common, spread, known.to(one)]
+    means = window_means(torch.stack(layers), _odd(_WINDOW * longer))
+    variance = (means[2] - means[0] ** 2).clamp_min(0)
+    variance_common = (means[3] - means[1] ** 2).clamp_min(0)
+    agreement = 2 * (means[4] - means[0] * means[1]) / (variance + variance_common)
+    disputed = means[5] > variance_common.sqrt().clamp_min(_FLAT)
+    told = (torch.maximum(variance, variance_common) > _FLAT**2) & (means[6] > 0.999)
+    return torch.where(told, torch.where(disputed, DISPUTED, agreement), torch.nan)
+
+
+def _odd(size: float) -> int:
+    return 2 * round(size / 2) + 1

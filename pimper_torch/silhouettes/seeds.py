@@ -1,0 +1,126 @@
+"""What is certain before a view is cut: labels from points, parallax and the hull."""
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from pimper_torch.silhouettes.opencv import (
+    BACKGROUND,
+    OBJECT,
+    PERHAPS_BACKGROUND,
+    PERHAPS_OBJECT,
+    blind_holes,
+    closed,
+    convex_hull_of,
+    discs_at,
+    opened,
+    signed_distance,
+)
+
+# Lengths are shares of the pictures' longer side.
+_DISC = 1 / 400  # about a point: its feature is larger, but may reach over the silhouette
+_STRIP = 1 / 64  # along the border of a photograph, where nothing else is known
+_CLOSING = 1 / 90
+_BEYOND = 1 / 25  # what is further outside the hull's projection is background
+_DEEP = 1 / 50  # parallax this far inside the projection tells object
+_GRAIN = 1 / 200  # what is smaller in parallax is noise
+_GAPS = 1 / 50  # in what does not show the plane, as beyond its far border
+_FOOT = 1 / 80  # parallax tells nothing of an object's foot that is so high
+
+# Agreement with neighbours moved by the plane: below is not the plane, above is.
+_OFF_PLANE = 0.4
+_NOT_PLANE = 0.6
+_ON_PLANE = 0.75
+_THROUGH = 0.2  # of a hole: its border agrees with nothing
+
+
+def labels_from_points(
+    object_px: Float[Tensor, "point 2"],
+    other_px: Float[Tensor, "other 2"],
+    agreement: Float[Tensor, "height width"] | None,
+    size_px: tuple[int, int],
+) -> UInt8[Tensor, "height width"]:
+    """Seed with the points that a view observes, the object's and others, and with parallax.
+
+    Without parallax a strip along the border is background.
+    """
+    longer = max(size_px)
+    region = convex_hull_of(object_px, size_px)
+    labels = torch.full(size_px[::-1], PERHAPS_BACKGROUND, dtype=torch.uint8)
+    if agreement is not None:
+        labels[_surely_on_plane(agreement)] = BACKGROUND
+        region &= ~_grainless(agreement > _ON_PLANE)
+    else:
+        strip = max(1, round(_STRIP * longer))
+        border = torch.ones_like(labels, dtype=torch.bool)
+        border[strip:-strip, strip:-strip] = False
+        labels[border] = BACKGROUND
+    labels[region & (labels != BACKGROUND)] = PERHAPS_OBJECT
+    labels[discs_at(other_px, _DISC * longer, size_px)] = BACKGROUND
+    labels[discs_at(object_px, _DISC * longer, size_px)] = OBJECT
+    return labels
+
+
+def labels_from_hull(
+    margin: Float[Tensor, "height width"],
+    cut: Bool[Tensor, "height width"],
+    object_px: Float[Tensor, "point 2"],
+    agreement: Float[Tensor, "height width"] | None,
+) -> UInt8[Tensor, "height width"]:
+    """Seed with a view's last cut, the projection of the hull, points in it, and parallax."""
+    height, width = margin.shape
+    longer = max(height, width)
+    labels = torch.full(margin.shape, PERHAPS_BACKGROUND, dtype=torch.uint8)
+    region = cut | closed(margin > 0, max(1, round(_CLOSING * longer)))
+    if agreement is not None:
+        region &= ~_grainless(agreement > _ON_PLANE)
+    labels[region] = PERHAPS_OBJECT
+    if agreement is not None:
+        labels[_surely_on_plane(agreement)] = BACKGROUND
+        labels[_grainless(agreement < _OFF_PLANE) & is_deep(margin)] = OBJECT
+    labels[margin < -_BEYOND * longer] = BACKGROUND
+    discs = discs_at(object_px, _DISC * longer, (width, height))
+    labels[discs & (margin > 0)] = OBJECT
+    return labels
+
+
+def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Mark what does not show the plane, or where it is always hidden; unknown counts as plane."""
+    found = _grainless(agreement < _NOT_PLANE)
+    return filled(closed(found, round(_GAPS * max(agreement.shape))), agreement)
+
+
+def is_deep(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Mark what is so far inside that shadows beside the object do not reach it."""
+    return margin > _DEEP * max(margin.shape)
+
+
+def not_seen_through(
+    own_px: Float[Tensor, "point 2"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Mark what the object's points surround, where the plane is not seen."""
+    height, width = agreement.shape
+    return convex_hull_of(own_px, (width, height)) & ~_grainless(agreement > _ON_PLANE)
+
+
+def off_level(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Mark what is so bright or dark that light cannot make it so on the plane."""
+    return _grainless(agreement == -1)
+
+
+def filled(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Fill holes that the plane is not seen through, such as the inside of a vessel."""
+    whole = closed(cut, max(1, round(_CLOSING * max(cut.shape))))
+    return cut | blind_holes(whole, agreement > _ON_PLANE, _THROUGH)
+
+
+def _surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Mark the plane, but not what is next to something else: the object's foot agrees, too."""
+    sure = _grainless(agreement > _ON_PLANE)
+    return signed_distance(sure) > _FOOT * max(agreement.shape)
+
+
+def _grainless(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    return opened(mask, max(1, round(_GRAIN * max(mask.shape))))

@@ -1,0 +1,185 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.coarse.cropping import cropped
+from pimper_torch.coarse.fine_surface import FineSurfaceConfig, closed_surface, seen_surface
+from pimper_torch.coarse.oriented import no_points
+from pimper_torch.coarse.surface import CoarseSurface
+from pimper_torch.coarse.trim import Evidence
+from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.geometry.components import face_components
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.records import Support
+from pimper_torch.silhouettes.contours import TraceContours
+from tests.coarse.ball import SETTINGS, photographed, silhouettes_of
+
+SMALL_HOLES = FineSurfaceConfig(hole_px=0.3**0.5)  # closed up to an area of 0.3 with pixels of 1
+
+
+def white(points):
+    return torch.full_like(points, 0.7)
+
+
+def half_mottled(points):
+    """Waves above the equator, one colour below."""
+    generator = torch.Generator().manual_seed(3)
+    waves = 14 * torch.randn(24, 3, generator=generator, dtype=torch.float64).to(points)
+    tone = torch.sin(points @ waves.T + torch.arange(24).to(points)).mean(dim=-1, keepdim=True)
+    tone = torch.where(points[..., 2:] > 0, (0.5 + 1.2 * tone).clamp(0.05, 1), 0.7)
+    return tone.expand_as(points)
+
+
+def enclosed(scene, some=lambda points: points[:, 2] > -2):
+    """CoarseSurface the ball with its silhouettes, on some points of its cloud."""
+    errors = torch.where(some(scene.points_world), 0.5, 100.0)
+    scene = scene.replace(reprojection_errors_px=errors.to(scene.reprojection_errors_px))
+    return CoarseSurface(*SETTINGS)(
+        scene, TraceContours()(silhouettes_of(scene.cameras), scene.cameras)
+    )
+
+
+def is_closed(mesh):
+    pairs, _ = face_pairs(mesh.faces)
+    return 2 * len(pairs) == 3 * len(mesh.faces) and int(face_components(mesh.faces).max()) == 0
+
+
+def test_a_ball_textured_on_one_half_is_enclosed_whole_and_says_what_supports_it(round_about):
+    scene = photographed(round_about.cameras.to(torch.float64), half_mottled)
+    coarse = enclosed(scene, lambda points: points[:, 2] > 0)
+    mesh = coarse.mesh
+    assert is_closed(mesh)
+    middle = mesh.vertices_world[mesh.faces].mean(dim=1)
+    off = (middle.norm(dim=1) - 1).abs()
+    # A pixel is 0.022 of the radius there.
+    assert off.mean() < 0.02
+    assert off.max() < 0.1
+    above, below = middle[:, 2] > 0.2, middle[:, 2] < -0.2
+    # Views 40 degrees apart match some of it.
+    assert (coarse.support[above] == Support.POINTS).float().mean() > 0.15
+    assert (coarse.support[below] == Support.POINTS).float().mean() < 0.02
+    assert (coarse.support[below] == Support.CONTOUR).float().mean() > 0.3
+    assert (coarse.support >= Support.LIGHT).float().mean() > 0.8
+
+
+def test_a_ball_of_one_colour_is_enclosed_by_its_silhouettes_alone(round_about):
+    scene = photographed(round_about.cameras.to(torch.float64), white)
+    coarse = enclosed(scene, lambda points: points[:, 2] > 2)
+    assert is_closed(coarse.mesh)
+    assert len(coarse.points.facet) == 0
+    assert not bool((coarse.support == Support.POINTS).any())
+    assert (coarse.mesh.vertices_world.norm(dim=1) - 1).abs().mean() < 0.03
+    outward = normalize(face_normals(coarse.mesh.vertices_world, coarse.mesh.faces), dim=-1)
+    towards = normalize(coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1), dim=-1)
+    assert ((outward * towards).sum(dim=-1) > 0.6).float().mean() > 0.98
+
+
+def test_what_no_view_sees_is_left_out():
+    cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
+    mesh = enclosed(photographed(cameras)).mesh
+    # The hull reaches to -2.2; views 25 degrees off the middle see to -0.2, and Poisson runs on
+    # along the last contours for a few facets.
+    assert -0.75 < float(mesh.vertices_world[:, 2].min()) < 0.1
+    off = (mesh.vertices_world.norm(dim=1) - 1).abs()
+    assert off.max() < 0.2
+    assert off[mesh.vertices_world[:, 2] > 0].mean() < 0.02
+
+
+def test_a_lid_goes_and_small_dents_stay():
+    vertices, faces = icosphere(3)
+    middle = vertices[faces].mean(dim=1)
+    lid, speck = middle[:, 2] > 0.8, middle[:, 2] < -0.97
+    count = torch.full((len(faces),), 3)
+    said = Evidence(seen=count, lit=count, denied=torch.where(lid | speck, 2, 0))
+    support = torch.full_like(count, Support.LIGHT)
+    support[middle[:, 0] > 0.9] = Support.CONTOUR
+    everywhere = torch.ones_like(lid)
+    kept = seen_surface(vertices, faces, support, said, everywhere, 1.0, SMALL_HOLES)
+    assert bool((kept == ~lid).all())  # the lid's area is 1.2, the speck's 0.2
+    # Nothing goes where points are.
+    support[lid] = Support.POINTS
+    assert bool(seen_surface(vertices, faces, support, said, everywhere, 1.0, SMALL_HOLES).all())
+
+
+def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes():
+    vertices, faces = icosphere(3)
+    middle = vertices[faces].mean(dim=1)
+    bottom, back, lid = middle[:, 2] > 0.97, middle[:, 2] < -0.5, middle[:, 0] > 0.97
+    assert 0.005 < bottom.double().mean() < 0.02 < back.double().mean()
+    count = torch.full((len(faces),), 3)
+    seen = torch.where(bottom | back | lid, 0, count)
+    said = Evidence(seen=seen, lit=seen, denied=torch.where(lid, 2, 0))
+    support = torch.where(seen > 0, Support.POINTS, Support.NOTHING)
+    everywhere = torch.ones_like(lid)
+    config = FineSurfaceConfig(hole_px=0.0)
+
+    def kept(inside=everywhere, config=config):
+        return seen_surface(vertices, faces, support, said, inside, 1.0, config)
+
+    assert bool((kept() == ~(back | lid)).all())
+    # One face of it behind which something is seen, or outside the hull, opens all of it.
+    assert bool((kept(inside=everywhere & (middle[:, 2] < middle[:, 2].max())) == (seen > 0)).all())
+    none = FineSurfaceConfig(hole_px=0.0, max_unseen=0.0)
+    assert bool((kept(config=none) == (seen > 0)).all())
+
+
+def test_pieces_that_neither_points_nor_contours_support_go():
+    vertices, faces = icosphere(2)
+    two = torch.cat([vertices, 0.3 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
+    first = torch.arange(len(two[1])) < len(faces)
+    count = torch.full((len(two[1]),), 3)
+    said = Evidence(seen=count, lit=count, denied=0 * count)
+    support = torch.where(first, Support.POINTS, Support.LIGHT)
+    kept = seen_surface(*two, support, said, torch.ones_like(first), 1.0, FineSurfaceConfig())
+    assert bool((kept == first).all())
+
+
+def test_the_crop_shows_the_same_at_the_same_places(round_about):
+    silhouettes = silhouettes_of(round_about.cameras)
+    part = cropped(round_about, silhouettes)
+    assert part.views.images.shape[-1] < round_about.views.images.shape[-1]
+    for view in (0, 5):
+        before, _ = project(
+            round_about.points_world,
+            round_about.cameras.cam_from_world[view],
+            round_about.cameras.intrinsics[view],
+        )
+        after, _ = project(
+            round_about.points_world,
+            part.cameras.cam_from_world[view],
+            part.cameras.intrinsics[view],
+        )
+        u, v = before.long().unbind(dim=1)
+        x, y = after.floor().long().unbind(dim=1)
+        shown = silhouettes.masks[view, v, u]
+        assert shown.sum() > 100
+        assert bool(part.views.masks[view, y, x][shown].all())
+        images, parts = round_about.views.images[view], part.views.images[view]
+        assert_close(parts[:, y[shown], x[shown]], images[:, v[shown], u[shown]])
+
+
+def test_a_view_without_silhouette_is_masked_whole(round_about):
+    silhouettes = silhouettes_of(round_about.cameras)
+    inside = silhouettes.inside.clone()
+    inside[3] = 0
+    part = cropped(round_about, silhouettes.replace(inside=inside))
+    assert not bool(part.views.masks[3].any())
+    assert bool(part.views.masks[2].any())
+
+
+def test_too_few_points_and_contours_are_refused(round_about):
+    contours = TraceContours()(silhouettes_of(round_about.cameras), round_about.cameras)
+    contours = contours.replace(rays=contours.rays.take(torch.arange(5)))
+    with pytest.raises(ReconstructionError, match="0 points were matched inside the silhouettes"):
+        closed_surface(no_points(round_about.points_world), contours, 0.02, FineSurfaceConfig())
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ConfigError, match=r"fine_surface\.touches"):
+        FineSurfaceConfig(touches=0)
+    with pytest.raises(ConfigError, match=r"fine_surface\.cell_px"):
+        FineSurfaceConfig(cell_px=0.0)

@@ -1,0 +1,324 @@
+import time
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.coarse.fill import delaunay
+from pimper_torch.coarse.remesh import RemeshConfig, remesh, within
+from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.surfaces import (
+    barycentric_2d,
+    boundary_vertices,
+    face_normals,
+    vertex_normals,
+)
+from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
+from pimper_torch.silhouettes.hull import Hull
+
+SPACING = 0.02
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(31)
+
+
+def sheet(generator, side=7, lift=lambda xy: 0 * xy[:, 0]):
+    """A square of irregular facets, counter-clockwise from above."""
+    line = torch.linspace(-1, 1, side, dtype=torch.float64)
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    xy = torch.stack([x, y], dim=-1).reshape(-1, 2)
+    shake = 0.08 * torch.randn(xy.shape, generator=generator, dtype=torch.float64)
+    xy = torch.where((xy.abs() < 0.99).all(dim=1, keepdim=True), xy + shake, xy)
+    faces = delaunay(xy)
+    vertices = torch.cat([xy, lift(xy)[:, None]], dim=1)
+    up = face_normals(vertices, faces)[:, 2:] > 0
+    return coarse_of(vertices, torch.where(up, faces, faces.flip(1)))
+
+
+def coarse_of(vertices, faces):
+    mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertex_normals(vertices, faces))
+    return CoarseMesh(mesh=mesh, reference=0, is_point=torch.zeros(len(vertices), dtype=torch.bool))
+
+
+def surface_on(coarse, place, spacing=SPACING, normals=None, confidence=None):
+    """The lattice of a mesh, its vertices moved by ``place``."""
+    mesh = coarse.mesh
+    count = len(mesh.faces)
+    lattice = subdivide(mesh.vertices_world, mesh.faces, torch.full((count,), spacing).double())
+    points = place(lattice.points)
+    found = vertex_normals(points, lattice.faces) if normals is None else normals(points)
+    sure = torch.ones_like(points[:, 0]) if confidence is None else confidence(lattice)
+    return Surface(
+        vertices_world=points,
+        faces=lattice.faces,
+        facet=lattice.facet,
+        barycentric=lattice.barycentric,
+        normals_world=found,
+        albedo=torch.ones_like(points),
+        confidence=sure,
+        convergence=Convergence(
+            iterations=torch.ones(1).long(), residual=torch.zeros(1), cause=torch.zeros(1).long()
+        ),
+    )
+
+
+def dome(points):
+    """A plane, and half a ball of radius 0.5 round (0.5, 0) on it."""
+    offset = points[:, :2] - points.new_tensor([0.5, 0])
+    height = (0.25 - offset.square().sum(dim=1)).clamp_min(0).sqrt()
+    return torch.cat([points[:, :2], height[:, None]], dim=1)
+
+
+def edge_counts(faces):
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    return torch.unique(edges, dim=0, return_counts=True)[1]
+
+
+def wavy(points):
+    lift = 0.05 * torch.sin(9 * points[:, 0])
+    return torch.cat([points[:, :2], points[:, 2:] + lift[:, None]], dim=1)
+
+
+def test_parts_of_a_facet_have_its_support(generator):
+    coarse = sheet(generator)
+    coarse = coarse.replace(support=torch.arange(len(coarse.mesh.faces)) % 4)
+    found = remesh(coarse, surface_on(coarse, wavy), SPACING)
+    assert len(found.mesh.faces) > len(coarse.mesh.faces)
+    middle = found.mesh.vertices_world[found.mesh.faces].mean(dim=1)[:, :2]
+    corners = coarse.mesh.vertices_world[coarse.mesh.faces][..., :2]
+    place = barycentric_2d(middle[:, None], corners[None])
+    parent = place.amin(dim=-1).argmax(dim=1)
+    assert bool((found.support == coarse.support[parent]).all())
+
+
+def test_a_surface_that_fits_changes_nothing(generator):
+    coarse = sheet(generator, lift=lambda xy: 0.1 * xy[:, 0] * xy[:, 1])
+    surface = surface_on(coarse, lambda points: points)
+    found = remesh(coarse, surface, SPACING)
+    assert_close(found.mesh.vertices_world, coarse.mesh.vertices_world)
+    assert (found.mesh.faces == coarse.mesh.faces).all()
+    again = remesh(found, surface_on(found, lambda points: points), SPACING)
+    assert_close(again.mesh.vertices_world, found.mesh.vertices_world)
+
+
+def test_a_mesh_gets_finer_on_a_ball_and_not_on_the_plane_beside_it(generator):
+    coarse = sheet(generator, side=9)
+    found = remesh(coarse, surface_on(coarse, dome), SPACING, RemeshConfig(min_samples=5.0))
+    middles = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
+    area = face_normals(found.mesh.vertices_world, found.mesh.faces)[:, 2] / 2
+    where = found.mesh.vertices_world[found.mesh.faces].mean(dim=1)
+    assert (area > 0).all()
+    assert_close(area.sum(), area.new_tensor(4.0), atol=1e-6, rtol=0)  # the square, seen from above
+    flat_before, flat_after = middles[:, 0] < -0.6, where[:, 0] < -0.6
+    assert int(flat_before.sum()) == int(flat_after.sum()) > 5
+    on_dome = (where[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.45
+    was_dome = (middles[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.45
+    assert int(on_dome.sum()) > 2 * int(was_dome.sum())
+
+
+def test_new_and_old_vertices_lie_on_the_surface(generator):
+    coarse = sheet(generator, side=9)
+    found = remesh(coarse, surface_on(coarse, dome), SPACING, RemeshConfig(min_samples=5.0))
+    vertices = found.mesh.vertices_world
+    assert len(vertices) > len(coarse.mesh.vertices_world)
+    off = (vertices[:, 2] - dome(vertices)[:, 2]).abs()
+    smooth = (vertices[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.42
+    # Between two cuts of an edge a chord, 0.02 long, leaves the ball by 0.02^2 / (8 * 0.5).
+    assert off[smooth].max() < 1e-3
+    truth = normalize(vertices - torch.tensor([0.5, 0, 0]), dim=1)
+    inner = (vertices[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.25
+    assert inner.any()
+    angle = (truth * found.mesh.normals_world).sum(dim=1)[inner].clamp(-1, 1).acos()
+    assert torch.rad2deg(angle).max() < 3
+
+
+def test_a_closed_mesh_stays_closed_and_nears_the_ball(generator):
+    vertices, faces = icosphere(1)
+    coarse = coarse_of(vertices, faces)
+    volume = (vertices[faces].det() / 6).sum()
+    config = RemeshConfig(max_spread_deg=8.0)
+    for _ in range(2):
+        surface = surface_on(coarse, lambda points: normalize(points, dim=1))
+        coarse = remesh(coarse, surface, SPACING, config)
+        assert (edge_counts(coarse.mesh.faces) == 2).all()
+        grown = (coarse.mesh.vertices_world[coarse.mesh.faces].det() / 6).sum()
+        assert volume < grown < 4 / 3 * torch.pi
+        volume = grown
+    assert len(coarse.mesh.faces) > 80
+    # Fine enough, nothing happens any more.
+    surface = surface_on(coarse, lambda points: normalize(points, dim=1))
+    coarse = remesh(coarse, surface, SPACING, config)
+    count = len(coarse.mesh.faces)
+    surface = surface_on(coarse, lambda points: normalize(points, dim=1))
+    assert len(remesh(coarse, surface, SPACING, config).mesh.faces) == count
+
+
+def test_facets_outside_the_hull_are_dropped(generator):
+    vertices, faces = icosphere(2)
+    coarse = coarse_of(vertices, faces)
+    grid = torch.linspace(-1.5, 1.5, 91).double()
+    x, y, z = torch.meshgrid(grid, grid, grid, indexing="ij")
+    # Half a ball: the plane z = -0.2 cuts it.
+    distance = torch.minimum(1.05 - (x**2 + y**2 + z**2).sqrt(), z + 0.2)
+    hull = Hull(origin_world=grid[:1].expand(3), spacing=grid[1] - grid[0], distance=distance)
+    surface = surface_on(coarse, lambda points: points, spacing=0.1)
+    inside = within(hull, surface, len(faces))
+    high, low = vertices[faces][..., 2].amax(dim=1), vertices[faces][..., 2].amin(dim=1)
+    assert inside[low > -0.2].all()
+    assert not inside[high < -0.35].any()
+    found = remesh(coarse, surface, 0.1, inside=inside)
+    assert len(found.mesh.faces) == int(inside.sum())
+    nowhere = torch.zeros_like(inside)
+    assert len(remesh(coarse, surface, 0.1, inside=nowhere).mesh.faces) == len(faces)
+
+
+def test_a_facet_without_vertices_of_its_own_is_not_outside(generator):
+    vertices, faces = icosphere(1)
+    surface = surface_on(coarse_of(vertices, faces), lambda points: points, spacing=5.0)
+    owners = torch.unique(surface.facet)
+    assert len(owners) < len(faces)  # facets share their corners, and have nothing else here
+    nowhere = Hull(
+        origin_world=vertices.new_full((3,), 5.0),
+        spacing=vertices.new_tensor(0.1),
+        distance=vertices.new_full((3, 3, 3), 1.0),
+    )
+    left = within(nowhere, surface, len(faces)).nonzero()[:, 0]
+    assert set(left.tolist()) == set(range(len(faces))) - set(owners.tolist())
+
+
+def test_only_where_the_residual_is_high_if_nothing_else_is(generator):
+    coarse = sheet(generator)
+    residual = torch.full((len(coarse.mesh.faces),), 0.01).double()
+    residual[0], residual[1] = 0.05, torch.nan
+    surface = surface_on(coarse, lambda points: points)
+    found = remesh(coarse, surface, SPACING, RemeshConfig(min_samples=4.0), residual=residual)
+    added = len(found.mesh.faces) - len(coarse.mesh.faces)
+    assert 3 <= added <= 12  # four of one, and the neighbours' cuts
+    corners = coarse.mesh.vertices_world[coarse.mesh.faces[0]]
+    size = face_normals(found.mesh.vertices_world, found.mesh.faces).norm(dim=1)
+    inside = found.mesh.vertices_world[found.mesh.faces].mean(dim=1) - corners.mean(dim=0)
+    nearest = size[inside.norm(dim=1).argmin()]
+    assert_close(nearest, torch.linalg.cross(*(corners[1:] - corners[0])).norm() / 4)
+
+
+def test_small_facets_are_never_split_and_the_limit_holds(generator):
+    coarse = sheet(generator, side=9)
+    surface = surface_on(coarse, dome)
+    alone = remesh(coarse, surface, SPACING, RemeshConfig(min_samples=500.0))
+    assert (alone.mesh.faces == coarse.mesh.faces).all()
+    free = len(remesh(coarse, surface, SPACING, RemeshConfig(min_samples=5.0)).mesh.faces)
+    limit = (len(coarse.mesh.faces) + free) // 2
+    config = RemeshConfig(min_samples=5.0, max_facets=limit)
+    held = len(remesh(coarse, surface, SPACING, config).mesh.faces)
+    assert limit - 12 <= held <= limit
+
+
+def test_facets_without_data_go_except_holes_inside(generator):
+    coarse = sheet(generator, side=9)
+    middles = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
+    hole = middles[:, :2].norm(dim=1).argsort()[:2]
+    rim = middles[:, 0] > 0.7
+
+    def confidence(lattice):
+        inner = (lattice.barycentric > 0).all(dim=1)
+        lost = torch.isin(lattice.facet, torch.cat([hole, rim.nonzero()[:, 0]])) & inner
+        return (~lost).double()
+
+    surface = surface_on(coarse, lambda points: points, confidence=confidence)
+    found = remesh(coarse, surface, SPACING)
+    assert len(found.mesh.faces) == len(coarse.mesh.faces) - int(rim.sum())
+    strict = remesh(coarse, surface, SPACING, RemeshConfig(max_hole=0.0))
+    assert len(strict.mesh.faces) == len(found.mesh.faces) - 2
+    seen = rim.clone()
+    assert len(remesh(coarse, surface, SPACING, seen=seen).mesh.faces) == len(coarse.mesh.faces)
+    dark = surface.replace(confidence=torch.zeros_like(surface.confidence))
+    assert len(remesh(coarse, dark, SPACING).mesh.faces) == len(coarse.mesh.faces)
+    assert boundary_vertices(found.mesh.faces, len(found.mesh.vertices_world)).any()
+
+
+def test_points_stay_with_their_facets_and_moved_vertices_leave_theirs(generator):
+    coarse = sheet(generator, side=9)
+    count = 300
+    facet = torch.randint(len(coarse.mesh.faces), (count,), generator=generator)
+    inside = torch.distributions.Dirichlet(torch.ones(3).double()).sample((count,))
+    corners = coarse.mesh.vertices_world[coarse.mesh.faces[facet]]
+    places = (inside[:, :, None] * corners).sum(dim=1)
+    spread = torch.rand(count, generator=generator, dtype=torch.float64)
+    is_point = torch.rand(len(coarse.mesh.vertices_world), generator=generator) < 0.5
+    known = torch.eye(3).double() * is_point[:, None, None]
+    coarse = coarse.replace(
+        is_point=is_point,
+        covariance_world=known,
+        points=FacetPoints(
+            points_world=places,
+            covariance_world=spread[:, None, None] * torch.eye(3).double(),
+            facet=facet,
+        ),
+    )
+    found = remesh(coarse, surface_on(coarse, dome), SPACING, RemeshConfig(min_samples=5.0))
+    new = found.mesh.vertices_world[found.mesh.faces[found.points.facet]][..., :2]
+    here = found.points.points_world[..., :2]
+    ahead = new.roll(-1, dims=1) - new
+    to_point = here[:, None] - new
+    side = ahead[..., 0] * to_point[..., 1] - ahead[..., 1] * to_point[..., 0]
+    assert (side > -1e-6).all()  # inside its facet, as seen from above
+    assert_close(found.points.points_world[:count], places)
+    assert_close(found.points.covariance_world[:count, 0, 0], spread)
+    # What was a vertex and a point is one of the two still.
+    moved = len(found.points.facet) - count
+    assert moved > 0
+    assert moved + int(found.is_point.sum()) == int(is_point.sum())
+    old = torch.cdist(found.points.points_world[count:], coarse.mesh.vertices_world[is_point])
+    assert (old.amin(dim=1) == 0).all()
+    assert_close(found.points.covariance_world[count:], torch.eye(3).double().expand(moved, 3, 3))
+    on = found.covariance_world.diagonal(dim1=1, dim2=2).sum(dim=1) > 0
+    assert (on == found.is_point).all()
+
+
+def test_a_spike_of_the_surface_does_not_fold_the_mesh(generator):
+    coarse = sheet(generator)
+    surface = surface_on(coarse, lambda points: points)
+    corner = (surface.barycentric > 0.999).any(dim=1).nonzero()[20, 0]
+    spiked = surface.vertices_world.clone()
+    spiked[corner, :2] += 0.7
+    found = remesh(coarse, surface.replace(vertices_world=spiked), SPACING)
+    assert (face_normals(found.mesh.vertices_world, found.mesh.faces)[:, 2] > 0).all()
+
+
+def test_a_vertex_that_ran_away_draws_no_needle(generator):
+    coarse = sheet(generator)
+    surface = surface_on(coarse, lambda points: points)
+    corner = (surface.barycentric > 0.999).any(dim=1).nonzero()[20, 0]
+    ran = surface.vertices_world.clone()
+    ran[corner, 2] += 20.0  # straight up: no facet folds
+    found = remesh(coarse, surface.replace(vertices_world=ran), SPACING)
+    assert found.mesh.vertices_world[:, 2].abs().max() < 1e-9
+
+
+def test_a_surface_of_another_mesh_is_refused(generator):
+    coarse, other = sheet(generator), sheet(generator, side=9)
+    with pytest.raises(InputError, match="facets"):
+        remesh(coarse, surface_on(other, lambda points: points), SPACING)
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ConfigError, match="max_departure"):
+        RemeshConfig(max_departure=0.0)
+
+
+@pytest.mark.slow
+def test_five_thousand_facets_and_a_million_vertices_take_seconds(generator):
+    vertices, faces = icosphere(4)
+    coarse = coarse_of(vertices, faces)
+    surface = surface_on(coarse, lambda points: normalize(points, dim=1), spacing=0.0038)
+    assert len(surface.vertices_world) > 900_000
+    config = RemeshConfig(max_departure=0.05, min_samples=5.0, max_facets=20_000)
+    began = time.process_time()
+    found = remesh(coarse, surface, 0.0038, config)
+    assert time.process_time() - began < 20  # 1.5 measured
+    assert len(found.mesh.faces) > 10_000

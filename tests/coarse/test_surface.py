@@ -1,0 +1,139 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.coarse.densify import DensifyConfig
+from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig, two_faces_an_edge
+from pimper_torch.errors import ConfigError, InputError, ReconstructionError
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.geometry.components import face_components
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.records import Mesh, Silhouettes, Support
+from pimper_torch.silhouettes.contours import Contours
+from tests.coarse.ball import SETTINGS, photographed
+
+
+def built(scene, mesh=None):
+    """CoarseSurface what the photographs show, without silhouettes."""
+    contours = Contours.none(Silhouettes.everything(scene.views), scene.cameras)
+    return CoarseSurface(*SETTINGS)(scene, contours, mesh)
+
+
+@pytest.fixture(scope="module")
+def enclosed(round_about):
+    return built(round_about)
+
+
+def test_views_all_round_give_one_closed_surface(enclosed):
+    mesh = enclosed.mesh
+    pairs, _ = face_pairs(mesh.faces)
+    assert 2 * len(pairs) == 3 * len(mesh.faces)  # every edge has two faces: no contour
+    assert int(face_components(mesh.faces).max()) == 0
+    assert 500 <= len(mesh.faces) <= 600
+    assert len(mesh.vertices_world) - len(pairs) + len(mesh.faces) == 2  # Euler: a ball
+
+
+def test_the_surface_is_where_the_ball_is_and_faces_outward(enclosed):
+    mesh = enclosed.mesh
+    middle = mesh.vertices_world[mesh.faces].mean(dim=1)
+    # A pixel is 1 / 60 of the radius; facets of a ball of 600 lie up to 0.01 inside it.
+    assert (middle.norm(dim=1) - 1).abs().mean() < 0.01
+    assert (middle.norm(dim=1) - 1).abs().max() < 0.05
+    outward = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
+    assert ((outward * normalize(middle, dim=-1)).sum(dim=-1) > 0.8).all()
+    assert (mesh.normals_world * normalize(mesh.vertices_world, dim=-1)).sum(dim=-1).min() > 0.8
+
+
+def test_facets_carry_the_cloud(enclosed, round_about):
+    points = enclosed.points
+    assert len(points.facet) > 0.9 * len(round_about.points_world)
+    corners = enclosed.mesh.vertices_world[enclosed.mesh.faces[points.facet]]
+    reach = (corners - corners.mean(dim=1, keepdim=True)).norm(dim=-1).amax(dim=1)
+    assert ((points.points_world - corners.mean(dim=1)).norm(dim=-1) < 1.2 * reach).all()
+    assert points.covariance_world.shape == (len(points.facet), 3, 3)
+    assert not enclosed.is_point.any()
+    # A facet is 6 pixels wide, and a third of them have a point within 4.
+    assert (enclosed.support == Support.POINTS).float().mean() > 0.3
+    assert (enclosed.support >= Support.LIGHT).all()
+
+
+def test_a_few_views_on_an_arc_give_the_side_that_they_see():
+    cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
+    scene = photographed(cameras)
+    mesh = built(scene).mesh
+    # Whatever is seen by nobody is gone, and black background gave nothing.
+    assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 0.1
+    assert mesh.vertices_world[:, 2].min() > -0.6
+    # Two views at least see 50 degrees up, down and to the sides.
+    wanted = normalize(
+        torch.tensor([[0.0, 0, 1], [0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.7, 0.7], [0, -0.7, 0.7]]),
+        dim=-1,
+    )
+    assert (NearestSurface(mesh).query(wanted).distance < 0.03).all()
+
+
+def test_masks_keep_the_rest_out():
+    cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=0.0)
+    scene = photographed(cameras)
+    masks = scene.views.inside.clone()
+    masks[:, 50:] = False  # the lower half of the ball in every picture
+    mesh = built(scene.replace(views=scene.views.replace(masks=masks))).mesh
+    assert mesh.vertices_world[:, 1].min() > -0.1  # y is up
+    assert mesh.vertices_world[:, 1].max() > 0.6
+
+
+def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_about):
+    vertices, faces = icosphere(3)
+    inside_out = Mesh(vertices_world=vertices, faces=faces.flip(1))
+    coarse = built(round_about, inside_out)
+    outward = face_normals(coarse.mesh.vertices_world, coarse.mesh.faces)
+    middle = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
+    assert ((outward * middle).sum(dim=-1) > 0).all()
+    assert len(coarse.mesh.faces) <= 600 < len(faces)
+    assert (middle.norm(dim=1) - 1).abs().max() < 0.03
+    assert len(coarse.points.facet) > 0.9 * len(round_about.points_world)
+
+
+def test_a_small_mesh_that_is_brought_stays_as_it_is(round_about):
+    vertices, faces = icosphere(1)
+    assert vertices.dtype == torch.float64  # as files give it
+    coarse = built(round_about, Mesh(vertices_world=vertices, faces=faces))
+    assert coarse.mesh.vertices_world.dtype == round_about.cameras.intrinsics.dtype == torch.float32
+    assert_close(coarse.mesh.vertices_world[coarse.mesh.faces], vertices.float()[faces])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda v, f: (v, f[:0]), "no faces"),
+        (lambda v, f: (v, f + len(v)), "faces reach from 42 to 83"),
+        (lambda v, f: (v / 0, f), "not finite"),
+        (lambda v, f: (v + 1e4, f), "no photograph shows"),
+    ],
+)
+def test_a_mesh_that_cannot_be_used_is_refused(round_about, change, told):
+    vertices, faces = change(*icosphere(1))
+    with pytest.raises(InputError, match=told):
+        built(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
+
+
+def test_without_points_to_trust_nothing_is_made(round_about):
+    doubtful = round_about.replace(reprojection_errors_px=round_about.reprojection_errors_px + 100)
+    with pytest.raises(ReconstructionError, match="0 of"):
+        built(doubtful)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ConfigError, match="best_sources"):
+        DensifyConfig(sources=2, best_sources=3)
+    with pytest.raises(ConfigError, match="num_facets"):
+        CoarseSurfaceConfig(num_facets=3)
+
+
+def test_of_three_faces_at_an_edge_the_smallest_goes():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.1]])
+    faces = torch.tensor([[0, 1, 2], [1, 0, 4], [1, 0, 3]])
+    assert two_faces_an_edge(vertices, faces).tolist() == [[0, 1, 2], [1, 0, 3]]

@@ -1,0 +1,284 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.evidence.metrics.closedness import closedness
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.geometry.components import boundary_loops, vertex_components
+from pimper_torch.geometry.surfaces import boundary_vertices, face_edges, vertex_normals
+from pimper_torch.meshing.extract import Extract, ExtractConfig
+from pimper_torch.meshing.faults import faults, overturned
+from pimper_torch.meshing.plates import least_bent
+from pimper_torch.meshing.repair import Repair, RepairConfig, repair, surroundings
+from pimper_torch.records import Convergence, Surface
+
+OLD = ExtractConfig(overturned="all")
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(5)
+
+
+def surface_of(vertices, faces, facet=None):
+    """A surface with support everywhere; facets are octants unless they are given."""
+    if facet is None:
+        facet = ((vertices > 0).long() * torch.tensor([1, 2, 4])).sum(dim=1)
+    return Surface(
+        vertices_world=vertices,
+        faces=faces,
+        facet=facet,
+        barycentric=torch.full_like(vertices, 1 / 3),
+        normals_world=vertex_normals(vertices, faces),
+        albedo=vertices.abs(),
+        confidence=torch.ones_like(vertices[:, 0]),
+        convergence=Convergence(
+            iterations=torch.ones(1, dtype=torch.long),
+            residual=torch.zeros(1, dtype=torch.float64),
+            cause=torch.zeros(1, dtype=torch.long),
+        ),
+    )
+
+
+def folded_sphere(subdivisions=4):
+    """A unit sphere, and the same with vertices pushed in and over others in three places."""
+    vertices, faces = icosphere(subdivisions)
+    dragged = vertices.clone()
+    step = 2.5 * float(sides(vertices, faces).median())
+    for direction in ([1.0, 0.3, 0.2], [-0.2, 1.0, 0.4], [0.1, -0.5, -1.0]):
+        middle = normalize(torch.tensor(direction).double(), dim=0)
+        near = (vertices @ middle).topk(3).indices
+        along = torch.linalg.cross(middle, middle.new_tensor([0.0, 0.6, 0.8]))
+        dragged[near] = 0.95 * vertices[near] + step * normalize(along, dim=0)
+    return vertices, surface_of(dragged, faces, surface_of(vertices, faces).facet)
+
+
+def sides(vertices, faces):
+    edges, _ = face_edges(faces)
+    return (vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1)
+
+
+def volume(mesh):
+    return trimesh.Trimesh(mesh.vertices_world.numpy(), mesh.faces.numpy(), process=False).volume
+
+
+def test_a_folded_sphere_was_slit_and_comes_out_closed():
+    sphere, surface = folded_sphere()
+    slit = closedness(Extract(OLD)(surface))
+    assert len(slit.loops) >= 3
+    mesh = Extract()(Repair()(surface))
+    found = closedness(mesh)
+    assert found.closed
+    assert found.folds == 0
+    assert found.euler == 2
+    assert torch.equal(mesh.faces, surface.faces)
+    assert not overturned(mesh.vertices_world, mesh.faces, surface.facet).any()
+    true = volume(surface.replace(vertices_world=sphere))
+    assert abs(volume(mesh) / true - 1) < 3e-5  # what the plates cut off
+    assert abs(volume(surface) / true - 1) > 3e-4
+    # A plate over three rings of the sphere is off by a thousandth; vertices were by 50.
+    assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 2e-3
+
+
+def test_only_what_is_mended_changes_and_it_says_so():
+    _, surface = folded_sphere()
+    mesh = Extract()(Repair()(surface))
+    moved = (mesh.vertices_world != surface.vertices_world).any(dim=1)
+    assert 9 <= moved.sum() < 0.1 * len(moved)
+    assert torch.equal(mesh.confidence == 0, moved)
+    assert torch.equal(mesh.albedo, surface.albedo)
+    beside = torch.zeros_like(moved)
+    beside[surface.faces[moved[surface.faces].any(dim=1)].flatten()] = True
+    assert_close(mesh.normals_world[~beside], surface.normals_world[~beside])
+    own = vertex_normals(mesh.vertices_world, mesh.faces)
+    assert_close(mesh.normals_world[beside], own[beside])
+
+
+def test_without_mending_exactly_the_overturned_faces_go():
+    _, surface = folded_sphere()
+    gone = overturned(surface.vertices_world, surface.faces, surface.facet)
+    mesh = Extract(OLD)(surface)
+    assert gone.sum() > 6
+    assert_close(
+        mesh.vertices_world[mesh.faces],
+        surface.vertices_world[surface.faces[~gone]],
+        rtol=0,
+        atol=0,
+    )
+    assert set(mesh.confidence.tolist()) == {1.0}
+
+
+def test_looking_only_round_the_folds_changes_nothing():
+    _, surface = folded_sphere(5)
+    vertices = surface.vertices_world
+    found = faults(vertices, surface.faces, surface.facet, 10.0)
+    farthest = torch.tensor(0.1 * 2 * 3**0.5).double()
+    whole, moved = repair(vertices, surface.faces, found.broken, farthest)
+    assert moved.any()
+    near = surroundings(surface.faces, found.broken(vertices), len(vertices))
+    assert near.sum() < 0.7 * len(near)
+    assert_close(Repair()(surface).vertices_world, whole)
+
+
+def test_a_genuine_opening_stays_as_it_is():
+    _, surface = folded_sphere()
+    below = (surface.vertices_world[:, 2] > -0.3) & (surface.vertices_world[:, 0] > -0.9)
+    bowl = surface.replace(faces=surface.faces[below[surface.faces].all(dim=1)])
+    mesh = Extract()(Repair()(bowl))
+    contours = [
+        {tuple(row) for row in points[boundary_loops(faces)[0]].flatten(1).tolist()}
+        for points, faces in (
+            (mesh.vertices_world, mesh.faces),
+            (bowl.vertices_world, bowl.faces),
+        )
+    ]
+    assert len(contours[0]) > 20
+    assert contours[0] == contours[1]
+    assert closedness(mesh).folds == 0
+
+
+def test_a_fold_at_the_border_goes_as_before():
+    _, surface = folded_sphere()
+    fold = faults(surface.vertices_world, surface.faces, surface.facet, torch.inf).broken(
+        surface.vertices_world
+    )
+    through = torch.zeros_like(surface.facet, dtype=torch.bool)
+    group = vertex_components(surface.faces[fold], torch.ones_like(through))
+    dragged = (surface.vertices_world.norm(dim=1) - 1).abs() > 1e-3
+    for label in torch.unique(group[dragged]).tolist():
+        through[((group == label) & dragged).nonzero()[0]] = True
+    cut = surface.replace(faces=surface.faces[~through[surface.faces].any(dim=1)])
+    folds = faults(cut.vertices_world, cut.faces, cut.facet, torch.inf)
+    gone = folds.worst(cut.vertices_world)
+    assert gone.sum() > 6
+    mesh = Extract()(Repair()(cut))
+    assert (mesh.confidence == 1).all()
+    assert_close(mesh.vertices_world[mesh.faces], cut.vertices_world[cut.faces[~gone]])
+
+
+def test_a_fold_that_extends_too_far_is_left():
+    _, surface = folded_sphere()
+    left = Repair(RepairConfig(max_extent=0.01))(surface)
+    assert torch.equal(left.vertices_world, surface.vertices_world)
+    assert torch.equal(left.confidence, surface.confidence)
+    assert Repair(RepairConfig(max_extent=0.0))(surface) is surface
+
+
+@pytest.mark.parametrize(("name", "value"), [("max_extent", -0.1), ("max_stretch", 1.0)])
+def test_settings_that_mean_nothing_are_refused(name, value):
+    with pytest.raises(ConfigError, match=name):
+        RepairConfig(**{name: value})
+
+
+def test_a_spike_is_drawn_in():
+    vertices, faces = icosphere(4)
+    spiked = vertices.clone()
+    spiked[100] *= 3
+    mesh = Extract()(Repair()(surface_of(spiked, faces)))
+    assert closedness(mesh).closed
+    assert_close(mesh.vertices_world[100].norm(), torch.ones(()).double(), rtol=0, atol=0.01)
+    assert not closedness(Extract(OLD)(surface_of(spiked, faces))).closed
+
+
+def test_a_facet_that_bends_far_has_no_fold():
+    """A whole sphere that is one facet: half of it looks away from any mean."""
+    vertices, faces = icosphere(3)
+    bulge = vertices.clone()
+    bulge[:, 2] = torch.where(bulge[:, 2] > 0, 4 * bulge[:, 2], bulge[:, 2])
+    surface = surface_of(bulge, faces, torch.zeros(len(bulge), dtype=torch.long))
+    surface = surface.replace(faces=faces[(bulge[faces][..., 2] > -0.8).all(dim=1)])
+    assert overturned(surface.vertices_world, surface.faces, surface.facet).any()
+    mesh = Extract()(Repair()(surface))
+    assert len(mesh.faces) == len(surface.faces)
+    assert (mesh.confidence == 1).all()
+
+
+def test_gradients_reach_what_is_held_and_none_what_is_mended():
+    _, surface = folded_sphere(3)
+    leaf = surface.vertices_world.clone().requires_grad_()
+    mesh = Extract()(Repair()(surface.replace(vertices_world=leaf)))
+    moved = (mesh.vertices_world != surface.vertices_world).any(dim=1)
+    (pulled,) = torch.autograd.grad(mesh.vertices_world[moved].sum(), leaf)
+    assert (pulled[moved] == 0).all()
+    # A shift of all that is held shifts what is repaired.
+    assert_close(pulled.sum(dim=0), moved.sum().double().expand(3))
+    clone = surface.vertices_world[:42].clone().requires_grad_()
+    _, coarse = icosphere(1)
+    free = torch.zeros(42, dtype=torch.bool)
+    free[[0, 5]] = True
+    assert torch.autograd.gradcheck(lambda places: least_bent(places, coarse, free), clone)
+
+
+def test_the_least_bent_places_are_those_of_a_dense_solve(generator):
+    vertices, faces = icosphere(2)
+    vertices = vertices + 0.1 * torch.randn(vertices.shape, generator=generator).double()
+    free = torch.rand(len(vertices), generator=generator) < 0.3
+    edges, _ = face_edges(faces)
+    near = torch.zeros(len(vertices), len(vertices)).double()
+    near[edges[:, 0], edges[:, 1]] = near[edges[:, 1], edges[:, 0]] = 1
+    bending = torch.eye(len(vertices)).double() - near / near.sum(dim=1, keepdim=True)
+    bending[~free & ~(near[:, free] > 0).any(dim=1)] = 0
+    target = -bending[:, ~free] @ vertices[~free]
+    best = np.linalg.lstsq(bending[:, free].numpy(), target.numpy(), rcond=None)[0]
+    placed = least_bent(vertices, faces, free)
+    assert_close(placed[free], torch.from_numpy(best))
+    assert torch.equal(placed[~free], vertices[~free])
+
+
+def test_a_regular_lattice_in_a_plane_is_found_again(generator):
+    row, column = torch.meshgrid(torch.arange(9), torch.arange(9), indexing="ij")
+    here = (row[:-1, :-1] * 9 + column[:-1, :-1]).flatten()
+    faces = torch.cat(
+        [
+            torch.stack([here, here + 9, here + 10], dim=1),
+            torch.stack([here, here + 10, here + 1], dim=1),
+        ]
+    )
+    plane = torch.randn(3, 3, generator=generator).double()
+    flat = column.reshape(-1, 1) * plane[0] + row.reshape(-1, 1) * plane[1] + plane[2]
+    free = ((row - 4).abs().maximum((column - 4).abs()) <= 1).flatten()
+    stirred = flat + free[:, None] * torch.randn(flat.shape, generator=generator).double()
+    assert_close(least_bent(stirred, faces, free), flat)
+
+
+def test_what_no_placing_heals_is_left_where_it_was():
+    vertices, faces = icosphere(3)
+
+    def never(places):
+        return torch.arange(len(faces)) == 7
+
+    places, moved = repair(vertices, faces, never, torch.tensor(10.0).double())
+    assert torch.equal(places, vertices)
+    assert not moved.any()
+
+
+def test_a_piece_that_is_broken_all_over_is_left_where_it_was():
+    vertices, faces = icosphere(1)
+    both = torch.cat([vertices, vertices + 5])
+    faces = torch.cat([faces, faces + len(vertices)])
+
+    def one_piece(places):
+        return (torch.arange(len(faces)) < len(faces) // 2) & (places[0, 0] == both[0, 0])
+
+    places, moved = repair(both, faces, one_piece, torch.tensor(10.0).double())
+    assert torch.equal(places, both)
+    assert not moved.any()
+
+
+def test_the_border_is_never_moved():
+    _, surface = folded_sphere(3)
+    upper = surface.faces[(surface.vertices_world[surface.faces][..., 2] > -0.2).all(dim=1)]
+    contour = boundary_vertices(upper, len(surface.vertices_world))
+
+    def growing(places):  # content only when much has moved
+        marked = torch.zeros(len(upper), dtype=torch.bool)
+        marked[upper.eq(int(upper[0, 0])).any(dim=1).nonzero()[0]] = True
+        return marked & ((places != surface.vertices_world).any(dim=1).sum() < 60)
+
+    places, moved = repair(surface.vertices_world, upper, growing, torch.tensor(10.0).double())
+    assert moved.sum() >= 60
+    assert torch.equal(places[contour], surface.vertices_world[contour])

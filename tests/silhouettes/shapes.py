@@ -1,0 +1,82 @@
+"""Shapes given by their distance functions, and their silhouettes."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.records import Cameras, Silhouettes
+
+WIDTH, HEIGHT, FOCAL, DISTANCE = 120, 100, 180.0, 5.0
+PIXEL = DISTANCE / FOCAL  # at the origin
+
+
+def all_round() -> Cameras:
+    """Twenty views of the origin, from everywhere."""
+    index = torch.arange(20, dtype=torch.float64) + 0.5
+    z, angle = 1 - index / 10, torch.pi * (1 + 5**0.5) * index
+    flat = (1 - z**2).sqrt()
+    eyes = DISTANCE * torch.stack([flat * angle.cos(), flat * angle.sin(), z], dim=1)
+    up = torch.tensor([0.1, 0.2, 1.0]).double()
+    return pinholes(look_at(eyes, torch.zeros(3).double(), up), FOCAL, WIDTH, HEIGHT)
+
+
+def silhouettes_of(
+    distance: Callable[[Tensor], Tensor], cameras: Cameras, reach: float = 1.5
+) -> Silhouettes:
+    """Draw the silhouettes of a shape that is given by its distance function, about the origin."""
+    masks = []
+    for view in range(cameras.num_views):
+        pixels = pixel_centers(WIDTH, HEIGHT, like=cameras.intrinsics).reshape(-1, 2)
+        rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
+        masks.append(nearest_to(distance, cameras.centers_world[view], rays, reach)[0] < 0)
+    return Silhouettes(
+        inside=torch.stack(masks).reshape(-1, HEIGHT, WIDTH).double(),
+        trusted=torch.ones(len(masks), dtype=torch.bool),
+        source="masks",
+    )
+
+
+def nearest_to(
+    distance: Callable[[Tensor], Tensor], centers: Tensor, rays: Tensor, reach: float = 1.5
+) -> tuple[Tensor, Tensor]:
+    """Give the smallest distance along rays within a ball about the origin, and where it is."""
+    rays = normalize(rays, dim=-1)
+    middle = -(centers * rays).sum(dim=-1)
+    best, place = None, None
+    for step in torch.linspace(-reach, reach, 121).to(rays):
+        points = centers + (middle + step)[:, None] * rays
+        found = distance(points)
+        if best is None or place is None:
+            best, place = found, points
+        else:
+            nearer = found < best
+            best, place = (
+                torch.where(nearer, found, best),
+                torch.where(nearer[:, None], points, place),
+            )
+    assert best is not None
+    assert place is not None
+    return best, place
+
+
+def ball(points: Tensor) -> Tensor:
+    return points.norm(dim=-1) - 1
+
+
+def ring(points: Tensor) -> Tensor:
+    """A torus about the z axis, of radii 0.9 and 0.35."""
+    flat = points[..., :2].norm(dim=-1) - 0.9
+    return torch.stack([flat, points[..., 2]], dim=-1).norm(dim=-1) - 0.35
+
+
+CENTERS = torch.tensor([[-0.6, 0.0, 0.0], [0.6, 0.2, 0.1]], dtype=torch.float64)
+
+
+def two_balls(points: Tensor) -> Tensor:
+    """Balls of radius 0.5 that do not touch; from some places one hides part of the other."""
+    return (points[..., None, :] - CENTERS).norm(dim=-1).amin(dim=-1) - 0.5

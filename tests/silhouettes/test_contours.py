@@ -1,0 +1,57 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.silhouettes.contours import TraceContours, box_round
+from tests.silhouettes.shapes import PIXEL, ball, silhouettes_of, two_balls
+
+
+@pytest.mark.parametrize("shape", [ball, two_balls])
+def test_a_box_holds_what_the_silhouettes_show_and_not_much_more(cameras, shape):
+    low, high = box_round(silhouettes_of(shape, cameras), cameras)
+    assert (low < -1.1).all()
+    assert (high > 1.1).all()
+    assert (high - low).max() < 2 * 2.4
+
+
+def test_contours_of_a_ball_touch_it(cameras):
+    contours = TraceContours()(silhouettes_of(ball, cameras), cameras)
+    assert contours is not None
+    generator = torch.Generator().manual_seed(7)
+    points = normalize(torch.randn(4000, 3, generator=generator, dtype=torch.float64), dim=1)
+    found = contours.touching(points, points)
+    assert len(found.points_world) > 0.9 * len(contours.rays.view)
+    assert (found.points_world.norm(dim=1) - 1).abs().median() < 0.5 * PIXEL
+    # Deep in the middle, and out of it beside the ball.
+    depth = contours.hull.depth_of(torch.tensor([[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]]))
+    assert depth[0] > 0.9
+    assert depth[1] < -0.1
+
+
+def test_one_wrong_silhouette_in_twenty_cuts_nothing_off_where_they_were_found(cameras):
+    silhouettes = silhouettes_of(ball, cameras)
+    wrong = silhouettes.inside.clone()
+    wrong[3, :, 60:] = 0  # half of the ball lies in shadow there
+    eye = -(cameras.cam_from_world[3, :3, :3].mT @ cameras.cam_from_world[3, :3, 3])
+    lost = 0.9 * normalize(cameras.cam_from_world[3, 0, :3], dim=0)  # to that picture's right
+    assert (lost @ eye).abs() < 1e-6
+    for source, kept in (("found", True), ("masks", False)):
+        contours = TraceContours()(silhouettes.replace(inside=wrong, source=source), cameras)
+        assert bool(contours.hull.holds(lost)) == kept
+
+
+def test_silhouettes_that_leave_nothing_out_constrain_nothing(cameras):
+    silhouettes = silhouettes_of(ball, cameras).replace(source="everything")
+    contours = TraceContours()(silhouettes, cameras)
+    assert not contours.confine
+    far = torch.tensor([[1e6, 0.0, 0.0]], dtype=torch.float64)
+    assert contours.hull.holds(far).all()
+    assert len(contours.touching(far, far).points_world) == 0
+
+
+def test_silhouettes_without_a_common_place_are_told_of(cameras):
+    silhouettes = silhouettes_of(ball, cameras)
+    nothing = silhouettes.replace(inside=torch.zeros_like(silhouettes.inside))
+    with pytest.warns(PimperWarning, match="no place in common"):
+        assert not TraceContours()(nothing, cameras).confine

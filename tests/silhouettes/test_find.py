@@ -1,0 +1,178 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Silhouettes
+from pimper_torch.silhouettes import find
+from pimper_torch.silhouettes.cuts import Cuts
+from pimper_torch.silhouettes.find import (
+    FindSilhouettes,
+    SilhouetteConfig,
+    SilhouetteDetails,
+    masked,
+)
+from pimper_torch.silhouettes.ground import Plane, gaze, supporting_plane
+from pimper_torch.silhouettes.parallax import plane_agreement
+from pimper_torch.silhouettes.pictures import working_pictures
+
+SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
+
+
+def overlap(found, truth):
+    return (found & truth).sum(dim=(1, 2)) / (found | truth).sum(dim=(1, 2))
+
+
+def test_a_ball_on_a_table_is_found_in_every_view(staged):
+    silhouettes = FindSilhouettes(*SMALL)(staged.scene)
+    assert silhouettes is not None
+    assert silhouettes.source == "found"
+    assert silhouettes.trusted.all()
+    # A pixel more all round the ball of 50 pixels is 0.96; the table or its shadow is far less.
+    assert overlap(silhouettes.masks, staged.truth).min() > 0.95
+
+
+def test_an_object_without_a_point_is_found_by_parallax(staged):
+    scene = staged.scene
+    on_ball = scene.points_world[:, 2] > 0.01
+    kept = ~on_ball[scene.observation_point]
+    bare = scene.replace(
+        observation_point=scene.observation_point[kept],
+        observation_view=scene.observation_view[kept],
+        observation_pixels=scene.observation_pixels[kept],
+    )
+    silhouettes = FindSilhouettes(*SMALL)(bare)
+    assert silhouettes is not None
+    assert overlap(silhouettes.masks, staged.truth).median() > 0.9
+
+
+def test_used_masks_are_a_little_wider_than_silhouettes(staged):
+    silhouettes = FindSilhouettes(*SMALL)(staged.scene)
+    assert silhouettes is not None
+    used = masked(staged.scene, silhouettes).views.masks
+    assert used is not None
+    assert (used | ~silhouettes.masks).all()
+    assert used.sum() > silhouettes.masks.sum()
+    assert masked(staged.scene, Silhouettes.everything(staged.scene.views)) is staged.scene
+
+
+def test_masks_that_are_given_are_believed(staged):
+    drawn = torch.zeros_like(staged.truth)
+    drawn[:, 20:60, 30:90] = True  # nothing like the ball
+    scene = staged.scene.replace(views=staged.scene.views.replace(masks=drawn))
+    silhouettes = FindSilhouettes()(scene)
+    assert silhouettes is not None
+    assert silhouettes.source == "masks"
+    assert silhouettes.trusted.all()
+    assert torch.equal(silhouettes.masks, drawn)
+    assert masked(scene, silhouettes) is scene
+    assert FindSilhouettes(SilhouetteConfig(object="everything"))(scene).source == "everything"
+
+
+def test_masks_are_asked_for_and_missing(staged):
+    with pytest.raises(InputError, match="come without any"):
+        FindSilhouettes(SilhouetteConfig(object="masks"))(staged.scene)
+
+
+def test_silhouettes_that_contradict_one_another_are_not_trusted(staged):
+    """Photographs under other cameras than theirs have no hull in common."""
+    views = staged.scene.views
+    shifted = [image.roll(90 * (view % 2) - 45, 2) for view, image in enumerate(views.images)]
+    scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))
+    with pytest.warns(PimperWarning, match=r"is taken for the object.*`silhouettes.region`"):
+        assert FindSilhouettes(*SMALL)(scene).source == "everything"
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(staged, monkeypatch, share):
+    """Cuts that meet the hull's projections by chance, or not at all, are no silhouettes."""
+    projections = torch.full(staged.truth.shape, -5.0)
+    projections[:, 60:120, 60:180] = 5.0
+    masks = torch.zeros_like(staged.truth)
+    masks[:, 60:120, 180 - int(share * 120) : 240] = True
+    nonsense = Cuts(masks=masks, margins_px=projections, on_plane=True)
+    monkeypatch.setattr(find, "cut_in_rounds", lambda *_, **__: nonsense)
+    overlap_percent = 100 * (share * 120 * 60) / ((240 - 60) * 60)
+    with pytest.warns(PimperWarning, match=f"by {overlap_percent:.0f}% in the median"):
+        assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
+
+
+def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
+    """Half of the views and more have to."""
+    projections = torch.full(staged.truth.shape, -5.0)
+    projections[:, 60:120, 60:180] = 5.0
+    masks = projections > 0
+    masks[:7, 60:120, 60:205] = True  # overlap 0.83, of which 0.83 is inside
+    cuts = Cuts(masks=masks, margins_px=projections, on_plane=False)
+    monkeypatch.setattr(find, "cut_in_rounds", lambda *_, **__: cuts)
+    with pytest.warns(PimperWarning, match="only 5 of 12 silhouettes agree"):
+        assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
+
+
+def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
+    """A place of the table that is hidden in eight of twelve views is known from the other four."""
+    views, cameras = staged.scene.views, staged.scene.cameras
+    place, _ = project(
+        torch.tensor([[0.0, -0.75, 0.0]]), cameras.cam_from_world, cameras.intrinsics
+    )
+    away = (pixel_centers(240, 180, like=views.images) - place[:, None]).norm(dim=-1)
+    hidden = away < 16
+    hidden[8:] = False
+    other = torch.rand(views.images.shape, generator=generator)
+    images = torch.where(hidden[:, None], other, views.images)
+    pictures = working_pictures(views.replace(images=images), cameras, 240)
+    plane = Plane(normal_world=torch.tensor([0.0, 0, 1]), offset=torch.tensor(0.0))
+    looked_at = gaze(pictures.cameras)
+    before = plane_agreement(pictures, plane, looked_at)
+    after = plane_agreement(pictures, plane, looked_at, hidden)
+    middle = (away < 8) & after.isfinite()  # not where the table is flat
+    seen, covered = middle & (torch.arange(12) >= 8)[:, None, None], middle & hidden
+    assert seen.sum() > 400
+    assert (before[seen] > 0.75).float().mean() < 0.4  # what hides it counts for it
+    assert (after[seen] > 0.75).float().mean() > 0.9
+    assert (after[covered] < 0.5).float().mean() > 0.8  # what hides it stands out
+
+
+def test_the_region_keeps_what_is_outside_from_being_the_object(staged):
+    left = SilhouetteConfig(size_px=240, region=(-0.6, -0.6, 0.0, 0.0, 0.6, 1.1)), SMALL[1]
+    silhouettes = FindSilhouettes(*left)(staged.scene)
+    assert silhouettes is not None
+    assert 0 < silhouettes.masks.sum() < 0.8 * staged.truth.sum()  # half a ball, as the box cuts it
+
+
+def test_a_region_is_two_corners():
+    for wrong in ((1.0, 2.0), (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)):
+        with pytest.raises(ConfigError, match="region"):
+            SilhouetteConfig(region=wrong)
+
+
+def test_the_table_is_the_supporting_plane(staged, generator):
+    scene = staged.scene
+    plane = supporting_plane(
+        scene.points_world, scene.cameras, tolerance=0.01, least_on=0.1, most_below=0.05,
+        generator=generator,
+    )  # fmt: skip
+    assert plane is not None
+    assert_close(plane.normal_world, torch.tensor([0.0, 0, 1]), atol=1e-3, rtol=0)
+    assert_close(
+        plane.height_of(torch.tensor([3.0, 1.0, 0.7])), torch.tensor(0.7), atol=0.01, rtol=0
+    )
+
+
+def test_points_without_a_plane_have_none(generator):
+    from pimper_torch.evidence.scenes.cameras import arc_cameras
+
+    cameras = arc_cameras(5, width=80, height=60, focal_px=90.0, distance=4.0).to(torch.float32)
+    points = torch.randn(500, 3, generator=generator)
+    found = supporting_plane(
+        points, cameras, tolerance=0.01, least_on=0.1, most_below=0.05, generator=generator
+    )
+    assert found is None
+
+
+def test_cameras_look_where_they_are_aimed(staged):
+    found = gaze(staged.scene.cameras)
+    assert_close(found.fixation_world, torch.tensor([0.0, 0.0, 0.4]), atol=0.01, rtol=0)
+    assert_close(found.distance, torch.tensor(3.0), atol=0.01, rtol=0)

@@ -1,0 +1,136 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.records import Cameras, Silhouettes
+from pimper_torch.silhouettes.hull import projection, visual_hull
+
+BOX = torch.tensor([[-2.0, -2, -2], [2, 2, 2]])
+
+
+def all_round(num_views: int = 24, width: int = 160, height: int = 120) -> Cameras:
+    """Look at the origin from 5 units away, from everywhere (Fibonacci's sphere)."""
+    index = torch.arange(num_views) + 0.5
+    z = 1 - 2 * index / num_views
+    angle = torch.pi * (1 + 5**0.5) * index
+    flat = (1 - z**2).sqrt()
+    eyes = 5 * torch.stack([flat * angle.cos(), flat * angle.sin(), z], dim=1)
+    up = torch.tensor([0.1, 0.2, 1.0])
+    return pinholes(look_at(eyes, torch.zeros(3), up), 200.0, width, height)
+
+
+def ball_silhouettes(cameras: Cameras, radius: float = 1.0) -> Silhouettes:
+    """Draw the silhouettes of a ball about the origin: the rays that pass it within its radius."""
+    from pimper_torch.geometry.pixels import pixel_centers
+    from pimper_torch.geometry.projection import rays_through
+
+    width, height = cameras.sizes_px[0].tolist()
+    pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
+    rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)
+    rays = rays / rays.norm(dim=-1, keepdim=True)
+    eyes = cameras.centers_world[:, None]
+    passing = torch.linalg.cross(rays, eyes.expand_as(rays)).norm(dim=-1)
+    inside = (passing < radius).float().reshape(-1, height, width)
+    return Silhouettes(
+        inside=inside, trusted=torch.ones(len(inside), dtype=torch.bool), source="masks"
+    )
+
+
+@pytest.fixture(scope="module")
+def cameras() -> Cameras:
+    return all_round()
+
+
+@pytest.fixture(scope="module")
+def ball(cameras):
+    hull = visual_hull(ball_silhouettes(cameras), cameras, BOX, num_voxels=64**3, disagreeing=0.0)
+    assert hull is not None
+    return hull
+
+
+def test_the_hull_of_a_ball_contains_it_and_little_more(ball):
+    steps = ball.occupied.nonzero()
+    radius = (ball.origin_world + ball.spacing * steps).norm(dim=1)
+    # The tangent cones of 24 views leave corners: at most 1 / cos of half the angle between
+    # neighbouring views (some 41 degrees) off the ball.
+    assert radius.max() < 1 / torch.deg2rad(torch.tensor(22.0)).cos() + ball.spacing
+    volume = float(ball.occupied.sum() * ball.spacing**3)
+    assert 4.189 * 0.99 < volume < 4.189 * 1.06  # 4/3 pi; a cube of corners would have 1.9 times
+
+
+def test_depth_is_the_distance_to_the_border_along_every_radius(ball, generator):
+    direction = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=1)
+    shells = torch.tensor([0.5, 0.9, 0.97])[:, None, None]
+    depth = ball.depth_of(shells * direction)
+    # A quarter of a pixel is 0.6 % of the radius; the hull itself is larger than the ball.
+    assert_close(depth.amin(dim=1), 1 - shells[:, 0, 0], atol=0.02, rtol=0)
+    assert (depth > 0).all()
+    assert (ball.depth_of(1.15 * direction) < 0).all()
+
+
+def test_off_the_grid_depth_falls_with_distance(ball):
+    points = torch.tensor([[3.0, 0, 0], [4.0, 0, 0]])
+    near, far = ball.depth_of(points)
+    assert_close(near - far, torch.tensor(1.0))
+    assert near < -1
+
+
+def test_projections_are_the_silhouettes_that_the_hull_was_built_from(ball, cameras):
+    drawn = ball_silhouettes(cameras).masks
+    for view in (0, 7, 15):
+        found = projection(ball, cameras.intrinsics[view], cameras.cam_from_world[view], (160, 120))
+        union = (found | drawn[view]).sum()
+        assert (found & drawn[view]).sum() / union > 0.985  # half a pixel all round is 2.5 %
+
+
+def test_a_view_that_is_wrong_is_outvoted_or_left_out(cameras):
+    silhouettes = ball_silhouettes(cameras)
+    wrong = silhouettes.inside.clone()
+    wrong[3] = 0
+    believed = visual_hull(
+        silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=32**3, disagreeing=0.0
+    )
+    assert believed is None
+    voted = visual_hull(
+        silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=32**3, disagreeing=0.05
+    )
+    trusted = silhouettes.trusted.clone()
+    trusted[3] = False
+    untrusted = silhouettes.replace(inside=wrong, trusted=trusted)
+    left_out = visual_hull(untrusted, cameras, BOX, num_voxels=32**3, disagreeing=0.0)
+    assert left_out is not None
+    assert voted is not None
+    volume = float(left_out.occupied.sum() * left_out.spacing**3)
+    assert 4.1 < volume < 4.6
+    assert voted.occupied.sum() * voted.spacing**3 >= 0.99 * volume  # one vote less holds it
+
+
+def test_views_abstain_outside_their_photographs(cameras):
+    """Photographs that show half of the ball do not cut the other half off."""
+    silhouettes = ball_silhouettes(cameras)
+    left = torch.tensor([[80, 120]]).repeat(12, 1)
+    sizes = torch.cat([left, cameras.sizes_px[12:]])
+    inside = silhouettes.inside.clone()
+    inside[:12, :, 80:] = 0  # the padding
+    cut = cameras.replace(sizes_px=sizes)
+    hull = visual_hull(
+        silhouettes.replace(inside=inside),
+        cut,
+        BOX,
+        num_voxels=48**3,
+        disagreeing=0.0,
+        least_seen=0.4,
+    )
+    assert hull is not None
+    assert 4.1 < float(hull.occupied.sum() * hull.spacing**3) < 4.8
+
+
+def test_what_too_few_views_look_at_is_outside(cameras):
+    near = visual_hull(ball_silhouettes(cameras), cameras, BOX + 4.0, num_voxels=32**3)
+    assert near is None  # the box stands beside the ball
+    everything = ball_silhouettes(cameras, radius=100.0)
+    hull = visual_hull(everything, cameras, 4 * BOX, num_voxels=32**3, least_seen=0.9)
+    assert hull is not None
+    radius = (hull.origin_world + hull.spacing * hull.occupied.nonzero()).norm(dim=1)
+    assert radius.max() < 2.5  # beyond the pictures' width at the origin, 2, few views look

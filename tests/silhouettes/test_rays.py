@@ -1,0 +1,99 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.evidence.metrics.relative import angles_deg
+from pimper_torch.silhouettes.rays import RayConfig, contour_rays
+from tests.silhouettes.shapes import PIXEL, ball, nearest_to, ring, silhouettes_of
+
+
+@pytest.fixture(scope="module")
+def of_ball(cameras):
+    return contour_rays(silhouettes_of(ball, cameras), cameras)
+
+
+def test_rays_of_a_ball_are_its_tangents_and_normals_its_own(of_ball, cameras):
+    centers = cameras.centers_world[of_ball.view]
+    along = normalize(of_ball.rays_world, dim=1)
+    touching = centers - (centers * along).sum(dim=1, keepdim=True) * along
+    off_px = (touching.norm(dim=1) - 1) / PIXEL
+    # Masks know their border to a pixel; smoothed, an eighth of that is left.
+    assert off_px.abs().mean() < 0.15
+    assert off_px.mean().abs() < 0.08
+    angles = angles_deg(of_ball.normals_world, normalize(touching, dim=1))
+    assert angles.mean() < 1.5
+    assert angles.max() < 4
+
+
+def test_normals_lie_across_their_rays(of_ball):
+    assert_close(
+        (of_ball.normals_world * of_ball.rays_world).sum(dim=1),
+        torch.zeros(len(of_ball.view), dtype=torch.float64),
+    )
+    assert_close(of_ball.normals_world.norm(dim=1), torch.ones_like(of_ball.sigma_px))
+
+
+def test_the_inner_silhouette_of_a_ring_faces_into_its_hole(cameras):
+    above = torch.tensor([cameras.centers_world[:, 2].argmax()])
+    silhouettes = silhouettes_of(ring, cameras)
+    only = torch.zeros_like(silhouettes.trusted)
+    only[above] = True
+    rays = contour_rays(silhouettes.replace(trusted=only), cameras)
+    assert bool((rays.view == above).all())
+    centers = cameras.centers_world[rays.view]
+    _, touching = nearest_to(ring, centers, rays.rays_world)
+    inner = touching[:, :2].norm(dim=1) < 0.8
+    assert 0.2 * len(inner) < inner.sum() < 0.8 * len(inner)
+    inward = (rays.normals_world[:, :2] * touching[:, :2]).sum(dim=1) < 0
+    assert bool((inward == inner).all())
+
+
+def test_a_soft_silhouette_is_as_uncertain_as_it_says(cameras):
+    hard = silhouettes_of(ball, cameras)
+    u = torch.arange(120, dtype=torch.float64)
+    places = torch.distributions.Normal(60.0, 2.5).cdf(u).expand(20, 100, 120)
+    rays = contour_rays(hard.replace(inside=places), cameras)
+    assert_close(rays.pixels[:, 0], torch.full_like(rays.sigma_px, 60.5), atol=0.05, rtol=0)
+    # 2.5 px, and what a pixel hides
+    assert_close(rays.sigma_px, torch.full_like(rays.sigma_px, 2.52), atol=0.1, rtol=0)
+    assert contour_rays(hard, cameras).sigma_px.median() < 0.4
+
+
+def test_borders_specks_corners_and_untrusted_views_have_no_rays(cameras):
+    blank = silhouettes_of(ball, cameras)
+    inside = torch.zeros_like(blank.inside)
+    inside[:, :50, 40:80] = 1  # runs out of the picture at the top
+    inside[:, 70:73, 100:103] = 1  # a speck
+    rays = contour_rays(blank.replace(inside=inside, trusted=blank.trusted & False), cameras)
+    assert len(rays.view) == 0
+    trusted = blank.trusted.clone()
+    trusted[1:] = False
+    rays = contour_rays(blank.replace(inside=inside, trusted=trusted), cameras)
+    u, v = rays.pixels.unbind(dim=1)
+    assert bool((v >= 3).all())
+    assert float(u.max()) < 90
+    for corner in (40.0, 80.0):  # turns by 90 degrees: just allowed, its tangents are between
+        assert ((u - corner).abs() < 1).sum() > 30
+    concave = torch.zeros_like(inside)
+    concave[:, 20:80, 30:90] = 1
+    concave[:, 20:50, 30:60] = 0
+    rays = contour_rays(blank.replace(inside=concave, trusted=trusted), cameras)
+    from_corner = (rays.pixels - torch.tensor([60.0, 50.0]).double()).norm(dim=1)
+    assert from_corner.min() > 3
+    assert from_corner.min() < 8
+
+
+def test_the_number_of_rays_is_what_is_asked_for(cameras):
+    silhouettes = silhouettes_of(ball, cameras)
+    rays = contour_rays(silhouettes, cameras, RayConfig(per_view=50))
+    count = torch.bincount(rays.view)
+    assert bool(((count >= 45) & (count <= 51)).all())
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ConfigError, match="per_view"):
+        RayConfig(per_view=0)
+    with pytest.raises(ConfigError, match="max_concave_deg"):
+        RayConfig(max_concave_deg=200.0)
