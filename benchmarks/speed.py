@@ -302,17 +302,17 @@ def watch_cycles(meter: Meter) -> None:
     try:
         from pimper_torch.linalg.hierarchy import Hierarchy
 
-        precondition: Callable[..., Any] = Hierarchy.precondition
+        cycle: Callable[..., Any] = Hierarchy.cycle
     except (ImportError, AttributeError):
         return
 
     def timed(self: Hierarchy, residual: torch.Tensor) -> torch.Tensor:
         began = time.perf_counter()
-        found = precondition(self, residual)
+        found = cycle(self, residual)
         meter.cycles.setdefault(len(residual), []).append(time.perf_counter() - began)
         return found
 
-    Hierarchy.precondition = timed
+    Hierarchy.cycle = timed
 
 
 def copy_bytes_per_s(size: int = 2**26) -> float:

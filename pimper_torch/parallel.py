@@ -58,23 +58,28 @@ def side_by_side(
 _WORTHWHILE_ROWS = 20_000
 
 
-def over_rows(kernel: Callable[..., object], rows: int, *arguments: object) -> None:
+def over_rows(
+    kernel: Callable[..., Result], rows: int, *arguments: object, size: int = 1
+) -> list[Result]:
     """Call ``kernel(*arguments, first, last)`` on ranges that make up all rows, side by side.
 
     Args:
-        kernel: Compiled, so that it holds no lock; what it writes for a row depends on no other.
+        kernel: Compiled, so that it holds no lock; what it does for a row depends on no other.
         rows: How many there are.
         arguments: Of the kernel.
+        size: How many rows of usual work one of them is.
+
+    Returns:
+        What the calls returned, in the order of the rows.
     """
-    workers = num_workers() if rows >= _WORTHWHILE_ROWS else 1
+    workers = num_workers() if rows * size >= _WORTHWHILE_ROWS else 1
     bounds = [rows * part // workers for part in range(workers + 1)]
     others = [
         _idle(workers - 1).submit(kernel, *arguments, first, last)
         for first, last in pairwise(bounds[1:])
     ]
-    kernel(*arguments, bounds[0], bounds[1])
-    for other in others:
-        other.result()
+    own = kernel(*arguments, bounds[0], bounds[1])
+    return [own, *(other.result() for other in others)]
 
 
 @cache

@@ -5,7 +5,7 @@ from contextvars import ContextVar
 import pytest
 import torch
 
-from pimper_torch.parallel import num_workers, side_by_side
+from pimper_torch.parallel import num_workers, over_rows, side_by_side
 from pimper_torch.progress import listening, track
 
 COLOUR: ContextVar[str] = ContextVar("colour", default="none")
@@ -87,3 +87,12 @@ def test_progress_counts_items_and_not_what_they_walk_through(two_threads):
         list(side_by_side(lambda _: list(track(range(7))), range(3)))
         list(side_by_side(lambda _: None, range(3), tracked=False))
     assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize(("rows", "size", "parts"), [(40_000, 1, 2), (100, 1, 1), (100, 400, 2)])
+def test_ranges_make_up_all_rows_and_answer_in_their_order(two_threads, rows, size, parts):
+    found = over_rows(lambda given, first, last: (given, first, last), rows, "it", size=size)
+    assert [each[0] for each in found] == ["it"] * parts
+    assert [each[1:] for each in found] == [
+        (part * rows // parts, (part + 1) * rows // parts) for part in range(parts)
+    ]

@@ -1,7 +1,7 @@
 """Products with sparse matrices in compressed rows, fused with what multigrid does with them.
 
 Vectors have one column a right-hand side, so that a matrix is read once for all of them. Every
-function works on the rows from ``first`` up to ``last`` alone.
+function works on the rows from ``first`` up to ``last`` alone. Sums are float64 in either type.
 """
 
 import numpy as np
@@ -10,11 +10,20 @@ from pimper_torch.kernels.switch import compiled
 
 Array = np.ndarray
 
-_MATRIX = "int32[::1], int32[::1], float64[::1]"
-_VECTORS = "float64[:,::1]"
+_REALS = ("float32", "float64")
 
 
-@compiled(f"void({_MATRIX}, {_VECTORS}, {_VECTORS}, {_VECTORS}, float64, float64, int64, int64)")
+def _types(pattern: str) -> list[str]:
+    """Spell out a signature of matrices M, vectors V and diagonals D in both types."""
+    return [
+        pattern.replace("M", "int32[::1], int32[::1], D")
+        .replace("V", f"{real}[:,::1]")
+        .replace("D", f"{real}[::1]")
+        for real in _REALS
+    ]
+
+
+@compiled(*_types("void(M, V, V, V, float64, float64, int64, int64)"))
 def product(
     starts: Array,
     columns: Array,
@@ -54,17 +63,23 @@ def product(
     else:
         for row in range(first, last):
             for side in range(width):
-                found[row, side] = keep * start[row, side]
-            for place in range(starts[row], starts[row + 1]):
-                column, entry = columns[place], gain * entries[place]
-                for side in range(width):
-                    found[row, side] += entry * vectors[column, side]
+                one = 0.0
+                for place in range(starts[row], starts[row + 1]):
+                    one += entries[place] * vectors[columns[place], side]
+                found[row, side] = keep * start[row, side] + gain * one
 
 
-@compiled(
-    f"void({_MATRIX}, float64[::1], {_VECTORS}, {_VECTORS}, {_VECTORS}, {_VECTORS}, "
-    "float64, float64, int64, int64)"
-)
+@compiled(*_types("void(D, V, V, float64, int64, int64)"))
+def scaled(
+    inverse_diagonal: Array, residual: Array, step: Array, share: float, first: int, last: int
+) -> None:
+    """Write ``share * D^-1 residual`` to ``step``."""
+    for row in range(first, last):
+        for side in range(residual.shape[1]):
+            step[row, side] = share * inverse_diagonal[row] * residual[row, side]
+
+
+@compiled(*_types("void(M, D, V, V, V, V, float64, float64, int64, int64)"))
 def corrected(
     starts: Array,
     columns: Array,
@@ -86,7 +101,7 @@ def corrected(
     width = step.shape[1]
     if width == 1:
         for row in range(first, last):
-            rest = residual[row, 0]
+            rest = float(residual[row, 0])
             for place in range(starts[row], starts[row + 1]):
                 rest -= entries[place] * step[columns[place], 0]
             found[row, 0] = (
@@ -94,7 +109,7 @@ def corrected(
             )
     elif width == 2:
         for row in range(first, last):
-            rest, more = residual[row, 0], residual[row, 1]
+            rest, more = float(residual[row, 0]), float(residual[row, 1])
             for place in range(starts[row], starts[row + 1]):
                 column, entry = columns[place], entries[place]
                 rest -= entry * step[column, 0]
@@ -106,7 +121,7 @@ def corrected(
         for row in range(first, last):
             gain = of_rest * inverse_diagonal[row]
             for side in range(width):
-                rest = residual[row, side]
+                rest = float(residual[row, side])
                 for place in range(starts[row], starts[row + 1]):
                     rest -= entries[place] * step[columns[place], side]
                 found[row, side] = start[row, side] + of_step * step[row, side] + gain * rest

@@ -28,6 +28,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array, diags_array
 
 from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.parallel import over_rows
 
 # An entry is strong if it is at least this share of the largest of a row; compared by
 # iterations on weights that vary over 0 to 10 orders, where 0.1 takes up to 1.6 times as many.
@@ -47,6 +48,10 @@ _LEAST_UNIT = 0.1
 # Of the averaging step that smooths the aggregates' edges; 2/3 damps the highest frequencies
 # of an M-matrix best.
 _DAMPING = 2 / 3
+
+# Unknowns that are asked in any order among themselves, and after all before them: they and what
+# they are tied to fit the cache.
+_NEAR = 4096
 
 
 def prolongation(matrix: csr_array) -> csr_array:
@@ -76,7 +81,7 @@ def dominant_diagonal(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
         from pimper_torch.kernels import aggregation as kernels
 
         own, dominant = np.empty((2, matrix.shape[0]))
-        kernels.diagonals(matrix.indptr, matrix.indices, matrix.data, own, dominant)
+        over_rows(kernels.diagonals, len(own), *parts_of(matrix), own, dominant)
         return dominant
     diagonal: np.ndarray = matrix.diagonal()
     return np.maximum(diagonal, abs(matrix).sum(axis=1) / 2)
@@ -86,26 +91,66 @@ def _compiled(matrix: csr_array) -> csr_array:
     """Give the same map by compiled kernels."""
     from pimper_torch.kernels import aggregation as kernels
 
-    parts, size = (matrix.indptr, matrix.indices, matrix.data), matrix.shape[0]
+    parts, size = parts_of(matrix), matrix.shape[0]
     dominant, units = dominant_diagonal(matrix), np.ones(size)
+    smoother = np.empty(size)
     for _ in range(_UNIT_STEPS):
-        smoother = np.empty(size)
-        kernels.smooth_ones(*parts, dominant, units, smoother, _DAMPING)
-        units = smoother
-    units = np.maximum(np.abs(units), _LEAST_UNIT)
-    largest, tied, excess = np.empty((3, size))
-    kernels.ties(*parts, units, largest, tied, excess)
-    label = np.empty(size, np.int32)
-    count = kernels.aggregate(*parts, units, largest, tied, _order(size), _STRONG, _TIED, label)
-    starts, columns, entries = kernels.spread(
-        *parts, units, largest, excess, label, _STRONG, _DAMPING
+        over_rows(kernels.smooth_ones, size, *parts, dominant, units, smoother, _DAMPING)
+        units, smoother = smoother, units
+    units = np.maximum(np.abs(units, out=units), _LEAST_UNIT, out=units)
+    largest, tied, excess = dominant, smoother, np.empty(size)  # memory that is free
+    over_rows(kernels.ties, size, *parts, units, largest, tied, excess)
+    strong, label = np.empty(len(parts[1]), np.bool_), np.empty(size, np.int32)
+    tying = units, largest, tied
+    over_rows(kernels.strong_ties, size, *parts, *tying, _STRONG, _TIED, strong)
+    count = kernels.roots(*parts[:2], strong, _order(size), label)
+    other = np.empty_like(label)
+    for _ in range(2):
+        over_rows(kernels.joined, size, *parts, units, strong, label, other)
+        label, other = other, label
+    while any(over_rows(kernels.followed, size, *parts, *tying, _TIED, label, other)):
+        label, other = other, label
+    found = over_rows(
+        kernels.spread, size, *parts, units, largest, excess, label, _STRONG, _DAMPING
     )
-    return csr_array((entries, columns, starts), shape=(size, count))
+    return _joined(found, count)
+
+
+def coarser(matrix: csr_array, spread: csr_array, gather: csr_array) -> csr_array:
+    """Give the matrix of the coarse unknowns.
+
+    Args:
+        matrix: Of the fine ones.
+        spread: As :func:`prolongation` gives it.
+        gather: Its transpose.
+    """
+    if compiled_for():
+        from pimper_torch.kernels import aggregation as kernels
+
+        parts = [part for each in (matrix, spread, gather) for part in parts_of(each)]
+        return _joined(over_rows(kernels.coarser, gather.shape[0], *parts), gather.shape[0])
+    found: csr_array = gather @ (matrix @ spread)
+    return found
+
+
+def parts_of(matrix: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give a matrix as kernels take it: where rows start, columns and entries."""
+    return matrix.indptr, matrix.indices, matrix.data
+
+
+def _joined(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int) -> csr_array:
+    """Make one matrix of some rows after others: how many entries they have, columns, entries."""
+    counts, columns, entries = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    starts = np.zeros(len(counts) + 1, np.int32)
+    np.cumsum(counts, out=starts[1:])
+    return csr_array((entries, columns, starts), shape=(len(counts), width))
 
 
 def _order(size: int) -> Int[np.ndarray, " unknown"]:
-    """Give the order in which unknowns are asked to be roots."""
-    return np.random.default_rng(0).permutation(size)
+    """Give the order in which unknowns are asked to be roots: any, but near ones together."""
+    within = np.random.default_rng(0).permutation(min(size, _NEAR))
+    order = (np.arange(0, size, _NEAR)[:, None] + within).ravel() if size else within
+    return order[order < size]
 
 
 def _units(matrix: csr_array) -> Float[np.ndarray, " unknown"]:

@@ -4,7 +4,12 @@ from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
+from scipy.sparse import csr_array
 from torch import Tensor
+
+from pimper_torch.kernels.arrays import as_array
+from pimper_torch.linalg.aggregation import parts_of
+from pimper_torch.parallel import over_rows
 
 
 @torch.no_grad()
@@ -63,5 +68,72 @@ def conjugate_gradients(
         previous, decrease = decrease, inner(residual, better)
         growth = torch.where(previous > 0, decrease / previous, 0)
         direction.mul_(growth).add_(better)
+        steps += 1
+    return found, steps, bool((decrease.abs() <= goal).all())
+
+
+@torch.no_grad()
+def compressed_gradients(
+    matrix: csr_array,
+    precondition: Callable[[Float[Tensor, "unknown side"]], Float[Tensor, "unknown side"]],
+    rhs: Float[Tensor, "unknown side"],
+    *,
+    start: Float[Tensor, "unknown side"] | None,
+    tolerance: float,
+    max_iterations: int,
+    dtype: torch.dtype = torch.float64,
+) -> tuple[Float[Tensor, "unknown side"], int, bool]:
+    """Do what :func:`conjugate_gradients` does for a matrix in compressed rows, by kernels.
+
+    Args:
+        matrix: Float64, on the CPU.
+        precondition: Approximates the inverse in ``dtype``; it may return the same memory again.
+        rhs: Float64, one column a right-hand side.
+        start: Where to begin; zero if not given.
+        tolerance: As there.
+        max_iterations: As there.
+        dtype: Of what ``precondition`` takes and gives.
+    """
+    from pimper_torch.kernels import conjugate_gradients as kernels
+    from pimper_torch.kernels import sparse
+
+    count, sides = rhs.shape
+    blocks = -(-count // kernels.BLOCK)
+
+    def inner(one: Tensor, other: Tensor) -> Tensor:
+        sums = torch.empty(blocks, sides, dtype=torch.float64)
+        vectors = as_array(one), as_array(other), sums.numpy()
+        over_rows(kernels.dots, blocks, *vectors, size=kernels.BLOCK)
+        return sums.sum(dim=0)
+
+    def product(vectors: Tensor, base: Tensor, found: Tensor, keep: float, gain: float) -> None:
+        arrays = as_array(vectors), as_array(base), as_array(found)
+        over_rows(sparse.product, count, *parts_of(matrix), *arrays, keep, gain)
+
+    found, residual = torch.zeros_like(rhs), rhs.clone()
+    if start is not None:
+        found.copy_(start)
+        product(found, rhs, residual, 1.0, -1.0)
+    rounded = residual.to(dtype, copy=True)
+    better = precondition(rounded)
+    decrease = inner(residual, better)
+    direction, image = better.to(torch.float64, copy=True), torch.empty_like(rhs)
+    size = decrease if start is None else inner(rhs, precondition(rounded.copy_(rhs)))
+    goal = tolerance**2 * size
+    steps = 0
+    # Written so that what is not a number stops the loop and has not converged.
+    while bool((decrease > goal).any()) and steps < max_iterations:
+        product(direction, image, image, 0.0, 1.0)
+        curvature = inner(direction, image)
+        descends = curvature > 0
+        if not bool(descends.any()):
+            break
+        length = torch.where(descends, decrease / curvature, 0).numpy()
+        vectors = (as_array(each) for each in (found, residual, direction, image))
+        over_rows(kernels.moved, count, *vectors, length, rounded.numpy())
+        better = precondition(rounded)
+        previous, decrease = decrease, inner(residual, better)
+        growth = torch.where(previous > 0, decrease / previous, 0).numpy()
+        over_rows(kernels.turned, count, as_array(direction), as_array(better), growth)
         steps += 1
     return found, steps, bool((decrease.abs() <= goal).all())

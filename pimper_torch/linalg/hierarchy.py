@@ -10,8 +10,6 @@ Vectors have one row an unknown, and may have one column a right-hand side.
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +19,12 @@ from torch import Tensor
 
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
-from pimper_torch.linalg.aggregation import dominant_diagonal, prolongation
+from pimper_torch.linalg.aggregation import (
+    coarser,
+    dominant_diagonal,
+    parts_of,
+    prolongation,
+)
 from pimper_torch.parallel import over_rows
 
 Product = Callable[[Tensor], Tensor]
@@ -36,78 +39,144 @@ _WORTHWHILE = 0.8
 # of the spectrum, [0, 2], below 2 / _SPAN.
 _SPAN = 4
 
+# Two steps of the three-term recurrence of Chebyshev's polynomials on that part: the first goes
+# by D^-1 residual / _CENTER, the second by _OF_STEP of that and _OF_REST of what is left.
+_CENTER, _RADIUS = 1 + 1 / _SPAN, 1 - 1 / _SPAN
+_GAIN = 1 / (2 * _CENTER / _RADIUS - _RADIUS / _CENTER)
+_OF_STEP, _OF_REST = 1 + _GAIN * _RADIUS / _CENTER, 2 * _GAIN / _RADIUS
+
 # Coarse levels of other values are kept if none of them has left this factor. Measured: noise
 # of a factor 1.26 (one sigma) on weights over 8 decades takes 27 cycles instead of 16; one new
 # strong tie in a thousand makes all that is kept useless.
 _KEPT_FACTOR = 2.0
 
 
-@dataclass(frozen=True, kw_only=True)
 class Level:
-    """A matrix, how to smooth it and how to reach the next one."""
+    """A matrix, how to smooth it and how to reach the next one.
 
-    product: Product
-    inverse_diagonal: Float[Tensor, " unknown"]
-    prolong: Product | None
-    restrict: Product | None
+    Args:
+        product: Of the matrix.
+        inverse_diagonal: Of its dominant diagonal.
+        prolong: From the next level's unknowns to those of this; nothing on the last one.
+        restrict: The transpose.
+    """
 
-    def corrected(
+    def __init__(
         self,
-        start: Float[Tensor, "unknown ..."],
-        residual: Float[Tensor, "unknown ..."],
-        step: Float[Tensor, "unknown ..."],
-        of_step: float,
-        of_rest: float,
-    ) -> Float[Tensor, "unknown ..."]:
-        """Give ``start + of_step * step + of_rest * D^-1 (residual - A step)``."""
-        rest = self.scaled(self.rest(residual, step))
-        return torch.add(start, step, alpha=of_step).add_(rest, alpha=of_rest)
+        product: Product,
+        inverse_diagonal: Float[Tensor, " unknown"],
+        prolong: Product | None,
+        restrict: Product | None,
+    ) -> None:
+        self.product, self.inverse_diagonal = product, inverse_diagonal
+        self.prolong, self.restrict = prolong, restrict
 
-    def scaled(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
-        """Give ``D^-1 residual``."""
+    def smoothed(
+        self,
+        residual: Float[Tensor, "unknown ..."],
+        start: Float[Tensor, "unknown ..."] | None = None,
+    ) -> Float[Tensor, "unknown ..."]:
+        """Take two Chebyshev steps of Jacobi's iteration towards A x = residual."""
+        left = residual if start is None else residual - self.product(start)
+        step = self._scaled(left).div_(_CENTER)
+        rest = self._scaled(left - self.product(step))
+        if start is None:  # the step itself is where to begin
+            return torch.mul(step, _OF_STEP).add_(rest, alpha=_OF_REST)
+        return torch.add(start, step, alpha=_OF_STEP).add_(rest, alpha=_OF_REST)
+
+    def coarse_residual(
+        self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
+    ) -> Float[Tensor, "coarse ..."]:
+        """Give what is left of a residual, to the next level."""
+        assert self.restrict is not None
+        return self.restrict(residual - self.product(found))
+
+    def add_coarse(
+        self, found: Float[Tensor, "unknown ..."], coarse: Float[Tensor, "coarse ..."]
+    ) -> None:
+        """Add the next level's answer."""
+        assert self.prolong is not None
+        found += self.prolong(coarse)
+
+    def _scaled(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         return self.inverse_diagonal.reshape(-1, *[1] * (residual.ndim - 1)) * residual
 
-    def rest(
-        self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
-    ) -> Float[Tensor, "unknown ..."]:
-        """Give ``residual - A found``."""
-        return residual - self.product(found)
 
-
-@dataclass(frozen=True, kw_only=True)
 class CompiledLevel(Level):
-    """A level whose matrix the kernels read: once for all right-hand sides, and on all threads."""
+    """A level whose matrices the kernels read: once for all right-hand sides, on all threads.
 
-    matrix: csr_array
+    Its vectors are made once, so that what it gives lasts until the next cycle.
 
-    def corrected(
+    Args:
+        matrix: Of this level.
+        inverse_diagonal: Of its dominant diagonal, in the type of everything here.
+        spread: From the next level's unknowns to those of this; nothing on the last one.
+        gather: The transpose.
+    """
+
+    def __init__(
         self,
-        start: Float[Tensor, "unknown ..."],
+        matrix: csr_array,
+        inverse_diagonal: Float[Tensor, " unknown"],
+        spread: csr_array | None,
+        gather: csr_array | None,
+    ) -> None:
+        def product(matrix: csr_array | None) -> Product | None:
+            return None if matrix is None else lambda vectors: with_product(matrix, vectors)
+
+        real = inverse_diagonal.numpy().dtype
+        self._matrix = matrix.astype(real, copy=False)
+        self._spread = None if spread is None else spread.astype(real, copy=False)
+        self._gather = None if gather is None else gather.astype(real, copy=False)
+        own = product(self._matrix)
+        assert own is not None
+        super().__init__(own, inverse_diagonal, product(self._spread), product(self._gather))
+        self._vectors: dict[str, Tensor] = {}
+
+    def smoothed(
+        self,
         residual: Float[Tensor, "unknown ..."],
-        step: Float[Tensor, "unknown ..."],
-        of_step: float,
-        of_rest: float,
+        start: Float[Tensor, "unknown ..."] | None = None,
     ) -> Float[Tensor, "unknown ..."]:
-        """Do the same in one pass."""
+        """Do the same in three passes."""
         from pimper_torch.kernels import sparse
 
-        found = torch.empty_like(step)
-        over_rows(
-            sparse.corrected,
-            len(step),
-            *_parts(self.matrix),
-            self.inverse_diagonal.numpy(),
-            *(_columns(vectors) for vectors in (residual, step, start, found)),
-            of_step,
-            of_rest,
-        )
+        left, size = residual, len(residual)
+        step, found = (self._room(name, residual) for name in ("step", "found"))
+        if start is not None:
+            left = self._room("left", residual)
+            with_product(self._matrix, start, residual, keep=1.0, gain=-1.0, found=left)
+        diagonal = self.inverse_diagonal.numpy()
+        over_rows(sparse.scaled, size, diagonal, _columns(left), _columns(step), 1 / _CENTER)
+        vectors = [_columns(each) for each in (left, step, step if start is None else start, found)]
+        of_step = _OF_STEP - 1 if start is None else _OF_STEP
+        parts = parts_of(self._matrix)
+        over_rows(sparse.corrected, size, *parts, diagonal, *vectors, of_step, _OF_REST)
         return found
 
-    def rest(
+    def coarse_residual(
         self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
-    ) -> Float[Tensor, "unknown ..."]:
+    ) -> Float[Tensor, "coarse ..."]:
+        """Do the same without new vectors."""
+        assert self._gather is not None
+        left = self._room("left", residual)
+        with_product(self._matrix, found, residual, keep=1.0, gain=-1.0, found=left)
+        coarse = self._room("coarse", residual, self._gather.shape[0])
+        return with_product(self._gather, left, found=coarse)
+
+    def add_coarse(
+        self, found: Float[Tensor, "unknown ..."], coarse: Float[Tensor, "coarse ..."]
+    ) -> None:
         """Do the same in one pass."""
-        return with_product(self.matrix, found, residual, keep=1.0, gain=-1.0)
+        assert self._spread is not None
+        with_product(self._spread, coarse, found, keep=1.0, found=found)
+
+    def _room(self, name: str, like: Tensor, size: int | None = None) -> Tensor:
+        """Give the vectors of a name: those of the last cycle, if they had as many columns."""
+        shape = (len(like) if size is None else size, *like.shape[1:])
+        if name not in self._vectors or self._vectors[name].shape != shape:
+            self._vectors[name] = like.new_empty(shape)
+        return self._vectors[name]
 
 
 class Hierarchy:
@@ -117,13 +186,18 @@ class Hierarchy:
         matrix: In float64; both triangles.
         device: Where cycles run.
         product: Of the matrix, if there is a quicker way than its compressed rows.
+        dtype: That compiled cycles compute in: float32 takes half the memory, and as many cycles.
 
     The cycle is symmetric and positive definite, as conjugate gradients need it: two
     Chebyshev-Jacobi steps before and after every coarser level.
     """
 
     def __init__(
-        self, matrix: csr_array, device: torch.device, product: Product | None = None
+        self,
+        matrix: csr_array,
+        device: torch.device,
+        product: Product | None = None,
+        dtype: torch.dtype = torch.float64,
     ) -> None:
         self._levels: list[Level] = []
         while True:
@@ -131,11 +205,11 @@ class Hierarchy:
             if spread is not None and not 0 < spread.shape[1] < _WORTHWHILE * matrix.shape[0]:
                 spread = None
             gather = None if spread is None else spread.T.tocsr()
-            self._levels.append(_level(matrix, spread, gather, device, product))
+            self._levels.append(_level(matrix, spread, gather, device, product, dtype))
             product = None
-            if spread is None:
+            if spread is None or gather is None:
                 break
-            matrix = gather @ (matrix @ spread)
+            matrix = coarser(matrix, spread, gather)
         small = matrix.shape[0] <= _DENSE
         self._coarsest = _dense_inverse(matrix).to(device) if small else None
 
@@ -146,6 +220,10 @@ class Hierarchy:
 
     def precondition(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         """Apply the approximate inverse."""
+        return self.cycle(residual).clone()
+
+    def cycle(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+        """Do the same, in vectors that the next cycle may write to."""
         return self._cycle(0, residual)
 
     def with_product(self, product: Product, dominant: Float[Tensor, " unknown"]) -> "Hierarchy":
@@ -157,12 +235,7 @@ class Hierarchy:
         """
         other = object.__new__(Hierarchy)
         finest, *coarse = self._levels
-        finest = Level(
-            product=product,
-            inverse_diagonal=1 / dominant,
-            prolong=finest.prolong,
-            restrict=finest.restrict,
-        )
+        finest = Level(product, 1 / dominant, finest.prolong, finest.restrict)
         other._levels, other._coarsest = [finest, *coarse], self._coarsest
         return other
 
@@ -170,14 +243,14 @@ class Hierarchy:
         self, depth: int, residual: Float[Tensor, "unknown ..."]
     ) -> Float[Tensor, "unknown ..."]:
         level = self._levels[depth]
-        if level.prolong is None or level.restrict is None:
+        if depth + 1 == len(self._levels):
             if self._coarsest is not None:
-                return self._coarsest @ residual
-            return _smooth(level, residual, None)
-        found = _smooth(level, residual, None)
-        coarse = self._cycle(depth + 1, level.restrict(level.rest(residual, found)))
-        found += level.prolong(coarse)
-        return _smooth(level, residual, found)
+                return self._coarsest.to(residual) @ residual
+            return level.smoothed(residual)
+        found = level.smoothed(residual)
+        coarse = self._cycle(depth + 1, level.coarse_residual(residual, found))
+        level.add_coarse(found, coarse)
+        return level.smoothed(residual, found)
 
 
 def _level(
@@ -186,17 +259,17 @@ def _level(
     gather: csr_array | None,
     device: torch.device,
     product: Product | None,
+    dtype: torch.dtype,
 ) -> Level:
     diagonal = torch.from_numpy(1 / dominant_diagonal(matrix)).to(device)
-    parts: dict[str, Any] = {
-        "product": product or sparse_product(matrix, device),
-        "inverse_diagonal": diagonal,
-        "prolong": None if spread is None else sparse_product(spread, device),
-        "restrict": None if gather is None else sparse_product(gather, device),
-    }
     if product is None and compiled_for(diagonal):
-        return CompiledLevel(matrix=matrix, **parts)
-    return Level(**parts)
+        return CompiledLevel(matrix, diagonal.to(dtype), spread, gather)
+    return Level(
+        product=product or sparse_product(matrix, device),
+        inverse_diagonal=diagonal,
+        prolong=None if spread is None else sparse_product(spread, device),
+        restrict=None if gather is None else sparse_product(gather, device),
+    )
 
 
 def sparse_product(matrix: csr_array, device: torch.device) -> Product:
@@ -214,13 +287,15 @@ def with_product(
     start: Float[Tensor, "row ..."] | None = None,
     keep: float = 0.0,
     gain: float = 1.0,
+    found: Float[Tensor, "row ..."] | None = None,
 ) -> Float[Tensor, "row ..."]:
-    """Give ``keep * start + gain * matrix @ vectors`` by compiled kernels."""
+    """Give ``keep * start + gain * matrix @ vectors`` by compiled kernels, in ``found`` or new."""
     from pimper_torch.kernels import sparse
 
-    found = vectors.new_empty(matrix.shape[0], *vectors.shape[1:])
+    if found is None:
+        found = vectors.new_empty(matrix.shape[0], *vectors.shape[1:])
     columns = [_columns(each) for each in (vectors, found if start is None else start, found)]
-    over_rows(sparse.product, len(found), *_parts(matrix), *columns, keep, gain)
+    over_rows(sparse.product, len(found), *parts_of(matrix), *columns, keep, gain)
     return found
 
 
@@ -243,27 +318,6 @@ def may_keep(new: Float[Tensor, "..."], old: Float[Tensor, "..."]) -> bool:
     ordered = torch.minimum(new.abs(), old.abs()), torch.maximum(new.abs(), old.abs())
     same_signs = bool((new.sign() == old.sign()).all())
     return same_signs and bool((ordered[1] <= _KEPT_FACTOR * ordered[0]).all())
-
-
-def _smooth(
-    level: Level,
-    residual: Float[Tensor, "unknown ..."],
-    start: Float[Tensor, "unknown ..."] | None,
-) -> Float[Tensor, "unknown ..."]:
-    """Take two Chebyshev steps of Jacobi's iteration towards A x = residual."""
-    center, radius = 1 + 1 / _SPAN, 1 - 1 / _SPAN
-    left = residual if start is None else level.rest(residual, start)
-    step = level.scaled(left).div_(center)
-    # Of the three-term recurrence of Chebyshev's polynomials, its second member.
-    gain = 1 / (2 * center / radius - radius / center)
-    of_step, of_rest = 1 + gain * radius / center, 2 * gain / radius
-    if start is None:  # the step itself is where to begin
-        return level.corrected(step, left, step, of_step - 1, of_rest)
-    return level.corrected(start, left, step, of_step, of_rest)
-
-
-def _parts(matrix: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return matrix.indptr, matrix.indices, matrix.data
 
 
 def _columns(vectors: Float[Tensor, "unknown ..."]) -> np.ndarray:

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from pimper_torch.linalg.adjoint import solve_adjointly
 from pimper_torch.linalg.aggregation import dominant_diagonal
-from pimper_torch.linalg.conjugate_gradients import conjugate_gradients
+from pimper_torch.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
 from pimper_torch.linalg.hierarchy import (
     Hierarchy,
     Product,
     may_keep,
     sparse_product,
+    with_product,
 )
 from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 
@@ -81,9 +82,70 @@ def solve_with_hierarchy(
         tolerance=tolerance,
         max_iterations=_MOST_CYCLES,
     )
+    reached = found, cycles, converged
+    return _checked(reached, rhs - product(found), diagonal, rhs, tolerance, what)
+
+
+def solve_by_cycles(
+    matrix: csr_array,
+    diagonal: Float[Tensor, " unknown"],
+    rhs: Float[Tensor, "unknown side"],
+    tolerance: float,
+    what: str,
+    start: Float[Tensor, "unknown side"] | None = None,
+) -> Iterate:
+    """Do the same for a matrix in compressed rows by kernels on the CPU, its hierarchy in float32.
+
+    Args:
+        matrix: A, float64, both triangles.
+        diagonal: Of A.
+        rhs: As there.
+        tolerance: As there.
+        what: As there.
+        start: As there.
+
+    Raises:
+        SingularSystemError: As there.
+    """
+    half = torch.float32
+    reached = compressed_gradients(
+        matrix,
+        Hierarchy(matrix, rhs.device, dtype=half).cycle,
+        rhs,
+        start=start,
+        tolerance=tolerance,
+        max_iterations=_MOST_CYCLES,
+        dtype=half,
+    )
+    residual = with_product(matrix, reached[0], rhs, keep=1.0, gain=-1.0)
+    return _checked(reached, residual, diagonal, rhs, tolerance, what)
+
+
+def _checked(
+    reached: tuple[Float[Tensor, "unknown ..."], int, bool],
+    residual: Float[Tensor, "unknown ..."],
+    diagonal: Float[Tensor, " unknown"],
+    rhs: Float[Tensor, "unknown ..."],
+    tolerance: float,
+    what: str,
+) -> Iterate:
+    """Refuse what conjugate gradients have reached if it is no solution.
+
+    Args:
+        reached: What they gave: values, steps and whether they converged.
+        residual: Of the values.
+        diagonal: Of the matrix.
+        rhs: Right-hand side.
+        tolerance: That was asked for.
+        what: Names the system.
+
+    Raises:
+        SingularSystemError: No convergence, with the iterations and the residual reached.
+    """
+    found, cycles, converged = reached
     scale = diagonal.rsqrt().reshape(-1, *[1] * (rhs.ndim - 1))
     size = (scale * rhs).norm(dim=0)
-    misfit = (scale * (rhs - product(found))).norm(dim=0)
+    misfit = (scale * residual).norm(dim=0)
     share = float((misfit / torch.where(size > 0, size, 1)).max())
     worst = max(_WORST_MISFIT, _MISFIT_TOLERANCES * tolerance)
     if not (share < worst and converged):

@@ -9,10 +9,11 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from pimper_torch.linalg.hierarchy import Hierarchy, sparse_product
-from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid, solve_with_hierarchy
+from pimper_torch.linalg.aggregation import parts_of
+from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid, solve_by_cycles
 from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.parallel import over_rows
 
 # Here a factor takes three times as long to make as a hierarchy, and a third as long to use; it
 # is exact, and half a second is soon earned back by the three coordinates of a surface.
@@ -119,15 +120,17 @@ def solve_compressed(
     Raises:
         SingularSystemError: See :func:`prepare`.
     """
+    from pimper_torch.kernels import aggregation as kernels
+
+    diagonal = torch.from_numpy(matrix.diagonal())
+    if len(sides) > _COMPILED_CHOLESKY_UNKNOWNS:
+        parts = over_rows(kernels.off_diagonal, len(sides), *parts_of(matrix))
+        positive, total = (sum(part) for part in zip(*parts, strict=True))
+        if positive <= _POSITIVE_SHARE * total:
+            refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
+            with suppress(SingularSystemError):
+                return solve_by_cycles(matrix, diagonal, sides, tolerance, what, start).values
     rows = np.repeat(np.arange(len(sides)), np.diff(matrix.indptr))
-    off = torch.from_numpy(matrix.data)[torch.from_numpy(rows != matrix.indices)]
-    if len(sides) > _COMPILED_CHOLESKY_UNKNOWNS and _mostly_negative(off):
-        diagonal = torch.from_numpy(matrix.diagonal())
-        refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
-        product = sparse_product(matrix, sides.device)
-        system = product, Hierarchy(matrix, sides.device), diagonal, sides, tolerance, what, start
-        with suppress(SingularSystemError):
-            return solve_with_hierarchy(*system).values
     index = torch.from_numpy(rows), torch.from_numpy(matrix.indices).long()
     return SparseCholesky(*index, torch.from_numpy(matrix.data), len(sides), what).solve(sides)
 
@@ -135,9 +138,6 @@ def solve_compressed(
 def _like_a_laplacian(
     rows: Int[Tensor, " entry"], cols: Int[Tensor, " entry"], values: Float[Tensor, " entry"]
 ) -> bool:
-    return _mostly_negative(values.detach()[rows != cols])
-
-
-def _mostly_negative(off: Float[Tensor, " entry"]) -> bool:
+    off = values.detach()[rows != cols]
     positive = float(torch.where(off > 0, off, 0).sum())
     return positive <= _POSITIVE_SHARE * float(off.abs().sum())

@@ -159,7 +159,7 @@ def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch, kern
     monkeypatch.setattr("pimper_torch.linalg.systems._CHOLESKY_UNKNOWNS", 100)
     monkeypatch.setattr("pimper_torch.linalg.systems._COMPILED_CHOLESKY_UNKNOWNS", 100)
     monkeypatch.setattr(Multigrid, "solve", refusing)
-    monkeypatch.setattr("pimper_torch.linalg.systems.solve_with_hierarchy", refusing)
+    monkeypatch.setattr("pimper_torch.linalg.systems.solve_by_cycles", refusing)
     with using(kernels):
         found = fused(kinds)
     assert stuck

@@ -1,41 +1,61 @@
 import numpy as np
 import pytest
 import torch
-from scipy.sparse import coo_array
 from torch.testing import assert_close
 
+from pimper_torch.kernels import aggregation as kernels
 from pimper_torch.kernels.switch import using
-from pimper_torch.linalg.aggregation import dominant_diagonal, prolongation
+from pimper_torch.linalg.aggregation import coarser, dominant_diagonal, parts_of, prolongation
 from pimper_torch.linalg.hierarchy import Hierarchy
+from tests.linalg.laplacians import triangles
 
 CPU = torch.device("cpu")
 
 
-def triangles(side: int, decades: float, seed: int = 0):
-    """A Laplacian of a triangle lattice whose weights vary over decades, with holes and anchors."""
-    generator = np.random.default_rng(seed)
-    name = np.arange(side * side).reshape(side, side)
-    pairs = (name[:, :-1], name[:, 1:]), (name[:-1], name[1:]), (name[:-1, :-1], name[1:, 1:])
-    one, other = np.concatenate([[a.ravel(), b.ravel()] for a, b in pairs], axis=1)
-    weight = 10 ** (decades * generator.random(len(one)))
-    weight[generator.random(len(one)) < 0.2] = 0
-    anchor = 1e-4 + 10.0 * (generator.random(side * side) < 0.02)
-    each = np.arange(side * side)
-    rows = np.concatenate([one, other, one, other, each])
-    cols = np.concatenate([other, one, one, other, each])
-    values = np.concatenate([-weight, -weight, weight, weight, anchor])
-    return coo_array((values, (rows.astype(np.int32), cols.astype(np.int32)))).tocsr()
-
-
 @pytest.mark.parametrize("decades", [0.0, 4.0, 10.0])
-def test_aggregates_are_those_of_numpy(decades):
-    matrix = triangles(60, decades)
+@pytest.mark.parametrize("side", [60, 160])  # the larger one has more rows than a thread is given
+def test_aggregates_are_those_of_numpy(side, decades):
+    matrix = triangles(side, decades)
     found, diagonal = prolongation(matrix), dominant_diagonal(matrix)
     with using("torch"):
         expected, own = prolongation(matrix), dominant_diagonal(matrix)
     assert found.shape == expected.shape
     assert abs(found - expected).max() < 1e-12
     np.testing.assert_allclose(diagonal, own, rtol=1e-12)
+
+
+@pytest.mark.parametrize("decades", [0.0, 4.0, 10.0])
+@pytest.mark.parametrize("side", [60, 300])
+def test_coarse_matrices_are_scipys_products(side, decades):
+    matrix = triangles(side, decades)
+    spread = prolongation(matrix)
+    gather = spread.T.tocsr()
+    found, expected = coarser(matrix, spread, gather), gather @ (matrix @ spread)
+    assert found.shape == expected.shape
+    assert abs(found - expected).max() <= 1e-12 * abs(expected).max()
+    count = found.nnz
+    found.sum_duplicates()
+    assert found.nnz == count  # no column twice in a row
+
+
+def test_rows_of_many_entries_find_room():
+    """Every coarse unknown meets every other: more than the first guess leaves room for."""
+    generator = np.random.default_rng(0)
+    matrix = triangles(10, 1.0)
+    spread = type(matrix)(generator.random((100, 40)))
+    found = coarser(matrix, spread, spread.T.tocsr())
+    expected = spread.toarray().T @ matrix.toarray() @ spread.toarray()
+    np.testing.assert_allclose(found.toarray(), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_entries_off_the_diagonal_are_added_up_by_sign():
+    matrix = triangles(20, 2.0)
+    matrix.data = matrix.data * np.random.default_rng(1).choice([-1.0, 1.0], len(matrix.data))
+    off = matrix.toarray() * (1 - np.eye(400))
+    for first, last in ((0, 400), (30, 31), (7, 7)):
+        positive, size = kernels.off_diagonal(*parts_of(matrix), first, last)
+        np.testing.assert_allclose(positive, off[first:last].clip(min=0).sum(), rtol=1e-12)
+        np.testing.assert_allclose(size, abs(off[first:last]).sum(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("sides", [(), (1,), (2,), (3,)])
@@ -46,3 +66,23 @@ def test_a_cycle_is_that_of_torch_for_any_number_of_sides(sides):
     with using("torch"):
         expected = Hierarchy(matrix, CPU).precondition(side)
     assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("sides", [1, 2, 3])
+def test_a_cycle_in_float32_is_that_in_float64_but_for_rounding(sides):
+    matrix = triangles(160, 3.0)
+    side = torch.randn(25600, sides, generator=torch.Generator().manual_seed(1)).double()
+    expected = Hierarchy(matrix, CPU).precondition(side)
+    found = Hierarchy(matrix, CPU, dtype=torch.float32).precondition(side.float())
+    assert found.dtype == torch.float32
+    assert_close(found.double(), expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
+
+
+def test_a_cycle_leaves_what_the_one_before_gave_only_if_asked_to():
+    hierarchy = Hierarchy(triangles(60, 3.0), CPU)
+    one, other = torch.randn(2, 3600, generator=torch.Generator().manual_seed(1)).double()
+    kept, lent = hierarchy.precondition(one), hierarchy.cycle(one)
+    before = kept.clone()
+    assert_close(lent, before, rtol=0, atol=0)
+    hierarchy.cycle(other)
+    assert_close(kept, before, rtol=0, atol=0)

@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+import torch
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import spsolve
+from torch.testing import assert_close
+
+from pimper_torch.kernels import conjugate_gradients as kernels
+from pimper_torch.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
+from pimper_torch.linalg.hierarchy import Hierarchy
+from tests.linalg.laplacians import triangles
+
+CPU = torch.device("cpu")
+
+
+def random(*shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(11), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("real", [torch.float32, torch.float64])
+@pytest.mark.parametrize("rows", [1, kernels.BLOCK, 2 * kernels.BLOCK + 5])
+def test_inner_products_add_up_blocks_of_rows(rows, real):
+    one, other = random(2, rows, 3)
+    other = other.to(real)
+    blocks = -(-rows // kernels.BLOCK)
+    sums = np.full((blocks, 3), np.nan)
+    for block in range(blocks):
+        kernels.dots(one.numpy(), other.numpy(), sums, block, block + 1)
+    assert_close(torch.from_numpy(sums).sum(dim=0), (one * other).sum(dim=0), rtol=1e-11, atol=0)
+
+
+@pytest.mark.parametrize("real", [torch.float32, torch.float64])
+def test_moves_and_turns_are_those_of_torch_on_the_rows_asked_for(real):
+    found, residual, direction, image, better = random(5, 20, 2)
+    better, rounded = better.to(real), torch.zeros(20, 2, dtype=real)
+    length, rows = torch.tensor([0.5, -3.0]).double(), slice(4, 17)
+    wanted = [each.clone() for each in (found, residual, rounded, direction)]
+    wanted[0][rows] += (length * direction)[rows]
+    wanted[1][rows] -= (length * image)[rows]
+    wanted[2][rows] = wanted[1][rows].to(real)
+    wanted[3][rows] = (better + length * direction)[rows]
+    arrays = [each.numpy() for each in (found, residual, direction, image, length, rounded)]
+    kernels.moved(*arrays, 4, 17)
+    kernels.turned(direction.numpy(), better.numpy(), length.numpy(), 4, 17)
+    for one, other in zip((found, residual, rounded, direction), wanted, strict=True):
+        assert_close(one, other, rtol=1e-6 if real == torch.float32 else 1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("sides", [1, 2, 4])
+def test_solutions_are_scipys(sides, dtype):
+    matrix, rhs = triangles(60, 4.0), random(3600, sides)
+    cycle = Hierarchy(matrix, CPU, dtype=dtype).cycle
+    options = {"tolerance": 1e-12, "max_iterations": 100, "dtype": dtype}
+    found, steps, converged = compressed_gradients(matrix, cycle, rhs, start=None, **options)
+    assert converged
+    assert 0 < steps < 60
+    exact = torch.from_numpy(spsolve(matrix.tocsc(), rhs.numpy())).reshape(rhs.shape)
+    assert_close(found, exact, rtol=1e-8, atol=1e-8 * float(exact.abs().max()))
+    kept, none, _ = compressed_gradients(
+        matrix, cycle, rhs, start=exact, **options | {"tolerance": 1e-8}
+    )
+    assert none == 0
+    assert_close(kept, exact, rtol=0, atol=0)
+
+
+def test_steps_are_those_of_torchs_vectors_and_of_any_number_of_threads():
+    matrix, rhs = triangles(160, 3.0), random(25600, 2)
+    hierarchy = Hierarchy(matrix, CPU)
+
+    def times(vectors):
+        return torch.from_numpy(matrix @ vectors.numpy())
+
+    start = torch.from_numpy(matrix.diagonal()).rsqrt()[:, None] * random(25600, 2)
+    options = {"start": start, "tolerance": 1e-30, "max_iterations": 5}
+    expected, _, _ = conjugate_gradients(times, hierarchy.precondition, rhs, dims=(0,), **options)
+    before, answers = torch.get_num_threads(), []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        answers.append(compressed_gradients(matrix, hierarchy.cycle, rhs, **options)[0])
+    torch.set_num_threads(before)
+    assert_close(answers[0], expected, rtol=1e-8, atol=1e-8 * float(expected.abs().max()))
+    assert_close(answers[1], answers[0], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("wrong", ["negative", "nan", "limit"])
+def test_what_does_not_converge_is_said(wrong):
+    matrix, rhs = triangles(30, 1.0), random(900, 2)
+    if wrong == "negative":
+        matrix = (matrix - diags_array(1.5 * matrix.diagonal())).tocsr()
+    if wrong == "nan":
+        rhs = rhs * torch.nan
+    _, steps, converged = compressed_gradients(
+        matrix,
+        lambda vectors: vectors.clone(),
+        rhs,
+        start=None,
+        tolerance=1e-12,
+        max_iterations=2 if wrong == "limit" else 200,
+    )
+    assert not converged
+    assert steps < 200
