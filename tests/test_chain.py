@@ -6,8 +6,10 @@ import warnings
 import pytest
 import torch
 from torch import nn
+from torch.nn.functional import normalize
 
 import pimper_torch as pt
+from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.metrics import compare_in_view, pair_views, similarity_between_cameras
@@ -35,6 +37,7 @@ from pimper_torch.records import (
 )
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Given
+from tests.coarse import ball
 
 log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figures
 
@@ -205,6 +208,29 @@ def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene) -> ViewCo
         normals_true=truth.normals_world[view],
         where=truth.foreground[view],
     )
+
+
+@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")  # lit in too few views
+@pytest.mark.parametrize("masked", [False, True])
+def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
+    """With the coarse surface's own details for small photographs."""
+    scene = ball.photographed(ball.all_round())
+    if masked:
+        masks = ball.silhouettes_of(scene.cameras).masks
+        scene = scene.replace(views=scene.views.replace(masks=masks))
+    settings = {"scales": [0.5, 1.0]} | (
+        {} if masked else {"silhouettes": {"object": "everything"}}
+    )
+    result = pt.load_chain("default", settings, coarse_surface=CoarseSurface(*ball.SETTINGS))(scene)
+    mesh, coarse = result.mesh, result.coarse.mesh
+    off = mesh.vertices_world.norm(dim=1) - 1
+    chords = coarse.vertices_world[coarse.faces].mean(dim=1).norm(dim=1) - 1
+    # Measured: 0.0012 and 0.0016, the facets of the last pass 0.009; 0.93 degrees in the median.
+    assert off.abs().mean() < 0.0025
+    assert off.abs().max() < 0.02
+    assert off.abs().mean() < 0.25 * chords.abs().mean()
+    assert angles_deg(mesh.normals_world, normalize(mesh.vertices_world, dim=1)).median() < 1.3
+    assert result.report[-1].figures["openings"] == 0
 
 
 @pytest.mark.slow
