@@ -27,7 +27,7 @@ from pimper_torch.evidence.scenes.one_view import (
     photograph,
     regions,
 )
-from pimper_torch.photometry.bas_relief import BasRelief, align_reliefs
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_reliefs
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles

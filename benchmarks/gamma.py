@@ -16,8 +16,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.evidence.datasets import read_uw_ps, read_yale_b
-from pimper_torch.photometry.gamma import GammaEstimate, estimate_gamma, gamma_of_photographs
 from pimper_torch.radiometry import Gamma, Linear, Srgb
+from pimper_torch.single_view.factorization.gamma import (
+    GammaEstimate,
+    estimate_gamma,
+    gamma_of_photographs,
+)
 
 CURVES = {
     "linear": Linear(),

@@ -16,14 +16,17 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.photometry.bilinear import Bilinear, objective
-from pimper_torch.photometry.factorize import CHUNK_ENTRIES, SOLVERS
+from pimper_torch.photometry.factorize import PART_ENTRIES
+from pimper_torch.photometry.factorize import SOLVERS as CHAIN
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Squares
+from pimper_torch.single_view.factorization import solve_alternation, solve_descent
 
 # How strongly lights are held to their start, as a share of what the data say, and the loss.
 CASES = ((1.0, Squares()), (1.0, Cauchy(2.0)), (1e-6, Squares()))
 LIMITS = {"variable-projection": 60, "alternation": 300, "balm": 300, "descent": 300}
+SOLVERS = {**CHAIN, "alternation": solve_alternation, "descent": solve_descent}
 TOLERANCES = {"variable-projection": 1e-4, "alternation": 1e-4, "balm": 1e-3, "descent": 1e-3}
 
 
@@ -58,7 +61,7 @@ def main() -> None:
             before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
             began, spent = time.perf_counter(), time.process_time()
             steps, cost, error, limited = 0, 0.0, [], 0
-            chunk = max(1, CHUNK_ENTRIES // (options.views * options.samples))
+            chunk = max(1, PART_ENTRIES // (options.views * options.samples))
             for first in range(0, options.patches, chunk):
                 some = torch.arange(first, min(first + chunk, options.patches))
                 problem = pose(radiance[some], seen[some], lights[some], normals[some])

@@ -27,11 +27,11 @@ from pimper_torch.evidence.scenes.bodies import Texture
 from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.photometry.ambiguity import align_factorizations
-from pimper_torch.photometry.bas_relief import BasRelief, align_reliefs
 from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.radiometry import linear_from_srgb
+from pimper_torch.single_view.factorization.ambiguity import align_factorizations
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_reliefs
 from pimper_torch.single_view.photometric_stereo import PhotometricStereo, photometric_stereo
 from pimper_torch.single_view.photometric_stereo.methods import METHODS
 

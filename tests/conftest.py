@@ -283,3 +283,46 @@ def dtu(tmp_path_factory):
     scipy.io.savemat(root / "ObsMask" / "ObsMask9_10.mat", mask)
     scipy.io.savemat(root / "ObsMask" / "Plane9.mat", {"P": np.array([[0.0], [0], [1], [20]])})
     return root
+
+
+@pytest.fixture
+def problem(generator):
+    """Random factors on the cone, their exact product, and a perturbed start."""
+    from torch.nn.functional import normalize
+
+    from pimper_torch.photometry.bilinear import Bilinear
+    from pimper_torch.photometry.cone import project_to_cone
+    from pimper_torch.photometry.harmonics import harmonics
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    def random_lights(views: int) -> torch.Tensor:
+        lights = 0.5 * normal(views, 4)
+        lights[:, 0] = 1 + lights[:, 0].abs()
+        lights[:, 3] = -0.6 - lights[:, 3].abs()  # from the viewer's side
+        return lights
+
+    def make(
+        patches: int = 2, views: int = 20, samples: int = 150, off: float = 0.05, missing: float = 0
+    ) -> tuple[Bilinear, torch.Tensor, torch.Tensor]:
+        n = normalize(normal(patches, samples, 3), dim=-1)
+        n[..., 2] = -n[..., 2].abs()
+        albedo = 0.4 + 0.2 * normal(patches, samples).abs()
+        shading = (albedo[..., None] * harmonics(n)).mT
+        lights = torch.stack([random_lights(views) for _ in range(patches)])
+        draw = torch.rand(patches, views, samples, generator=generator, dtype=torch.float64)
+        weight = (draw >= missing).double()
+        start = lights + off * normal(*lights.shape)
+        from_shading = project_to_cone((shading + off * normal(*shading.shape)).mT).mT
+        given = Bilinear(
+            radiance=weight * (lights @ shading),
+            weight=weight,
+            lights=start,
+            anchor=start,
+            shading=from_shading,
+            pull=torch.zeros(patches, views, dtype=torch.float64),
+        )
+        return given, lights, shading
+
+    return make

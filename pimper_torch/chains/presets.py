@@ -49,6 +49,9 @@ _FORMER = {
     "adapt": "`remesh`",
     "mend": "no setting: `Repair` takes a `RepairConfig`",
     "fuse.rims": "`fuse.contours`",
+    "factorize.start": "no setting: lights and normals start at the coarse mesh",
+    "factorize.rank": "no setting: light is of first order; see single_view.factorization",
+    "factorize.colour": "no setting: see solve_in_colour of single_view.factorization",
     **{
         f"triangulate.{name}": "no setting: `Triangulate` takes `TriangulateDetails`"
         for name in [

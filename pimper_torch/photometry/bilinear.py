@@ -14,16 +14,14 @@ problem; with any vectors, low-rank factorization with missing data.
 A solver is a function of such a problem, a limit of iterations and a tolerance.
 """
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.photometry.manifolds import Cone, Free, Manifold
+from pimper_torch.photometry.manifolds import Cone, Manifold
 from pimper_torch.photometry.quadratics import (
     PackedCholesky,
     apply_packed,
@@ -36,8 +34,6 @@ from pimper_torch.photometry.quadratics import (
 )
 from pimper_torch.photometry.robust import Loss, Squares, spread
 from pimper_torch.records import Convergence, Record, StopCause
-
-AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 # The spread of residuals is never taken to be less than this share of a patch's brightness:
 # on exact data all residuals are rounding, and none is an outlier.
@@ -88,15 +84,6 @@ class Bilinear(Record):
         data = (self.radiance, self.anchor, self.pull, self.prior)
         return any(part is not None and part.requires_grad for part in data)
 
-    def detached(self) -> "Bilinear":
-        """Give the same problem to a solver, without gradients."""
-        tensors = {
-            field.name: value.detach()
-            for field in dataclasses.fields(self)
-            if isinstance(value := getattr(self, field.name), Tensor)
-        }
-        return self.replace(**tensors)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Factors(Record):
@@ -116,13 +103,6 @@ class Factors(Record):
 
 
 Solver = Callable[[Bilinear, int, float], Factors]
-
-
-def select(record: AnyRecord, patches: Int[Tensor, " chosen"] | slice) -> AnyRecord:
-    """Keep some patches of a record whose tensors all lead with the patch; of a slice, views."""
-    fields = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
-    chosen = {name: value[patches] for name, value in fields.items() if isinstance(value, Tensor)}
-    return record.replace(**chosen)
 
 
 def reweigh(
@@ -215,7 +195,7 @@ def follow(
     By Gauss-Newton steps along the manifold, at most as long as their model holds; a sample that
     a step does not help stays. Exact at once where any vector will do.
     """
-    if isinstance(problem.manifold, Free):
+    if problem.manifold.flat:
         return PackedCholesky(packed, shading.shape[1]).solve(rhs)
     image = apply_packed(packed, shading)
     value = dot(shading, image - 2 * rhs)

@@ -1,4 +1,4 @@
-"""The last word on every sample: the exact minimum on the manifold, and how sure it is."""
+"""Sample by sample: albedo under given normals, the exact minimum on the manifold, and how sure."""
 
 import math
 from dataclasses import dataclass
@@ -66,29 +66,37 @@ def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
 
 def fit_albedo(
     radiance: Float[Tensor, "patch view channel sample"],
-    weight: Float[Tensor, "patch view light sample"],
-    lights: Float[Tensor, "patch view light rank"],
+    weight: Float[Tensor, "patch view sample"],
+    lights: Float[Tensor, "patch view rank"],
     basis: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch channel sample"]:
     """Give every channel's albedo in closed form, lights and normals given.
 
     Args:
         radiance: Linear.
-        weight: Of each entry.
-        lights: One for all channels, or one each; so the weights.
+        weight: Of each entry, alike for all channels.
+        lights: Alike for all channels.
         basis: What albedo 1 makes of the normals.
 
     Not negative; zero where nothing is lit. Differentiable.
     """
-    channels, count = [], lights.shape[2]
-    for light in range(count):
-        shading = lights[:, :, light] @ basis
-        lit = weight[:, :, light] * shading
-        square = (lit * shading).sum(dim=1)[:, None]
-        product = torch.einsum("pfk,pfck->pck", lit, radiance[:, :, light::count])
-        some = square > torch.finfo(square.dtype).tiny ** 0.5
-        channels.append(torch.where(some, product / torch.where(some, square, 1), 0))
-    return torch.cat(channels, dim=1).clamp_min(0)
+    shading = lights @ basis
+    lit = weight * shading
+    square = (lit * shading).sum(dim=1)[:, None]
+    product = torch.einsum("pfk,pfck->pck", lit, radiance)
+    some = square > torch.finfo(square.dtype).tiny ** 0.5
+    return torch.where(some, product / torch.where(some, square, 1), 0).clamp_min(0)
+
+
+def start_from_mesh(
+    radiance: Float[Tensor, "patch view sample"],
+    seen: Bool[Tensor, "patch view sample"],
+    lights: Float[Tensor, "patch view rank"],
+    basis: Float[Tensor, "patch rank sample"],
+) -> Float[Tensor, "patch rank sample"]:
+    """Give shading vectors along a basis, that of the mesh's normals, with the best albedo."""
+    weight = seen.to(radiance.dtype)
+    return fit_albedo(radiance[:, :, None], weight, lights, basis) * basis
 
 
 def light_varies(

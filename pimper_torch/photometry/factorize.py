@@ -15,22 +15,17 @@ from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.carry import carried_normals
-from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
-from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold
-from pimper_torch.photometry.colour import solve_in_colour, split_colours
-from pimper_torch.photometry.descent import solve_descent
-from pimper_torch.photometry.harmonics import rotate_lights
+from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold, start_from_mesh
+from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.light_field import LightField, faces_lamp
-from pimper_torch.photometry.manifolds import Cone, Free, Manifold, SecondOrder
+from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.mesh_light import light_of_mesh
-from pimper_torch.photometry.parts import joined_parts, parts_of
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, on_raster, rows_of
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
-from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.photometry.verdicts import judge_data, warn_of_verdicts
 from pimper_torch.records import (
@@ -53,15 +48,11 @@ LEAST_PULL = 1e-6
 # The Gauss-Newton matrix of a patch's lights is summed over about this many samples.
 CURVATURE_SAMPLES = 256
 
-MANIFOLDS: dict[int, Manifold] = {3: Free(), 4: Cone(), 9: SecondOrder()}
-
 SOLVERS: dict[str, Solver] = {
     "variable-projection": partial(
         solve_variable_projection, small_steps=1, curvature_samples=CURVATURE_SAMPLES
     ),
-    "alternation": solve_alternation,
     "balm": solve_balm,
-    "descent": solve_descent,
 }
 
 LOSSES: dict[str, Callable[[float], Loss]] = {
@@ -76,6 +67,10 @@ AT_REST = 300, 1e-9
 # A surface is right to so many samples, where it casts shadows.
 SHADOW_SAMPLES = 2.0
 
+# Patches are factorized so many entries of J at a time, or one by one: what they need fits the
+# cache.
+PART_ENTRIES = 400_000
+
 # The spread of a patch's residuals is read off about this many samples.
 SPREAD_SAMPLES = 512
 
@@ -84,22 +79,15 @@ SPREAD_SAMPLES = 512
 class FactorizeConfig:
     """Settings of :class:`Factorize`.
 
-    The published method is ``start="svd"``, ``light="soft"``, ``solver="balm"``,
-    ``loss="squares"``, and all that holds lights and normals 0.
+    The published method is ``light="soft"``, ``solver="balm"``, ``loss="squares"``, and all that
+    holds lights and normals 0.
 
     Attributes:
         light: What is fitted to the coarse mesh: ``"soft"``, one first-order light a view all
             over the scene; ``"lamp"``, an ambient term and a lamp at some place, with attached
             shadows; ``"auto"``, the one of them that explains the photographs better.
-        rank: Of the light: 3, a distant lamp and nothing else; 4, first order; 9, second order.
-        colour: Whether every channel has lights of its own, with normals shared: for lamps of
-            different colours. Takes several times as long.
-        start: Where lights and normals start: ``"mesh"``, lights fitted to the coarse
-            mesh; ``"svd"``, the data's own factors, whose Lorentz ambiguity is then fixed by
-            the lights that the mesh gives.
         solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
-            eliminated; ``"alternation"``, least squares in turns; ``"balm"``, augmented
-            Lagrangian; ``"descent"``, autograd with projection.
+            eliminated; ``"balm"``, augmented Lagrangian.
         light_pull: How strongly each patch's lights hold to those fitted to the mesh, in units
             of the patch's own data; 0 leaves them free, 1e6 fixes them.
         geometry_weight: How strongly normals hold to the coarse ones, in units of one view.
@@ -115,14 +103,11 @@ class FactorizeConfig:
             needs; about the angle, in radians, by which the light moved across its way.
         max_iterations: Of the solver.
         tolerance: Relative change at which a patch is done: of its objective with variable
-            projection and alternation, of its shading vectors with the others.
+            projection, of its shading vectors with BALM.
     """
 
     light: Literal["auto", "soft", "lamp"] = "auto"
-    rank: Literal[3, 4, 9] = 4
-    colour: bool = False
-    start: Literal["mesh", "svd"] = "mesh"
-    solver: Literal["variable-projection", "alternation", "balm", "descent"] = "variable-projection"
+    solver: Literal["variable-projection", "balm"] = "variable-projection"
     light_pull: float = 1.0
     geometry_weight: float = 0.1
     loss: Literal["squares", "cauchy"] = "cauchy"
@@ -136,10 +121,6 @@ class FactorizeConfig:
     def __post_init__(self) -> None:
         models = ("auto", "soft", "lamp")
         require(self.light in models, "factorize.light", self.light, "auto, soft or lamp")
-        require(self.rank in MANIFOLDS, "factorize.rank", self.rank, "3, 4 or 9")
-        four = self.rank == 4 or self.start == "mesh"
-        require(four, "factorize.start", self.start, "mesh unless rank 4")
-        require(self.start in ("mesh", "svd"), "factorize.start", self.start, "mesh or svd")
         require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
         require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
         for name in ("light_pull", "geometry_weight"):
@@ -181,7 +162,7 @@ class _Posed(Record):
     """Their factorization, ready to be solved."""
 
     rows: Rows
-    anchor: Float[Tensor, "patch view rank"]
+    anchor: Float[Tensor, "patch view 4"]
     verdict: Int[Tensor, " patch"]
     problem: Bilinear
 
@@ -198,9 +179,8 @@ class Factorize(Stage):
     :meth:`solve` for some patches at a time, and :meth:`conclude` for all that were solved.
 
     Gauge: albedo and light share one free factor for the whole scene; it is set so that the
-    99th percentile of gray albedo is 1. With nothing that holds lights and ``start="svd"`` each
-    patch has, besides, its own Lorentz ambiguity, fixed by the mesh's lights as well as a
-    nearly plane facet allows.
+    99th percentile of gray albedo is 1. With nothing that holds lights each patch has, besides,
+    its own Lorentz ambiguity, which stays at that of the start.
 
     Where it fails softly: samples lit in fewer than ``min_views`` views, or found to face
     away, carry the coarse normal, are not ``valid`` and have confidence 0. Patches that light
@@ -212,8 +192,7 @@ class Factorize(Stage):
     Differentiable in the radiance and in templates and normals that it starts from: light field,
     lights and samples by the implicit function at the optimum (see
     :mod:`~pimper_torch.photometry.implicit`), which Newton's method takes them to where gradients
-    are asked for. Which samples count is constant, and so is the start from the data's own
-    factors, to which lights hold that nothing else does (``start="svd"`` without ``light_pull``).
+    are asked for. Which samples count is constant.
     """
 
     def __init__(self, config: FactorizeConfig | None = None) -> None:
@@ -223,19 +202,11 @@ class Factorize(Stage):
     def forward(self, seen: PatchViews) -> PhotometricPatches:
         """Factorize all patches: :meth:`light`, :meth:`solve` and :meth:`conclude` in turn."""
         light = self.light(seen)
-        parts = [part for bucket in range(len(seen.buckets)) for part in parts_of(seen, bucket)]
-        solved = list(side_by_side(lambda part: self.solve(part.seen, light), parts))
-        joined = [
-            joined_parts(
-                [
-                    one.buckets[0]
-                    for one, part in zip(solved, parts, strict=True)
-                    if part.bucket == bucket
-                ]
-            )
-            for bucket in range(len(seen.buckets))
-        ]
-        return self.conclude(PhotometricPatches(patches=seen.patches, buckets=tuple(joined)))
+        parts = [_in_parts(seen, bucket) for bucket in range(len(seen.buckets))]
+        flat = [part for some in parts for part in some]
+        solved = iter(list(side_by_side(lambda part: self.solve(part, light).buckets[0], flat)))
+        joined = tuple(Photometry.cat([next(solved) for _ in some]) for some in parts)
+        return self.conclude(PhotometricPatches(patches=seen.patches, buckets=joined))
 
     def light(self, seen: PatchViews) -> Illumination:
         """Fit the light field.
@@ -263,7 +234,7 @@ class Factorize(Stage):
             bucket = _Bucket(templates=templates, registered=registered, normals=normals)
             lit = bucket.replace(registered=_lit(bucket, light))
             posed = self._pose(lit, light.field)
-            buckets.append(self._conclude(lit, posed, *self._solve(posed)))
+            buckets.append(self._conclude(lit, posed, self._solve(posed.problem)))
         return PhotometricPatches(patches=seen.patches, buckets=tuple(buckets))
 
     def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
@@ -276,7 +247,7 @@ class Factorize(Stage):
         config = self.config
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
         middle = invert_rigid(patch_from_world)[:, :3, 3]
-        anchor = _of_rank(rotate_lights(patch_from_world, field.lights_at(middle)), config.rank)
+        anchor = rotate_lights(patch_from_world, field.lights_at(middle))
         lamp = rotate(patch_from_world, field.lamp_at(middle))
         rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
         shown = bucket.registered.valid & bucket.templates.inside[:, None]
@@ -294,11 +265,9 @@ class Factorize(Stage):
         problem = self._problem(rows, anchor, raster)
         return _Posed(rows=rows, anchor=anchor, verdict=verdict, problem=problem)
 
-    def _conclude(
-        self, bucket: _Bucket, posed: _Posed, problem: Bilinear, factors: Factors
-    ) -> Photometry:
-        rows, normals = posed.rows, bucket.normals
-        if torch.is_grad_enabled() and posed.problem.requires_grad:
+    def _conclude(self, bucket: _Bucket, posed: _Posed, factors: Factors) -> Photometry:
+        rows, normals, problem = posed.rows, bucket.normals, posed.problem
+        if torch.is_grad_enabled() and problem.requires_grad:
             factors = differentiable(problem, factors)
         found = refine_on_manifold(problem, factors)
         sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
@@ -308,45 +277,30 @@ class Factorize(Stage):
         verdict = torch.where(failed, int(PatchVerdict.FAILED), posed.verdict)
         determined = verdict == int(PatchVerdict.DETERMINED)
         valid = lit & determined[:, None] & sure & (found.normals[..., 2] < 0)
-        # In colour every channel is a view of the problem.
-        channels = problem.radiance.shape[1] // rows.seen.shape[1]
-        anchor = posed.anchor.repeat_interleave(channels, dim=1)
-        lights = torch.where(determined[:, None, None], factors.lights, anchor)
-        by_channel = (len(lights), rows.seen.shape[1], channels, -1)
-        lights = lights.reshape(by_channel) * rows.seen.any(dim=2)[..., None, None]
+        lights = torch.where(determined[:, None, None], factors.lights, posed.anchor)
+        lights = lights * rows.seen.any(dim=2)[..., None]
         chosen = torch.where(valid[..., None], found.normals, rows.normals)
         weight = torch.where(determined[:, None, None], factors.weight, problem.weight)
-        basis = problem.manifold.join(torch.ones_like(chosen[..., 0]), chosen).mT
-        albedo = fit_albedo(rows.radiance, weight.reshape(by_channel), lights, basis)
+        albedo = fit_albedo(rows.radiance, weight, lights, harmonics(chosen).mT)
         nothing = torch.zeros_like(bucket.registered.valid[:, 0])
         blank = torch.zeros_like(normals[..., 0])
         black = blank[..., None].expand(-1, -1, -1, albedo.shape[1])
         return Photometry(
             normals_patch=on_raster(chosen, rows.place, normals),
             albedo=on_raster(albedo.mT, rows.place, black),
-            lights_patch=_with_ambient(lights.mean(dim=2)),
+            lights_patch=lights,
             valid=on_raster(valid, rows.place, nothing),
             confidence=on_raster(found.confidence * valid, rows.place, blank),
             verdict=verdict,
             convergence=factors.convergence,
         )
 
-    def _problem(
-        self, rows: Rows, anchor: Float[Tensor, "patch view rank"], raster: int
-    ) -> Bilinear:
-        config = self.config
+    def _problem(self, rows: Rows, anchor: Float[Tensor, "patch view 4"], raster: int) -> Bilinear:
+        config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
-        manifold = MANIFOLDS[config.rank]
-        basis = manifold.join(torch.ones_like(rows.normals[..., 0]), rows.normals).mT
-        shading = start_from_mesh(gray, rows.seen, anchor, basis)
-        lights = anchor
-        if config.start == "svd":
-            with torch.no_grad():
-                lights, shading = start_from_data(gray, rows.seen, anchor, shading)
-        if config.light_pull == 0:
-            anchor = lights
-        square = manifold.split(shading.mT)[0] ** 2
+        shading = start_from_mesh(gray, rows.seen, anchor, harmonics(rows.normals).mT)
+        square = shading[:, 0] ** 2
         count = (square > 0).sum(dim=1).clamp_min(1)
         seen_square = (weight @ square[..., None])[..., 0]
         borrowed = BORROWED_SAMPLES * square.sum(dim=1) / count
@@ -356,51 +310,42 @@ class Factorize(Stage):
         prior = None
         if config.geometry_weight > 0:
             gamma = config.geometry_weight * level
-            prior = gamma[:, None, None] * manifold.bend(rows.normals.mT)
+            prior = gamma[:, None, None] * cone.bend(rows.normals.mT)
         return Bilinear(
             radiance=gray,
             weight=weight,
-            lights=lights,
+            lights=anchor,
             anchor=anchor,
             shading=shading,
             pull=pull,
             prior=prior,
-            manifold=manifold,
+            manifold=cone,
             loss=LOSSES[config.loss](config.loss_scale),
             stride=max(1, raster // SPREAD_SAMPLES),
         )
 
-    def _solve(self, posed: _Posed) -> tuple[Bilinear, Factors]:
-        problem, config = posed.problem, self.config
-        data = problem.detached()
-        solve, limits = SOLVERS[config.solver], (config.max_iterations, config.tolerance)
+    def _solve(self, problem: Bilinear) -> Factors:
+        config = self.config
+        limits = config.max_iterations, config.tolerance
         if torch.is_grad_enabled() and problem.requires_grad:
             limits = max(limits[0], AT_REST[0]), min(limits[1], AT_REST[1])
-        if not config.colour:
-            return problem, solve(data, *limits)
-        radiance = posed.rows.radiance
-        found = solve_in_colour(data, radiance.detach(), solve, *limits)
-        factors = Factors(
-            lights=found.lights.flatten(1, 2),
-            shading=found.shading,
-            weight=found.weight.flatten(1, 2),
-            convergence=found.convergence,
+        return SOLVERS[config.solver](problem.detach(), *limits)
+
+
+def _in_parts(seen: PatchViews, bucket: int) -> list[PatchViews]:
+    """Cut a bucket into batches of bounded size, as views of its memory."""
+    templates, registered = seen.patches.buckets[bucket], seen.buckets[bucket]
+    count, num_views = registered.valid.shape[:2]
+    samples = max(int(templates.inside.sum(dim=(1, 2)).max()), 1) if count else 1
+    size = max(1, PART_ENTRIES // (samples * max(num_views, 1)))
+    return [
+        PatchViews(
+            patches=seen.patches.replace(buckets=(templates.take(some),)),
+            buckets=(registered.take(some),),
         )
-        return split_colours(problem, radiance, found.chroma), factors
-
-
-def _of_rank(lights: Float[Tensor, "*batch 4"], rank: int) -> Float[Tensor, "*batch rank"]:
-    """Leave the ambient part out, or add the second order, zero."""
-    if rank == 3:
-        return lights[..., 1:]
-    return torch.cat([lights, lights.new_zeros(*lights.shape[:-1], rank - 4)], dim=-1)
-
-
-def _with_ambient(lights: Float[Tensor, "*batch rank"]) -> Float[Tensor, "..."]:
-    """Give lights without an ambient part the part zero."""
-    if lights.shape[-1] > 3:
-        return lights
-    return torch.cat([torch.zeros_like(lights[..., :1]), lights], dim=-1)
+        for first in range(0, max(count, 1), size)
+        for some in (slice(first, first + size),)
+    ]
 
 
 def _lit(bucket: _Bucket, light: Illumination) -> Observations:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from pimper_torch.photometry.bilinear import Bilinear, select
+from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.records import Record, StopCause
 
 State = TypeVar("State", bound=Record)
@@ -55,7 +55,7 @@ def iterate(
             return final, taken, causes
         if float((~running).double().mean()) >= _COMPACT_SHARE:
             keep = running.nonzero()[:, 0]
-            state, problem, patches = select(state, keep), select(problem, keep), patches[keep]
+            state, problem, patches = state.take(keep), problem.take(keep), patches[keep]
             running = running[keep]
     _store(final, state, names, patches, running)
     return final, taken, causes

@@ -1,98 +1,69 @@
-r"""What shading vectors can be: the photometric manifolds of each order of lighting.
+r"""What shading vectors can be: a photometric manifold, of first-order light the cone.
 
-A surface shows :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends
-on albedo and normal alone. Which vectors those are decides how much of a factorization is free:
-
-====================  ====  ============================  =====================
-light                 rank  :math:`s`                     left free
-====================  ====  ============================  =====================
-any low-rank matrix   any   any vector                    an invertible matrix
-a distant lamp        3     :math:`\rho n`: any vector    an invertible 3 x 3
-first order           4     :math:`\rho (1, n)`           scaled Lorentz
-second order          9     :math:`\rho (1, n, n n^\top)` rotation, scale
-====================  ====  ============================  =====================
+A surface shows :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
+albedo and normal alone: :math:`s = \rho (1, n)` to first order, of rank four, which leaves a
+scaled Lorentz transformation free. Other orders of light, and any low-rank matrix, are in
+:mod:`pimper_torch.single_view.factorization.manifolds`.
 
 Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
 """
 
-import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError
 from pimper_torch.photometry.cone import (
     project_to_cone,
     split_shading,
     tangent_columns,
     tangents,
 )
-from pimper_torch.photometry.quadratics import outer
-
-# Newton's iteration for the nearest second-order vector doubles its digits each step.
-_SECULAR_STEPS = 30
 
 
-@dataclass(frozen=True, slots=True)
-class Free:
-    """Any vectors: low-rank factorization, and with rank three albedo times normal."""
+@runtime_checkable
+class Manifold(Protocol):
+    """What shading vectors can be."""
 
-    rank: int = 3
+    @property
+    def flat(self) -> bool:
+        """Whether any vector will do, so that normal equations give the best at once."""
 
     def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Give the nearest vector of the manifold: the vector itself."""
-        return shading
+        """Give the nearest vector of the manifold."""
 
     def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Bring back what a small step along the tangents has left: nothing."""
-        return shading
+        """Bring back what a small step along the tangents has left."""
+
+    def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
+        """Span the tangent space at each column: albedo first, then two turns of the normal."""
 
     def curvature(
         self,
         shading: Float[Tensor, "*batch rank sample"],
         slope: Float[Tensor, "*batch rank sample"],
-    ) -> Float[Tensor, "*batch sample rank rank"]:
-        """Give the manifold's part of second derivatives: flat, it has none."""
-        return slope.new_zeros(*slope.shape[:-2], slope.shape[-1], self.rank, self.rank)
+    ) -> Float[Tensor, "*batch sample tangent tangent"]:
+        r"""Give the manifold's part of the second derivatives by the tangents' coordinates.
 
-    def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
-        """Span the tangent space: all of it. With rank three albedo first, then two turns."""
-        if self.rank == 3:
-            _, normal = self.split(shading.mT)
-            return [column.mT for column in (normal, *tangents(normal))]
-        eye = torch.eye(self.rank, dtype=shading.dtype, device=shading.device)
-        return [axis[:, None].expand_as(shading) for axis in eye]
+        Of a function with gradient ``slope``, :math:`g \cdot \partial^2 s`.
+        """
 
     def split(
         self, shading: Float[Tensor, "*batch rank"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Read albedo and unit normal off vectors of rank three."""
-        self._only_three()
-        length = shading.norm(dim=-1)
-        return length, shading / torch.where(length > 0, length, 1)[..., None]
+        """Read albedo and unit normal off the vectors."""
 
     def join(
         self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch 3"]:
+    ) -> Float[Tensor, "*batch rank"]:
         """Give the vectors of albedo and normal."""
-        self._only_three()
-        return albedo[..., None] * normals
 
-    def bend(self, normals: Float[Tensor, "*batch 3 sample"]) -> Float[Tensor, "*batch 6 sample"]:
-        r"""Give the quadratic form :math:`\lVert b - (b \cdot \bar n) \bar n \rVert^2`, packed."""
-        self._only_three()
-        one, zero = torch.ones_like(normals[..., 0, :]), torch.zeros_like(normals[..., 0, :])
-        unit = torch.stack([one, zero, zero, one, zero, one], dim=-2)
-        return unit - outer(normals)
-
-    def _only_three(self) -> None:
-        if self.rank != 3:
-            raise InputError(
-                f"vectors of rank {self.rank} have no albedo and normal; needed: rank 3."
-            )
+    def bend(
+        self, normals: Float[Tensor, "*batch 3 sample"]
+    ) -> Float[Tensor, "*batch packed sample"]:
+        """Give the quadratic form of bending away from normals, packed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +71,7 @@ class Cone:
     r"""First-order lighting: :math:`\rho (1, n)`."""
 
     rank: ClassVar[int] = 4
+    flat: ClassVar[bool] = False
 
     def project(self, shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
         """Give the nearest vector of the manifold."""
@@ -123,7 +95,7 @@ class Cone:
         albedo, normal = self.split(shading.mT)
         first, second = tangents(normal)
         along = [(slope[..., 1:, :].mT * part).sum(dim=-1) for part in (normal, first, second)]
-        return _bending(-along[0], along[1], along[2], torch.zeros_like(albedo), albedo)
+        return bending(-along[0], along[1], along[2], torch.zeros_like(albedo), albedo)
 
     def split(
         self, shading: Float[Tensor, "*batch 4"]
@@ -146,176 +118,23 @@ class Cone:
         return torch.stack(rows, dim=-2)
 
 
-@dataclass(frozen=True, slots=True)
-class SecondOrder:
-    r"""Second-order lighting: :math:`\rho\, Y(n)`, nine harmonics.
-
-    :math:`Y(n) = (1, n, \sqrt 3 xy, \sqrt 3 xz, \sqrt 3 yz, \tfrac{\sqrt 3}{2}(x^2 - y^2),
-    \tfrac12 (3 z^2 - 1))`, each degree of length one, other constants folded into the light.
-    """
-
-    rank: ClassVar[int] = 9
-
-    def project(self, shading: Float[Tensor, "*batch 9"]) -> Float[Tensor, "*batch 9"]:
-        r"""Give the nearest vector of the manifold.
-
-        The normal maximises :math:`b \cdot n + n^\top Q n` on the sphere, with ``b`` and ``Q``
-        the vector's first and second degree: the largest root of a secular equation, found by
-        Newton's method. Albedo is the third of what is reached, or zero. Constant to autograd.
-        """
-        with torch.no_grad():
-            vector, form = shading[..., 1:4].double(), _quadratic(shading[..., 4:].double())
-            values, axes = torch.linalg.eigh(2 * form)
-            inner = (axes.mT @ vector[..., None])[..., 0]
-            # |(m - values)^-1 inner| = 1 has one root beyond the largest value; its inverse
-            # is concave there, so that Newton from the left end never overshoots.
-            top = values[..., -1:]
-            tiny = 1e-12 * (
-                values.abs().amax(dim=-1, keepdim=True) + vector.norm(dim=-1)[..., None]
-            )
-            root = top + inner[..., -1:].abs().maximum(tiny.clamp_min(1e-300))
-            for _ in range(_SECULAR_STEPS):
-                part = inner / (root - values)
-                length = part.norm(dim=-1, keepdim=True).clamp_min(1e-90)
-                slope = (part**2 / (root - values)).sum(dim=-1, keepdim=True) / length**3
-                root = torch.maximum(root + (1 - 1 / length) / slope.clamp_min(1e-300), root)
-            found = inner / (root - values)
-            # Where b has no part along the largest value's axis that axis makes up the length.
-            rest = (1 - found[..., :-1].square().sum(dim=-1, keepdim=True)).clamp_min(0).sqrt()
-            last = torch.where(found[..., -1:] < 0, -rest, rest)
-            found = torch.cat([found[..., :-1], last], dim=-1)
-            normal = (axes @ found[..., None])[..., 0]
-            normal = normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-300)
-        return self._along(shading, normal.to(shading))
-
-    def retract(self, shading: Float[Tensor, "*batch 9"]) -> Float[Tensor, "*batch 9"]:
-        """Bring back what a small step along the tangents has left: by its first degree."""
-        vector = shading[..., 1:4]
-        length = vector.norm(dim=-1, keepdim=True)
-        return self._along(shading, vector / torch.where(length > 0, length, 1))
-
-    def tangents(self, shading: Float[Tensor, "*batch 9 sample"]) -> list[Tensor]:
-        r"""Span the tangent space: albedo, and two turns of the normal by :math:`1/\rho`."""
-        _, normal = self.split(shading.mT)
-        first, second = tangents(normal)
-        columns = [second_order(normal)]
-        for turn in (first, second):
-            nothing = torch.zeros_like(turn[..., :1])
-            columns.append(torch.cat([nothing, turn, _differential(normal, turn)], dim=-1))
-        return [column.mT for column in columns]
-
-    def curvature(
-        self, shading: Float[Tensor, "*batch 9 sample"], slope: Float[Tensor, "*batch 9 sample"]
-    ) -> Float[Tensor, "*batch sample 3 3"]:
-        r"""Give the manifold's part of the second derivatives; see :meth:`Cone.curvature`."""
-        albedo, normal = self.split(shading.mT)
-        g = slope.mT
-        turns = tangents(normal)
-        outward = (g[..., 1:4] * normal).sum(dim=-1)
-        outward = outward + (g[..., 4:] * _differential(normal, normal)).sum(dim=-1)
-        mixed = [
-            (g[..., 1:4] * turn).sum(dim=-1)
-            + (g[..., 4:] * _differential(normal, turn)).sum(dim=-1)
-            for turn in turns
-        ]
-        twice = {
-            (a, b): (g[..., 4:] * _differential(turns[a], turns[b])).sum(dim=-1)
-            for a, b in ((0, 0), (0, 1), (1, 1))
-        }
-        flat = _bending(-outward, mixed[0], mixed[1], twice[0, 1], albedo)
-        safe = torch.where(albedo > 0, albedo, 1)
-        bend = torch.zeros_like(flat)
-        bend[..., 1, 1], bend[..., 2, 2] = twice[0, 0] / safe, twice[1, 1] / safe
-        return flat + bend
-
-    def split(
-        self, shading: Float[Tensor, "*batch 9"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Read albedo and unit normal off the vectors."""
-        return split_shading(shading[..., :4])
-
-    def join(
-        self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch 9"]:
-        """Give the vectors of albedo and normal."""
-        return albedo[..., None] * second_order(normals)
-
-    def bend(self, normals: Float[Tensor, "*batch 3 sample"]) -> Float[Tensor, "*batch 45 sample"]:
-        r"""Give the quadratic form :math:`\lVert b - \rho \bar n \rVert^2`, packed."""
-        small = Cone().bend(normals)
-        wide = small.new_zeros(*small.shape[:-2], 45, small.shape[-1])
-        # Row i of the packed triangle of nine begins after 9 + 8 + ...; of four, 4 + 3 + ...
-        nine, four = (0, 9, 17, 24), (0, 4, 7, 9)
-        for row in range(4):
-            wide[..., nine[row] : nine[row] + 4 - row, :] = small[
-                ..., four[row] : four[row] + 4 - row, :
-            ]
-        return wide
-
-    def _along(
-        self, shading: Float[Tensor, "*batch 9"], normal: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch 9"]:
-        basis = second_order(normal)
-        albedo = (shading * basis).sum(dim=-1, keepdim=True) / 3
-        return albedo.clamp_min(0) * basis
-
-
-Manifold = Free | Cone | SecondOrder
-
-
-def second_order(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
-    """Give the nine harmonics up to the second order; see :class:`SecondOrder`.
-
-    >>> second_order(torch.tensor([0.0, 0.0, -1.0]))
-    tensor([ 1.,  0.,  0., -1.,  0., -0., -0.,  0.,  1.])
-    """
-    x, y, z = normals.unbind(dim=-1)
-    root = math.sqrt(3)
-    square = (3 * z * z - (x * x + y * y + z * z)) / 2
-    degree = [root * x * y, root * x * z, root * y * z, root / 2 * (x * x - y * y), square]
-    return torch.cat(
-        [torch.ones_like(normals[..., :1]), normals, torch.stack(degree, dim=-1)], dim=-1
-    )
-
-
-def _bending(
+def bending(
     square: Float[Tensor, "*batch"],
     first: Float[Tensor, "*batch"],
     second: Float[Tensor, "*batch"],
     across: Float[Tensor, "*batch"],
     albedo: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Put second derivatives by albedo and two turns together, over albedo."""
+    """Put second derivatives by albedo and two turns together, over albedo.
+
+    Args:
+        square: By each turn twice.
+        first: By albedo and the first turn.
+        second: By albedo and the second.
+        across: By both turns.
+        albedo: In whose units turns are.
+    """
     none = torch.zeros_like(square)
     rows = [[none, first, second], [first, square, across], [second, across, square]]
     matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
     return matrix / torch.where(albedo > 0, albedo, 1)[..., None, None]
-
-
-def _quadratic(degree: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 3 3"]:
-    """Give ``Q`` with ``n^T Q n`` the sum of the second degree's harmonics, unit n."""
-    xy, xz, yz, difference, square = degree.unbind(dim=-1)
-    half, root = math.sqrt(3) / 2, math.sqrt(3) / 2
-    rows = [
-        [root * difference - square / 2, half * xy, half * xz],
-        [half * xy, -root * difference - square / 2, half * yz],
-        [half * xz, half * yz, square],
-    ]
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
-def _differential(
-    normals: Float[Tensor, "*batch 3"], turn: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 5"]:
-    """Give the change of the second degree when normals move along ``turn``."""
-    x, y, z = normals.unbind(dim=-1)
-    a, b, c = turn.unbind(dim=-1)
-    root = math.sqrt(3)
-    degree = [
-        root * (a * y + x * b),
-        root * (a * z + x * c),
-        root * (b * z + y * c),
-        root * (x * a - y * b),
-        2 * z * c - x * a - y * b,
-    ]
-    return torch.stack(degree, dim=-1)

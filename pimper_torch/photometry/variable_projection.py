@@ -35,7 +35,7 @@ from pimper_torch.photometry.bilinear import (
     reweigh,
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
-from pimper_torch.photometry.manifolds import Cone, Free
+from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Convergence, Record, StopCause
@@ -81,7 +81,7 @@ def solve_variable_projection(
 
     Args:
         problem: With its start. In low-rank factorization only the lights matter, which must
-            be of full rank; see :func:`~pimper_torch.photometry.low_rank.random_left`.
+            be of full rank.
         max_iterations: Steps at most.
         tolerance: A step that lowered a patch's objective by less than this share is small.
         small_steps: A patch is done after so many of them in a row: one may be the end of a
@@ -224,7 +224,7 @@ def _whitened(
 ) -> list[Float[Tensor, "patch view sample"]]:
     """Give ``C_k^-1 B_k^T l_f w_fk`` by tangents, ``C C^T`` the sample's normal equations."""
     packed, _ = equations_of_samples(problem, lights, weight)
-    if isinstance(problem.manifold, Free):
+    if problem.manifold.flat:
         slopes = [light[..., None] * weight for light in lights.unbind(dim=2)]
     else:
         columns = problem.manifold.tangents(shading)
@@ -274,7 +274,7 @@ def _move(state: _State) -> Float[Tensor, "patch view rank"]:
 
 def _is_free(problem: Bilinear) -> bool:
     """Tell whether lights are free up to any invertible matrix."""
-    return isinstance(problem.manifold, Free) and not bool((problem.pull > 0).any())
+    return problem.manifold.flat and not bool((problem.pull > 0).any())
 
 
 def _has_kernel(problem: Bilinear) -> bool:

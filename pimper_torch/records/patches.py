@@ -243,10 +243,8 @@ class Photometry(Record):
     Attributes:
         normals_patch: Unit, facing the viewer (``n_z < 0``).
         albedo: Linear, up to one scale shared by all patches.
-        lights_patch: Harmonics ``l`` with radiance = albedo * l . (1, n), n in the patch frame,
-            constants folded in; of second order nine of them (see
-            :class:`~pimper_torch.photometry.manifolds.SecondOrder`). The mean of the channels'
-            where they differ. A view without samples has zeros.
+        lights_patch: First-order harmonics ``l`` with radiance = albedo * l . (1, n), n in the
+            patch frame, constants folded in. A view without samples has zeros.
         valid: True where the sample was determined by the photographs.
         confidence: In [0, 1]; 0 where not valid.
         verdict: A :class:`PatchVerdict` each. The normals of a patch that is not determined
@@ -256,7 +254,7 @@ class Photometry(Record):
 
     normals_patch: Float[Tensor, "patch height width 3"]
     albedo: Float[Tensor, "patch height width channel"]
-    lights_patch: Float[Tensor, "patch view harmonic"]
+    lights_patch: Float[Tensor, "patch view 4"]
     valid: Bool[Tensor, "patch height width"]
     confidence: Float[Tensor, "patch height width"]
     verdict: Int[Tensor, " patch"]

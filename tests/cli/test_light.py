@@ -79,7 +79,7 @@ def test_help_and_refusals_do_not_wait_for_torch(tmp_path):
 
 def test_settings_are_read_as_the_command_reads_them():
     line = ["photos", "-o", "out", "--preset", "fast", "--decompose.overlap-samples", "3"]
-    line += ["--photographs.saturation", "1,2,3", "--factorize.rank", "9"]
+    line += ["--photographs.saturation", "1,2,3", "--factorize.min-views", "9"]
     line += ["--region", "(0,0,0,1,1,1)", "--reference", "a"]
     options = "pimper_torch.cli.options"
     found = light(options, "parse")("reconstruct", line)

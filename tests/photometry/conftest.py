@@ -9,8 +9,6 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.frames import invert_rigid, rigid, transform
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
 from pimper_torch.patches.carry import coarse_normals
-from pimper_torch.photometry.bilinear import Bilinear
-from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.records import CoarseMesh, Mesh, Observations, PatchSet, PatchViews, Templates
 
@@ -33,38 +31,6 @@ def random_lights(views: int, generator: torch.Generator) -> Tensor:
     lights[:, 0] = 1 + lights[:, 0].abs()
     lights[:, 3] = -0.6 - lights[:, 3].abs()  # from the viewer's side
     return lights
-
-
-@pytest.fixture
-def problem(generator: torch.Generator) -> Callable[..., tuple[Bilinear, Tensor, Tensor]]:
-    """Random factors on the cone, their exact product, and a perturbed start."""
-
-    def make(
-        patches: int = 2, views: int = 20, samples: int = 150, off: float = 0.05, missing: float = 0
-    ) -> tuple[Bilinear, Tensor, Tensor]:
-        def normal(*shape: int) -> Tensor:
-            return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-        n = normalize(normal(patches, samples, 3), dim=-1)
-        n[..., 2] = -n[..., 2].abs()
-        albedo = 0.4 + 0.2 * normal(patches, samples).abs()
-        shading = (albedo[..., None] * harmonics(n)).mT
-        lights = torch.stack([random_lights(views, generator) for _ in range(patches)])
-        draw = torch.rand(patches, views, samples, generator=generator, dtype=torch.float64)
-        weight = (draw >= missing).double()
-        start = lights + off * normal(*lights.shape)
-        from_shading = project_to_cone((shading + off * normal(*shading.shape)).mT).mT
-        given = Bilinear(
-            radiance=weight * (lights @ shading),
-            weight=weight,
-            lights=start,
-            anchor=start,
-            shading=from_shading,
-            pull=torch.zeros(patches, views, dtype=torch.float64),
-        )
-        return given, lights, shading
-
-    return make
 
 
 @pytest.fixture

@@ -6,9 +6,10 @@ from torch.testing import assert_close
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.photometry.implicit import differentiable
-from pimper_torch.photometry.manifolds import Cone, Free, SecondOrder
+from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.single_view.factorization.manifolds import Free, SecondOrder
 
 
 @pytest.fixture
@@ -112,7 +113,7 @@ def test_robust_weights_and_the_deviation_they_rest_on_take_part(noisy, generato
 
     def answer(x):
         given = problem.replace(radiance=x["radiance"], prior=x["prior"])
-        found = differentiable(given, solved(given.detached()))
+        found = differentiable(given, solved(given.detach()))
         return {
             "lights": found.lights,
             "shading": found.shading,

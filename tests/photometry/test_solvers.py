@@ -2,21 +2,19 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.alternation import solve_alternation
-from pimper_torch.photometry.ambiguity import align_factorizations
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import (
     equations_of_samples,
     evaluate,
     follow,
     objective,
-    select,
 )
 from pimper_torch.photometry.certainty import refine_on_manifold
-from pimper_torch.photometry.descent import solve_descent
 from pimper_torch.photometry.robust import Cauchy
-from pimper_torch.photometry.starts import start_from_data
 from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.single_view.factorization.alternation import solve_alternation
+from pimper_torch.single_view.factorization.ambiguity import align_factorizations
+from pimper_torch.single_view.factorization.descent import solve_descent
 
 
 def solve_projection(problem, max_iterations, tolerance):
@@ -55,26 +53,6 @@ def test_factors_are_recovered_when_whole_blocks_are_missing(problem):
     given = given.replace(weight=weight, radiance=weight * given.radiance)
     found = solve_descent(given, 800, 1e-8)
     assert error(found.shading, shading, weight) < 1e-3
-
-
-def test_the_data_alone_are_a_start(problem):
-    given, lights, shading = problem(missing=0.3)
-    L, N = start_from_data(given.radiance, given.weight > 0, given.lights, given.shading)
-    assert (N - shading).abs().median() < 0.05  # lights off by 0.05 fix the ambiguity so well
-    assert (L - lights).abs().median() < 0.05
-    assert (((L @ N - given.radiance) * given.weight) ** 2).mean().sqrt() < 1e-2
-    assert error(N, shading, given.weight) < 0.05
-
-
-def test_patches_that_three_views_see_start_where_they_are_told(problem):
-    given, _, _ = problem(patches=2, samples=40)
-    weight = given.weight.clone()
-    weight[1, 3:] = 0
-    seen, J = weight > 0, weight * given.radiance
-    L, N = start_from_data(J, seen, given.lights, given.shading)
-    assert_close(L[1], given.lights[1])
-    assert_close(N[1], given.shading[1])
-    assert (L[0] - given.lights[0]).abs().max() > 1e-3
 
 
 def test_balm_and_descent_agree_on_clean_data(problem):
@@ -150,7 +128,7 @@ def test_a_patch_is_solved_as_if_it_were_alone(problem, solve):
     )
     together = solve(empty, 60, 1e-5)
     for patch in (0, 2):
-        alone = solve(select(given, torch.tensor([patch])), 60, 1e-5)
+        alone = solve(given.take([patch]), 60, 1e-5)
         assert_close(together.shading[patch], alone.shading[0], rtol=0, atol=1e-9)
         assert together.convergence.iterations[patch] == alone.convergence.iterations[0]
     assert together.shading.isfinite().all()

@@ -31,15 +31,15 @@ from pimper_torch.evidence.baselines.template import (
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.paper.integrate import integrate_normals
 from pimper_torch.patches.warp import WarpConfig
-from pimper_torch.photometry.ambiguity import align_factorizations
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Factors
-from pimper_torch.photometry.certainty import refine_on_manifold
+from pimper_torch.photometry.certainty import refine_on_manifold, start_from_mesh
 from pimper_torch.photometry.cone import split_shading
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.lights import fit_distant_lights
-from pimper_torch.photometry.starts import start_from_data, start_from_mesh
 from pimper_torch.records import CoarseMesh, Convergence, Estimate, Record, SparseScene
+from pimper_torch.single_view.factorization.ambiguity import align_factorizations
+from pimper_torch.single_view.factorization.starts import start_from_data
 from pimper_torch.stage import Stage
 
 # Lights are fitted to the mesh, and the ambiguity is fixed, on this many samples.

@@ -11,9 +11,9 @@ from rich.console import Console
 from pimper_torch.cli.bars import Bars
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import list_images, load_views, read_mask
-from pimper_torch.photometry.gamma import GammaEstimate, gamma_of_photographs
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import LINEAR
+from pimper_torch.single_view.factorization.gamma import GammaEstimate, gamma_of_photographs
 
 # Residuals so near the best one are as good.
 _AS_GOOD = 1.05

@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.single_view.photometric_stereo.factors import (
     cast,

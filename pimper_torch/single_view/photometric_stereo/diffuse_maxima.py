@@ -22,9 +22,9 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, pad
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.photometry.robust import cauchy_weights
 from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.factors import (
     cast,
     require_matching,

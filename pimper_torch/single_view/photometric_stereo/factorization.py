@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.low_rank import low_rank_problem, random_left
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.low_rank import low_rank_problem, random_left
 from pimper_torch.single_view.photometric_stereo.regression import (
     Shadows,
     brightness,

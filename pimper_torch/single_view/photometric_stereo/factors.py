@@ -4,7 +4,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.relief_metric import standard_relief
 
 

@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.photometry.quadratics import diagonal, outer
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median_spread
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.relief import convex
 
 _ROUNDS = 20

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.photometry.manifolds import second_order
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
+from pimper_torch.single_view.factorization.manifolds import second_order
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles

@@ -23,9 +23,9 @@ from torch.nn.functional import conv2d, pad
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.photometry.bilinear import equations_of_samples
-from pimper_torch.photometry.low_rank import low_rank_problem
 from pimper_torch.photometry.quadratics import solve_packed
 from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.single_view.factorization.low_rank import low_rank_problem
 
 # Columns on which missing entries are filled in; the lights' span needs no more.
 _COLUMNS = 4000

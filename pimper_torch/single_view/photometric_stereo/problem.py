@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.ambiguity import Ambiguity
-from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.ambiguity import Ambiguity
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
 
 def rounded_relief(

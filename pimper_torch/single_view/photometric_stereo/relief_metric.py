@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
 # Squares of parallel vectors in float32 differ by about this share.
 _FLAT = 1e-12

@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.ambiguity import Ambiguity, lorentz
 from pimper_torch.photometry.cone import project_to_cone, split_shading
-from pimper_torch.photometry.manifolds import second_order
-from pimper_torch.photometry.spectral import upgrade_to_cone
 from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.ambiguity import Ambiguity, lorentz
+from pimper_torch.single_view.factorization.manifolds import second_order
+from pimper_torch.single_view.factorization.spectral import upgrade_to_cone
 from pimper_torch.single_view.photometric_stereo.factorization import evenly, factorize_photographs
 from pimper_torch.single_view.photometric_stereo.integrability import (
     Curls,

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.ambiguity import Ambiguity
-from pimper_torch.photometry.bas_relief import BasRelief
 from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.ambiguity import Ambiguity
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.methods import METHODS, Method
 from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution
 from pimper_torch.single_view.photometric_stereo.regression import determined

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.scenes.one_view import ball, bumps, lamps, photograph, regions
-from pimper_torch.photometry.bas_relief import BasRelief
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.diffuse_maxima import (
     _equations,
     find_maxima,

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.bas_relief import align_reliefs
+from pimper_torch.single_view.factorization.bas_relief import align_reliefs
 from pimper_torch.single_view.photometric_stereo.integrability import (
     curls,
     integrable,

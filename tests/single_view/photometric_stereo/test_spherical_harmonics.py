@@ -3,9 +3,13 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.ambiguity import align_factorizations, lorentz, minkowski
 from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.photometry.manifolds import second_order
+from pimper_torch.single_view.factorization.ambiguity import (
+    align_factorizations,
+    lorentz,
+    minkowski,
+)
+from pimper_torch.single_view.factorization.manifolds import second_order
 from pimper_torch.single_view.photometric_stereo.spherical_harmonics import (
     four_harmonic_stereo,
     nine_harmonic_stereo,

@@ -2,13 +2,13 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.photometry.ambiguity import (
+from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.single_view.factorization.ambiguity import (
     Ambiguity,
     align_factorizations,
     lorentz,
     minkowski,
 )
-from pimper_torch.photometry.harmonics import harmonics
 
 
 def some(generator, batch=3):

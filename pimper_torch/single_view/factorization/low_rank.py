@@ -6,7 +6,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.bilinear import Bilinear
-from pimper_torch.photometry.manifolds import Free
+from pimper_torch.single_view.factorization.manifolds import Free
 
 
 def low_rank_problem(

@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.ambiguity import align_factorizations
-from pimper_torch.photometry.colour import solve_in_colour
 from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.single_view.factorization.ambiguity import align_factorizations
+from pimper_torch.single_view.factorization.colour import solve_in_colour
 
 
 @pytest.fixture

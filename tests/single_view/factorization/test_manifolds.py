@@ -4,14 +4,15 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.alternation import solve_alternation
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear
-from pimper_torch.photometry.descent import solve_descent
-from pimper_torch.photometry.manifolds import Cone, Free, SecondOrder, second_order
+from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.quadratics import apply_packed
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
+from pimper_torch.single_view.factorization.alternation import solve_alternation
+from pimper_torch.single_view.factorization.descent import solve_descent
+from pimper_torch.single_view.factorization.manifolds import Free, SecondOrder, second_order
 
 MANIFOLDS = pytest.mark.parametrize("manifold", [Free(), Cone(), SecondOrder()])
 

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.low_rank import low_rank_problem, singular_left
 from pimper_torch.photometry.robust import cauchy_weights, spread
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import Response
 from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.low_rank import low_rank_problem, singular_left
 
 # Further rounds of linearising about the fit and weighing outliers, each exponent starting where
 # the last one ended.

@@ -4,12 +4,16 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.bilinear import equations_of_samples, follow
-from pimper_torch.photometry.low_rank import low_rank_problem, random_left, singular_left
-from pimper_torch.photometry.restarts import factorize_from_many
 from pimper_torch.photometry.variable_projection import (
     curvature_of_lights,
     solve_variable_projection,
 )
+from pimper_torch.single_view.factorization.low_rank import (
+    low_rank_problem,
+    random_left,
+    singular_left,
+)
+from pimper_torch.single_view.factorization.restarts import factorize_from_many
 
 
 def factorize(matrix, weight, start):

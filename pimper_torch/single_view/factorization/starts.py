@@ -1,27 +1,12 @@
-"""Where a factorization starts."""
+"""A start from the data alone, its ambiguity fixed by reference lights."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.ambiguity import Ambiguity, align_factorizations
 from pimper_torch.photometry.cone import project_to_cone
-from pimper_torch.photometry.spectral import factorize_rank_four, upgrade_to_cone
-
-
-def start_from_mesh(
-    radiance: Float[Tensor, "patch view sample"],
-    seen: Bool[Tensor, "patch view sample"],
-    lights: Float[Tensor, "patch view rank"],
-    basis: Float[Tensor, "patch rank sample"],
-) -> Float[Tensor, "patch rank sample"]:
-    """Give shading vectors along a basis, that of the mesh's normals, with the best albedo."""
-    shading = lights @ basis
-    weight = seen.to(radiance.dtype)
-    square = (weight * shading**2).sum(dim=1)
-    product = (weight * shading * radiance).sum(dim=1)
-    albedo = torch.where(square > 0, product / torch.where(square > 0, square, 1), 0)
-    return albedo.clamp_min(0)[:, None] * basis
+from pimper_torch.single_view.factorization.ambiguity import Ambiguity, align_factorizations
+from pimper_torch.single_view.factorization.spectral import factorize_rank_four, upgrade_to_cone
 
 
 def start_from_data(

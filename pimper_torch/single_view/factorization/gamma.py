@@ -21,7 +21,10 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.encoded import (
+from pimper_torch.photometry.robust import spread
+from pimper_torch.radiometry import SATURATED, Gamma, Linear, Srgb
+from pimper_torch.records import PatchViews, Record, Views
+from pimper_torch.single_view.factorization.encoded import (
     ROUNDS,
     EncodedFit,
     EncodedMatrix,
@@ -30,9 +33,6 @@ from pimper_torch.photometry.encoded import (
     freedom,
     residual_spread,
 )
-from pimper_torch.photometry.robust import spread
-from pimper_torch.radiometry import SATURATED, Gamma, Linear, Srgb
-from pimper_torch.records import PatchViews, Record, Views
 
 # Between them lie all curves in use; 1 is linear.
 LEAST, MOST = 0.4, 4.0

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.ambiguity import minkowski
 from pimper_torch.photometry.quadratics import diagonal, outer, solve_packed
 from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.ambiguity import minkowski
 
 # Filling converges in a few steps to a good start; the alternation after it is exact.
 FILL_STEPS = 20

@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.bas_relief import BasRelief, align_reliefs
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_reliefs
 
 
 def some(generator):

@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.spectral import factorize_rank_four, upgrade_to_cone
+from pimper_torch.single_view.factorization.spectral import factorize_rank_four, upgrade_to_cone
 
 
 def test_data_of_lower_rank_but_for_its_rounding_is_factorized_without_blowing_up(generator):

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.bilinear import Factors
-from pimper_torch.photometry.low_rank import low_rank_problem, random_left
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.low_rank import low_rank_problem, random_left
 
 # Residuals below this share of the data are zero but for rounding.
 _ROUNDING = 1e-6
