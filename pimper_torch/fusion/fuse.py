@@ -63,6 +63,10 @@ _LEAST_TURN, _LEAST_DOUBT = 1e-8, 1e-6
 _FINEST = 0.03
 
 
+# How far, in samples, a patch may lie from the others before they outvote it.
+_OUTLIER_SAMPLES = 4.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FuseConfig:
     """Which evidence takes part, and how the noise of each is found.
@@ -80,8 +84,6 @@ class FuseConfig:
         noise_rounds: Solves in which the noise of each kind of evidence is estimated and
             outliers lose weight: for each estimate of the tilt and twice after them on a coarser
             lattice, and twice at full size.
-        outlier_samples: How far, in samples, a patch may lie from the others before they
-            outvote it, where three or more meet.
         error_draws: Of noise, for the expected error of every vertex; the more, the less it is
             off by chance: 8 by a quarter. 0 gives none.
     """
@@ -93,12 +95,11 @@ class FuseConfig:
     contours: bool = True
     drift_rounds: int = 2
     noise_rounds: int = 3
-    outlier_samples: float = 4.0
     error_draws: int = 8
 
     def __post_init__(self) -> None:
-        for name in ("samples_per_vertex", "outlier_samples"):
-            require(getattr(self, name) > 0, f"fuse.{name}", getattr(self, name), "above 0")
+        each = self.samples_per_vertex
+        require(each > 0, "fuse.samples_per_vertex", each, "above 0")
         require(self.drift_rounds >= 0, "fuse.drift_rounds", self.drift_rounds, "0 or more")
         require(self.error_draws >= 0, "fuse.error_draws", self.error_draws, "0 or more")
         require(self.noise_rounds >= 1, "fuse.noise_rounds", self.noise_rounds, "1 or more")
@@ -229,9 +230,7 @@ class Fuse(Stage):
         spacing = vertex_spacing(patches, samples_per_vertex)
         lattice = subdivide(patches.coarse.mesh.vertices_world, facets, spacing)
         directions = ray_directions(lattice, patches.coarse)
-        union = unite(
-            carried_reliefs(swept), lattice, directions, self.config.outlier_samples, swept.buckets
-        )
+        union = unite(carried_reliefs(swept), lattice, directions, _OUTLIER_SAMPLES, swept.buckets)
         # A vertex stands for so many samples, each of which has its own share.
         density = samples_per_vertex**2
         places = lattice.points + union.heights[:, None] * directions

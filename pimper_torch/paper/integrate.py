@@ -26,23 +26,24 @@ _FILLED_WEIGHT = 1e-4
 _LEAST_CONFIDENCE = 0.05
 
 
+# Normals farther from the facet's own are brought to this angle, that of the warp's limit: such a
+# sample lies on the contour or is wrong, and one alone can bend its whole patch.
+_MAX_TILT_DEG = 75.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IntegrateConfig:
     """How slopes become heights.
 
     Attributes:
-        max_tilt_deg: Normals farther from the facet's own are brought to this angle; such a
-            sample lies on the rim or is wrong, and one alone can bend its whole patch.
         iterations: Rounds of weighted least squares after the published integration, so
             that filled slopes stop pulling at measured ones and uncertain ones count less.
             0 is the published method.
     """
 
-    max_tilt_deg: float = 75.0
     iterations: int = 8
 
     def __post_init__(self) -> None:
-        require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
         require(self.iterations >= 0, "iterations", self.iterations, "0 or more")
 
 
@@ -66,7 +67,7 @@ class Integrate(Stage):
 
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
         """Give every patch its relief; ``valid`` inside enlarged triangles that have data."""
-        steepest = math.tan(math.radians(self.config.max_tilt_deg))
+        steepest = math.tan(math.radians(_MAX_TILT_DEG))
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
         buckets = []
         for templates, photometry in track(pairs):
