@@ -161,7 +161,7 @@ def with_relief(patches: PatchSet, relief: Callable[[Templates], Tensor]) -> Dep
                 lights_patch=depth.new_ones(count, 1, 4),
                 valid=templates.inside,
                 confidence=depth.new_ones(1).expand(count, height, width),
-                verdict=0 * one.long(),
+                status=0 * one.long(),
                 convergence=Convergence(
                     iterations=one.long(), residual=0 * one, cause=0 * one.long()
                 ),

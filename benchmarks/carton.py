@@ -42,7 +42,7 @@ from pimper_torch.viz.render import crop
 IN_MASKS = 0.9
 
 # Neighbours that a plane is fitted to round a point, and the least cosine it must face a view by.
-NEIGHBOURS, LEAST_FACING = 16, 0.25
+NEIGHBOURS, MIN_FACING = 16, 0.25
 
 # Angles further from right than this belong to the gable; and only sides with this share of the
 # area that is flat are walls, whose angles are averaged.
@@ -187,7 +187,7 @@ def carton_scene(
     pixels, framed, masked = _looked_at(cloud, capture)
     to_camera = cameras.centers_world[:, None] - cloud
     facing = (to_camera * normals).sum(dim=-1) / to_camera.norm(dim=-1)
-    seen = framed & masked & (facing > LEAST_FACING)
+    seen = framed & masked & (facing > MIN_FACING)
     if num_views:
         names = list(views.names)
         middle = names.index(reference) if reference else len(names) // 2

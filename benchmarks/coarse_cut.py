@@ -33,7 +33,7 @@ def cut_surface(
     hull: Hull,
     contour: ContourPoints | None = None,
     *,
-    most_points: int = 20_000,
+    max_points: int = 20_000,
     views_each: int = 3,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
@@ -44,12 +44,12 @@ def cut_surface(
         maps: Which views see a point: those whose depth is the point's.
         hull: Nothing is outside.
         contour: Points that are seen from the view whose silhouette they lie on.
-        most_points: Of the cloud; as many random ones come in between.
+        max_points: Of the cloud; as many random ones come in between.
         views_each: Rays of each point, at most.
         seed: Of both.
     """
     generator = torch.Generator().manual_seed(seed)
-    chosen = torch.randperm(len(cloud.points_world), generator=generator)[:most_points]
+    chosen = torch.randperm(len(cloud.points_world), generator=generator)[:max_points]
     points = cloud.points_world[chosen].double()
     low, high = hull.corners_world.double()
     point, center = _rays(points.float(), maps, views_each)

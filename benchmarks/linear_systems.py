@@ -39,7 +39,7 @@ PLAIN_STEPS = 3000
 PLAIN_TOLERANCE = 1e-10
 
 # A factor of more unknowns than this takes minutes or memory that tables can do without.
-MOST_FOR_FACTORS = 1_000_000
+MAX_FOR_FACTORS = 1_000_000
 
 # Holds the constant of every raster, so that all solvers have the same matrix to solve.
 ANCHOR = 1e-9
@@ -185,7 +185,7 @@ def measure(case: str, name: str, side: int) -> dict[str, float]:
     del matrix
     prepare, solve = solver(name, case, side)
     own = name in ("cosine", "cholesky", "multigrid")
-    runs = 3 if own and size < MOST_FOR_FACTORS else 1
+    runs = 3 if own and size < MAX_FOR_FACTORS else 1
     scratch, reused = [], []
     for _ in range(runs):
         began = time.process_time()
@@ -256,7 +256,7 @@ def main() -> None:
             for name in given.solvers:
                 if (name == "cosine") != (case == "rectangle") and name == "cosine":
                     continue
-                if name not in ("cosine", "multigrid") and side * side > MOST_FOR_FACTORS:
+                if name not in ("cosine", "multigrid") and side * side > MAX_FOR_FACTORS:
                     continue
                 print(row(case, name, side), flush=True)  # noqa: T201
 

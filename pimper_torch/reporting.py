@@ -217,7 +217,7 @@ def _(depths: DepthPatches) -> dict[str, int | float]:
     told: dict[str, int | float] = {
         "valid_depths": sum(int(bucket.valid.sum()) for bucket in depths.buckets)
     }
-    if all(bucket.verdict is not None for bucket in depths.buckets):
+    if all(bucket.status is not None for bucket in depths.buckets):
         told["aligned_patches"] = sum(int(bucket.aligned.sum()) for bucket in depths.buckets)
     if depths.mismatch is not None:
         told["mismatch_before"] = float(depths.mismatch[0])

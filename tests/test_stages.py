@@ -128,9 +128,9 @@ def test_patches_are_counted_indexed_and_walked_through(factorized):
 
 def test_a_number_of_every_patch_is_drawn_in_a_view(factorized, tmp_path):
     scene, seen, found = factorized
-    verdicts = pt.by_facet(found, "verdict")
+    statuses = pt.by_facet(found, "status")
     for templates, bucket in zip(found.patches.buckets, found.buckets, strict=True):
-        assert torch.equal(verdicts[templates.facet], bucket.verdict.float())
+        assert torch.equal(statuses[templates.facet], bucket.status.float())
     residuals = pt.by_facet(found, "convergence.residual")
     coarse = found.patches.coarse
     pt.plot_in_view(coarse, scene.cameras, 0, residuals, "residual").savefig(tmp_path / "a.png")

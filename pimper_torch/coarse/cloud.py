@@ -15,7 +15,7 @@ _COMMON_FREEDOM = 6.0
 
 # Share of its mean information that a point is taken to have in every direction: a depth is
 # at most 1,000 times less certain than a place across, as where only one view sees it.
-_LEAST_INFORMATION = 1e-6
+_MIN_INFORMATION = 1e-6
 
 # Tests of points against facets made at once; bounds memory.
 _TESTS_AT_ONCE = 2_000_000
@@ -92,7 +92,7 @@ def point_covariances(
     inward = intrinsics.new_tensor([0, 0, 1])
     rate = (intrinsics[:, :2] - pixel * inward) / depth @ frames[:, :3, :3]
     information = rate.new_zeros(count, 3, 3).index_add(0, point, rate.mT @ rate)[index]
-    least = _LEAST_INFORMATION * information.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
+    least = _MIN_INFORMATION * information.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
     eye = torch.eye(3, dtype=rate.dtype, device=rate.device)
     covariance = torch.linalg.inv(information + least[:, None, None] * eye)
 

@@ -15,14 +15,14 @@ from pimper_torch.records import Photometry, Support
 _MORE, _LEAST = 3.0, 0.1
 
 # Facets that points support, at least, to compare with.
-_LEAST_FACETS = 20
+_MIN_FACETS = 20
 
 # Of these, how many of about the same occlusion: their median is certain to a sixth of the spread.
 _ALIKE = 50
 
 # Facets that light determines, at least, in a piece that can be contradicted: of a few, some are
 # explained badly by chance, and a hole of a few facets is none that views look into.
-_LEAST_TOLD = 10
+_MIN_TOLD = 10
 
 
 def contradicted(
@@ -54,13 +54,13 @@ def contradicted(
     judged = misfit.isfinite()
     known = judged & (support == int(Support.POINTS))
     (light,) = torch.nonzero(support == int(Support.LIGHT), as_tuple=True)
-    if int(known.sum()) < _LEAST_FACETS or len(light) == 0:
+    if int(known.sum()) < _MIN_FACETS or len(light) == 0:
         return found
     label = face_components(faces[light])
     for piece in range(int(label.max()) + 1):
         members = light[label == piece]
         told = members[judged[members]]
-        if len(told) >= _LEAST_TOLD:
+        if len(told) >= _MIN_TOLD:
             usual = _usual(misfit[known], occlusion[known], occlusion[told].median())
             found[members] = misfit[told].median() > torch.clamp(_MORE * usual, min=_LEAST)
     return found

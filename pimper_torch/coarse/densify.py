@@ -33,7 +33,7 @@ class DensifyConfig:
             counts little; 1 is bright.
         contrast: Of root radiance in a window, below which it says little; 1 is bright.
         margin: Share by which the searched range of inverse depths exceeds the points'.
-        most_hypotheses: Of the search of the whole range.
+        max_hypotheses: Of the search of the whole range.
         min_score: Correlation that a depth needs.
         max_error_px: Reprojection error between two views' depths that agree.
         agreeing: Other views that have to agree.
@@ -47,7 +47,7 @@ class DensifyConfig:
     likeness: float = 0.2
     contrast: float = 0.005
     margin: float = 0.15
-    most_hypotheses: int = 160
+    max_hypotheses: int = 160
     min_score: float = 0.5
     max_error_px: float = 1.0
     agreeing: int = 2
@@ -62,7 +62,7 @@ class DensifyConfig:
         require(self.likeness > 0, "likeness", self.likeness, "above 0")
         require(self.contrast > 0, "contrast", self.contrast, "above 0")
         require(self.margin >= 0, "margin", self.margin, "0 or more")
-        require(self.most_hypotheses >= 8, "most_hypotheses", self.most_hypotheses, "8 or more")
+        require(self.max_hypotheses >= 8, "max_hypotheses", self.max_hypotheses, "8 or more")
         require(0 < self.min_score < 1, "min_score", self.min_score, "in (0, 1)")
         require(self.max_error_px > 0, "max_error_px", self.max_error_px, "above 0")
         require(self.agreeing >= 1, "agreeing", self.agreeing, "1 or more")
@@ -179,7 +179,7 @@ def _whole_range(
     low, high = torch.quantile(known.double(), known.new_tensor([0.01, 0.99]).double()).tolist()
     low, high = low - config.margin * (high - low), high + config.margin * (high - low)
     low = max(low, 0.1 * high)
-    count = min(config.most_hypotheses, max(3, round((high - low) / (0.7 * step))))
+    count = min(config.max_hypotheses, max(3, round((high - low) / (0.7 * step))))
     found, score = sweep(matcher, blank, np.linspace(low, high, count).tolist())
     along = spanned(pixels, known, blank)
     reach = min(10, count)

@@ -40,7 +40,7 @@ _PLACES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
 _FACING = 0.1
 
 # Points that make a surface, with contours or without.
-_LEAST_POINTS = 16
+_MIN_POINTS = 16
 
 # Views that see something behind a face which is a lid; that show a lit one lit.
 _DENYING, _LIGHTING = 2, 2
@@ -149,7 +149,7 @@ def fine_surface(
     part = cropped(scene, contours.silhouettes)
     middle = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
     cloud, maps = no_points(middle), None
-    if len(trusted) >= _LEAST_POINTS or not contours.confine:
+    if len(trusted) >= _MIN_POINTS or not contours.confine:
         found, maps, pixel = matched_cloud(part, trusted, densify, config.point_px)
         cloud = found.take(
             contours.hull.depth_of(found.points_world) > -config.tolerance_px * pixel
@@ -207,7 +207,7 @@ def closed_surface(
             normals_world=touched.normals_world.to(cloud.points_world),
             noise=touched.variance.sqrt().to(cloud.noise),
         )
-        if len(cloud.points_world) + len(touched.ray) < _LEAST_POINTS:
+        if len(cloud.points_world) + len(touched.ray) < _MIN_POINTS:
             raise ReconstructionError(
                 f"coarse mesh: {len(cloud.points_world)} points were matched inside the "
                 f"silhouettes, and {len(touched.ray)} rays touch the surface there; some hundreds "

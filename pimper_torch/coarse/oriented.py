@@ -25,7 +25,7 @@ _REACH_STEPS = 3.0
 
 # Share of a window that has to lie on the plane: where it is less, the pixel is beside the
 # contour of what is in front, which windows that match make too large.
-_LEAST_SHARE = 0.7
+_MIN_SHARE = 0.7
 
 # How often planes are fitted, again with what lies off the last one left out; what is added to the
 # diagonal of their normal equations.
@@ -36,18 +36,18 @@ _FITTINGS, _RIDGE = 3, 1e-3
 _NEIGHBOURS, _FLAT, _FACING = 12, 0.3, 0.2
 
 # Of a grid's cells, for noisy points.
-_MOST_DOUBLINGS = 3
+_MAX_DOUBLINGS = 3
 
 # Steps of inverse depth that a window's pixels may scatter round their plane: more is a match
 # without texture, and a coarser window knows better.
-_MOST_NOISE_STEPS = 1.0
+_MAX_NOISE_STEPS = 1.0
 
 # Points whose places make a normal, and how many normals are made at once; bounds memory.
 _COMMON, _AT_ONCE = 24, 10_000
 
 # Length of the mean of unit normals round a point, at least: that of normals which scatter by
 # 60 degrees.
-_LEAST_AGREEMENT = 0.5
+_MIN_AGREEMENT = 0.5
 
 # Steps in front of what another view sees, beyond which a point is denied by it.
 _DENIED_STEPS = 3.0
@@ -124,7 +124,7 @@ def _of_view(
     inverse_depth, slope, spread, fine = fitted_planes(
         maps.inverse_depth[view], maps.valid[view], float(maps.step[view])
     )
-    fine &= wanted & (spread <= _MOST_NOISE_STEPS * maps.step[view])
+    fine &= wanted & (spread <= _MAX_NOISE_STEPS * maps.step[view])
     height, width = fine.shape
     pixels = pixel_centers(width, height, like=intrinsics)[fine]
     q, slope, spread = inverse_depth[fine], slope[fine], spread[fine]
@@ -168,7 +168,7 @@ def fitted_planes(
     else:
         fits = _fits(inverse_depth, valid, max(step, 1e-30))
     offset, across, down, variance, share = fits
-    fine = valid & (share >= _LEAST_SHARE) & (offset.abs() < 1)
+    fine = valid & (share >= _MIN_SHARE) & (offset.abs() < 1)
     # Neighbouring windows overlap, so that their errors are alike: no gain from averaging.
     spread = step * variance.sqrt().clamp_min(0.05)
     return inverse_depth + step * offset, step * torch.stack([across, down], dim=-1), spread, fine
@@ -267,10 +267,10 @@ def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     """
     if len(cloud.points_world) == 0:
         return cloud
-    doublings = (cloud.noise / (cell / 3)).clamp(1e-6).log2().ceil().clamp(0, _MOST_DOUBLINGS)
+    doublings = (cloud.noise / (cell / 3)).clamp(1e-6).log2().ceil().clamp(0, _MAX_DOUBLINGS)
     parts = [
         _averaged(cloud.take(doublings == rank), cell * 2**rank)
-        for rank in range(_MOST_DOUBLINGS + 1)
+        for rank in range(_MAX_DOUBLINGS + 1)
     ]
     return joined_points(*parts)
 
@@ -332,7 +332,7 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
 
     parts = torch.split(points, _AT_ONCE)
     found, agreement = zip(*side_by_side(common, parts, tracked=False), strict=True)
-    alike = torch.cat(agreement).to(cloud.normals_world) > _LEAST_AGREEMENT
+    alike = torch.cat(agreement).to(cloud.normals_world) > _MIN_AGREEMENT
     return cloud.replace(normals_world=torch.cat(found).to(cloud.normals_world)).take(alike)
 
 

@@ -37,13 +37,13 @@ _DEPARTURE_SHARE = 0.9
 _SEEING = 2
 
 # A facet smaller than this share of what it was before its corners moved has collapsed.
-_LEAST_AREA = 0.05
+_MIN_AREA = 0.05
 
 # A facet that gets so many times longer has a corner that ran away.
-_MOST_STRETCH = 4.0
+_MAX_STRETCH = 4.0
 
 # Photometric residual over the median facet's, above which a facet is split.
-_MOST_RESIDUAL = 3.0
+_MAX_RESIDUAL = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -293,7 +293,7 @@ def _severity(
     worst = torch.maximum(worst, spread.to(worst))
     if residual is not None:
         typical = residual.nanmedian()
-        relative = residual / torch.where(typical > 0, typical, torch.inf) / _MOST_RESIDUAL
+        relative = residual / torch.where(typical > 0, typical, torch.inf) / _MAX_RESIDUAL
         worst = torch.maximum(worst, relative.nan_to_num(nan=0.0).to(worst))
     return worst
 
@@ -375,12 +375,12 @@ def _without_folds(
     """Move vertices onto the surface, except where that folds, flattens or draws out facets."""
     before = face_normals(flat, faces)
     size = before.square().sum(dim=1)
-    longest = _MOST_STRETCH * side_lengths(flat[faces]).amax(dim=1)
+    longest = _MAX_STRETCH * side_lengths(flat[faces]).amax(dim=1)
     moving = onto.isfinite().all(dim=1)
     while True:
         places = torch.where(moving[:, None], onto, flat)
         along = (face_normals(places, faces) * before).sum(dim=1)
-        bad = (along <= _LEAST_AREA * size) | (side_lengths(places[faces]).amax(dim=1) > longest)
+        bad = (along <= _MIN_AREA * size) | (side_lengths(places[faces]).amax(dim=1) > longest)
         bad &= moving[faces].any(dim=1)
         if not bool(bad.any()):
             return places

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pimper_torch.fusion.evidence import LEAST_FACING, Evidence
+from pimper_torch.fusion.evidence import MIN_FACING, Evidence
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import ContourPoints, FacetPoints, Record
 
@@ -82,7 +82,7 @@ def contour_tangents(contours: ContourPoints, ground: Ground) -> Contacts:
     """
     line = ground.lines_at(contours.points_world)
     facing = (line * contours.normals_world.to(line)).sum(dim=-1)
-    told = facing.detach() > LEAST_FACING
+    told = facing.detach() > MIN_FACING
     return Contacts(
         places=contours.points_world.to(line)[told],
         lines=line[told],
@@ -106,7 +106,7 @@ def _passing(contacts: Contacts, ground: Ground, caster: RayCaster) -> Evidence:
     met = (hits.face >= 0) & (lift.abs() <= ground.reach)
     corners, share, line = ground.faces[hits.face[met]], hits.barycentric[met], line[met]
     vertex = corners.gather(1, share.argmax(dim=1, keepdim=True))
-    facing = (ground.directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(LEAST_FACING)
+    facing = (ground.directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(MIN_FACING)
     variance = contacts.variance[met]
     return Evidence(
         unknowns=vertex,

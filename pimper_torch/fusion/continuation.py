@@ -18,7 +18,7 @@ from pimper_torch.geometry.surfaces import boundary_vertices
 from pimper_torch.linalg.systems import solutions
 
 # The mean counts as much as this share of a neighbour at least, so that every vertex has a value.
-_LEAST_HOLD = 1e-6
+_MIN_HOLD = 1e-6
 
 
 def continued(
@@ -85,7 +85,7 @@ def about_mean(
     one, other = values.double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
     step = (one - other).square().sum() / max(len(one), 1)
     hold = torch.where(spread > 0, step / torch.where(spread > 0, spread, 1), 0)
-    hold = hold.clamp_min(_LEAST_HOLD).expand(len(values))
+    hold = hold.clamp_min(_MIN_HOLD).expand(len(values))
     return continued(values, known, edges, mean.expand_as(values), hold)
 
 

@@ -34,10 +34,10 @@ _JUDGES = 500_000
 
 # No source is more than twice too modest: where one kind is followed blindly its residuals
 # vanish, and would make it surer still.
-_LEAST_FACTOR = 0.25
+_MIN_FACTOR = 0.25
 
 # Evidence that seems to be used up whole still has this share left to judge it by.
-_LEAST_LEFT = 0.05
+_MIN_LEFT = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -104,7 +104,7 @@ def fuse_evidence(
                 continue
             square, used = _judged(kind, weights[place], heights, probe, answer)
             left = 1 - used / found[place] / weights[place].sum()
-            square = square / left.clamp_min(_LEAST_LEFT)
+            square = square / left.clamp_min(_MIN_LEFT)
             found[place] = noise_factor(square[:: max(1, len(square) // _JUDGES)])
             weights[place] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[place]))
     (heights,) = _solved(kinds, weights, found, start, hold, guess=heights, tolerance=_ACCURATE)
@@ -188,7 +188,7 @@ def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
     True
     """
     everything = torch.ones_like(square, dtype=torch.bool)
-    return robust_variance(square, everything).clamp_min(_LEAST_FACTOR)
+    return robust_variance(square, everything).clamp_min(_MIN_FACTOR)
 
 
 def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:

@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from pimper_torch.records import Record
 
 # A direction that leaves the surface at a flatter angle than this (cosine) tells no height.
-LEAST_FACING = 0.2
+MIN_FACING = 0.2
 
 # Heights along a direction cannot follow normals that are further from it than this (cosine).
 _UPRIGHT = 0.1
@@ -208,4 +208,4 @@ def upright_heights(
     information: Float[Tensor, " vertex"], facing: Float[Tensor, " vertex"]
 ) -> Bool[Tensor, " vertex"]:
     """Mark vertices whose swept offsets tell heights."""
-    return (information > 0) & (facing > LEAST_FACING)
+    return (information > 0) & (facing > MIN_FACING)

@@ -57,7 +57,7 @@ _FOLD = 0.25
 
 # Squared turn from vertex to vertex that even flat facets are said to have, radians; and the
 # least variance of the slopes that a surface has already.
-_LEAST_TURN, _LEAST_DOUBT = 1e-8, 1e-6
+_MIN_TURN, _MIN_DOUBT = 1e-8, 1e-6
 
 # Between its vertices the surface is flat: points tell no more than this share of a spacing.
 _FINEST = 0.03
@@ -409,7 +409,7 @@ class Fuse(Stage):
         if not bool(known.any()):
             return task.shape.new_tensor(math.radians(HALF_CONFIDENCE_DEG) ** 2)
         apart = (task.union.normals_world - task.shape)[known].square().sum(dim=-1)
-        return (apart.median() / MEDIAN_OF_TILT).clamp_min(_LEAST_DOUBT)
+        return (apart.median() / MEDIAN_OF_TILT).clamp_min(_MIN_DOUBT)
 
 
 def _ground(task: _Task) -> Ground:
@@ -447,7 +447,7 @@ def _turn(normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]) -> F
     """Give the mean squared turn of normals along edges, folds cut; squared radians."""
     one, other = normals[edges].unbind(dim=1)
     square = (one - other).square().sum(dim=1).clamp_max(_FOLD**2)
-    return (square.sum() / max(len(edges), 1)).clamp_min(_LEAST_TURN)
+    return (square.sum() / max(len(edges), 1)).clamp_min(_MIN_TURN)
 
 
 def _variance(confidence: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:

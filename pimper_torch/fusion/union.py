@@ -44,7 +44,7 @@ _RAGGED_SAMPLES = 1.5
 _DISTRUST = 10.0
 
 # Less weight than this is a border that tapered out.
-_LEAST_WEIGHT = 1e-3
+_MIN_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -299,9 +299,9 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Union:
     total = _sum_at(vertex, weight, count)
     seen_weight = weight * estimates.known
     seen_total = _sum_at(vertex, seen_weight, count)
-    supported, seen = total > _LEAST_WEIGHT, seen_total > _LEAST_WEIGHT
-    per_support = torch.where(supported, 1 / total.clamp_min(_LEAST_WEIGHT), 0)
-    per_seen = torch.where(seen, 1 / seen_total.clamp_min(_LEAST_WEIGHT), 0)
+    supported, seen = total > _MIN_WEIGHT, seen_total > _MIN_WEIGHT
+    per_support = torch.where(supported, 1 / total.clamp_min(_MIN_WEIGHT), 0)
+    per_seen = torch.where(seen, 1 / seen_total.clamp_min(_MIN_WEIGHT), 0)
     values = _sum_at(vertex, seen_weight[:, None] * estimates.values, count)
     normals, confidence, albedo = values[:, :3], values[:, 3], values[:, 4:]
     told = _sum_at(vertex, weight[:, None] * estimates.swept, count)

@@ -22,7 +22,7 @@ from pimper_torch.records import Record
 # An edge has at most so many times the pieces that it would have if its facet were equilateral,
 # of the same area: those of a half square's diagonal, and at most 2 points a spacing squared,
 # where the equilateral lattice has 1.2.
-_MOST_PIECES = 1.32
+_MAX_PIECES = 1.32
 
 # Vertices that a value is blended from, as many as a face has; and a distance, scene units, at
 # which one counts alone.
@@ -193,7 +193,7 @@ def _pieces(
         unset = torch.full_like(length, torch.inf)
         return unset.scatter_reduce(0, facet_edges.flatten(), spread, "amin")
 
-    length = torch.minimum(length, _MOST_PIECES * least(equilateral))
+    length = torch.minimum(length, _MAX_PIECES * least(equilateral))
     return (length / least(spacing)).round().long().clamp_min(1)
 
 

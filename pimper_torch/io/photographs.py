@@ -21,7 +21,7 @@ MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
 _BLACK = 1e-3
 _LIT_SHARE = 1e-3  # more than hot pixels
 # Less of the object than this is left of a photograph that is mostly saturated.
-_LEAST_USABLE = 0.1
+_MIN_USABLE = 0.1
 # Masks are turned round where more than the rest of it is bright at the border, and less inside.
 _TELLING = 0.25
 
@@ -293,7 +293,7 @@ def _judge_saturation(
     scant = [
         f"{name} ({share:.1%} left)"
         for name, share in zip(names, usable, strict=True)
-        if share < _LEAST_USABLE
+        if share < _MIN_USABLE
     ]
     if scant:
         warnings.warn(

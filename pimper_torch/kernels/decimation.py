@@ -14,7 +14,7 @@ Numbers = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
 # Fans of more faces, and more removed vertices on one fan, are left as they are.
-_MOST_FACES, _MOST_POINTS = 24, 2048
+_MAX_FACES, _MAX_POINTS = 24, 2048
 # A new face may be as long and narrow as this (4 sqrt(3) area / squared sides, 1 if equilateral),
 # or as the worst of those that it replaces.
 _MIN_SHAPE = 0.2
@@ -132,17 +132,17 @@ def fan(
             else:
                 following[before] = after
         else:
-            if count == _MOST_FACES:
+            if count == _MAX_FACES:
                 return 0
             owner[count] = face
             slot = corner - 3 * face
             ring[count] = faces[face, (slot + 1) % 3]
-            ring[_MOST_FACES + count] = faces[face, (slot + 2) % 3]
+            ring[_MAX_FACES + count] = faces[face, (slot + 2) % 3]
             count += 1
             before = corner
         corner = after
     for place in range(1, count):  # sort: each begins where the one before ends
-        wanted = ring[_MOST_FACES + place - 1]
+        wanted = ring[_MAX_FACES + place - 1]
         if wanted == ring[0]:
             return 0  # two fans meet in the vertex
         other = place
@@ -152,9 +152,9 @@ def fan(
             return 0
         ring[place], ring[other] = ring[other], ring[place]
         owner[place], owner[other] = owner[other], owner[place]
-        there = _MOST_FACES + place
+        there = _MAX_FACES + place
         ring[there], ring[there + other - place] = ring[there + other - place], ring[there]
-    return count if count >= 3 and ring[_MOST_FACES + count - 1] == ring[0] else 0
+    return count if count >= 3 and ring[_MAX_FACES + count - 1] == ring[0] else 0
 
 
 @compiled("boolean(int64, int64, int64, int32[:,::1], int32[::1], int32[::1], int32[::1])")
@@ -262,12 +262,12 @@ def decimate(
     Returns:
         How many vertices were removed.
     """
-    ring = np.empty(2 * _MOST_FACES, np.int32)
-    owner = np.empty(_MOST_FACES, np.int32)
-    score = np.empty(_MOST_FACES, np.float64)
-    listed = np.empty(_MOST_POINTS, np.int32)
-    placed = np.empty(_MOST_POINTS, np.int32)
-    off = np.empty((_MOST_POINTS, 2), np.float32)
+    ring = np.empty(2 * _MAX_FACES, np.int32)
+    owner = np.empty(_MAX_FACES, np.int32)
+    score = np.empty(_MAX_FACES, np.float64)
+    listed = np.empty(_MAX_POINTS, np.int32)
+    placed = np.empty(_MAX_POINTS, np.int32)
+    off = np.empty((_MAX_POINTS, 2), np.float32)
     normal, mean, found = np.empty(3), np.empty(3), np.empty(4)
     touched = np.full(len(head), -1, np.int8)
     total = 0
@@ -289,11 +289,11 @@ def decimate(
             listed[0], size = vertex, 1
             for place in range(count):
                 point = first_removed[owner[place]]
-                while point >= 0 and size < _MOST_POINTS:
+                while point >= 0 and size < _MAX_POINTS:
                     listed[size] = point
                     size += 1
                     point = next_removed[point]
-            if size == _MOST_POINTS:
+            if size == _MAX_POINTS:
                 continue
             mean[:] = 0
             worst = _MIN_SHAPE

@@ -19,8 +19,8 @@ Doubles = NDArray[np.float64]
 TILE = 256
 
 # As in the reference: Cauchy's scale in deviations, its least in brightnesses; and the damping.
-_TUNING, _LEAST_SCALE = 2.385, 1e-4
-_DAMPING, _LESS, _MORE, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 0.25, 10.0, 1e-9, 1e6
+_TUNING, _MIN_SCALE = 2.385, 1e-4
+_DAMPING, _LESS, _MORE, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 0.25, 10.0, 1e-9, 1e6
 _FLOOR, _LARGE = 1e-9, 1e100
 
 
@@ -134,7 +134,7 @@ def _scales(
             squares[count] = left[i] * left[i]
             count += there[i] > 0
         variance, guess[v] = robust_variance(squares[:count], guess[v])
-        scale[v] = widen * _TUNING * max(math.sqrt(variance), _LEAST_SCALE * level[v])
+        scale[v] = widen * _TUNING * max(math.sqrt(variance), _MIN_SCALE * level[v])
 
 
 @compiled(fast=True)
@@ -336,7 +336,7 @@ def fit(
     level: Doubles,
     closest: float,
     limit: int,
-    least_gain: float,
+    min_gain: float,
     lights: Doubles,
     albedo: Doubles,
 ) -> None:
@@ -350,7 +350,7 @@ def fit(
         level: Brightness of each view.
         closest: A lamp's closeness at most.
         limit: Steps at most.
-        least_gain: Share of the loss that the last step gains at most.
+        min_gain: Share of the loss that the last step gains at most.
         lights: View by number.
         albedo: Of each sample.
     """
@@ -377,8 +377,8 @@ def fit(
         if after < cost:
             lights[:], albedo[:] = moved, changed
             shading[:], residual[:] = under, left
-            damping = max(damping * _LESS, _LEAST_DAMPING)
-            if widen == 1 and after > cost * (1 - least_gain):
+            damping = max(damping * _LESS, _MIN_DAMPING)
+            if widen == 1 and after > cost * (1 - min_gain):
                 break
         else:
-            damping = min(damping * _MORE, _MOST_DAMPING)
+            damping = min(damping * _MORE, _MAX_DAMPING)

@@ -36,7 +36,7 @@ def register(
     depth: Array,
     outward: Array,
     inside: Array,
-    least_facing: float,
+    min_facing: float,
     dark_level: float,
     radiance: Array,
     valid: Array,
@@ -58,7 +58,7 @@ def register(
         depth: Of every sample.
         outward: Unit normals, patch frame.
         inside: Samples that are asked for.
-        least_facing: Cosine of the steepest angle.
+        min_facing: Cosine of the steepest angle.
         dark_level: Of the mean over the channels.
         radiance: Filled.
         valid: Filled.
@@ -70,7 +70,7 @@ def register(
     pixels = np.empty((height, width, 2), np.float64)
     wanted = np.empty((height, width), np.bool_)
     found = np.empty(channels, np.float32)
-    steepest = least_facing * least_facing
+    steepest = min_facing * min_facing
     for patch in range(patches):
         for view in range(views):
             m = image_from_patch[patch * views + view]

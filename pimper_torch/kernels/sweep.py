@@ -134,7 +134,7 @@ def costs(
     ladder: Array,
     num_views: int,
     min_views: int,
-    least_facing: float,
+    min_facing: float,
     cost: Array,
     swept: Array,
 ) -> None:
@@ -159,7 +159,7 @@ def costs(
         ladder: Heights that are tried, in units of ``spacing``.
         num_views: At most so many judge a sample.
         min_views: A sample that fewer views may judge is not swept.
-        least_facing: Cosine of the angle from which on footprints shrink no more.
+        min_facing: Cosine of the angle from which on footprints shrink no more.
         cost: Zero throughout; filled.
         swept: Zero throughout; 1 where a sample has costs.
     """
@@ -241,7 +241,7 @@ def costs(
                     du = m[0, 0] * ox + m[0, 1] * oy + m[0, 2] * oz
                     dv = m[1, 0] * ox + m[1, 1] * oy + m[1, 2] * oz
                     dw = m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz
-                    squeezed = max(facings[view], least_facing)
+                    squeezed = max(facings[view], min_facing)
                     footprint = footprints[view]
                     level, rest = blended_level(footprint * footprint * squeezed, count_levels)
                     for step in range(heights):

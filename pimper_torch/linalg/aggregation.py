@@ -43,7 +43,7 @@ _TIED = 0.05
 _UNIT_STEPS = 5
 
 # Where an anchor or a fold would have that vector vanish it keeps this much.
-_LEAST_UNIT = 0.1
+_MIN_UNIT = 0.1
 
 # Of the averaging step that smooths the aggregates' edges; 2/3 damps the highest frequencies
 # of an M-matrix best.
@@ -97,7 +97,7 @@ def _compiled(matrix: csr_array) -> csr_array:
     for _ in range(_UNIT_STEPS):
         over_rows(kernels.smooth_ones, size, *parts, dominant, units, smoother, _DAMPING)
         units, smoother = smoother, units
-    units = np.maximum(np.abs(units, out=units), _LEAST_UNIT, out=units)
+    units = np.maximum(np.abs(units, out=units), _MIN_UNIT, out=units)
     largest, tied, excess = dominant, smoother, np.empty(size)  # memory that is free
     over_rows(kernels.ties, size, *parts, units, largest, tied, excess)
     strong, label = np.empty(len(parts[1]), np.bool_), np.empty(size, np.int32)
@@ -158,7 +158,7 @@ def _units(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
     found, diagonal = np.ones(matrix.shape[0]), dominant_diagonal(matrix)
     for _ in range(_UNIT_STEPS):
         found = found - _DAMPING * (matrix @ found) / diagonal
-    return np.maximum(np.abs(found), _LEAST_UNIT)
+    return np.maximum(np.abs(found), _MIN_UNIT)
 
 
 def _averaged(matrix: csr_array) -> csr_array:

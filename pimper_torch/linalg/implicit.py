@@ -17,7 +17,7 @@ _RESTARTS, _STEPS = 5, 60
 
 # Newton's method doubles the digits at every step once it is near; before that its steps are
 # halved until they help, down to this share.
-_NEWTON_STEPS, _LEAST_STEP = 8, 0.05
+_NEWTON_STEPS, _MIN_STEP = 8, 0.05
 
 Vector = Float[Tensor, " unknown"]
 Array = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -91,7 +91,7 @@ def newton_solution(
             return found.cpu().double().numpy()
 
         step = _solve(product, precondition, left)
-        while share > _LEAST_STEP:
+        while share > _MIN_STEP:
             there = at - share * step
             after = equations(there)
             if bool(after.norm() < left.norm()):

@@ -52,14 +52,14 @@ def elements(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) 
 
 
 def cotangent_laplacian(
-    mesh: Elements, weight: Float[Tensor, " face"], least_shape: float = 0.0
+    mesh: Elements, weight: Float[Tensor, " face"], min_shape: float = 0.0
 ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
     r"""Give the entries of :math:`\int w \nabla \varphi_i \cdot \nabla \varphi_j`.
 
     Args:
         mesh: Its faces.
         weight: Of each face.
-        least_shape: A needle's area is taken as at least this share of its longest edge
+        min_shape: A needle's area is taken as at least this share of its longest edge
             squared: its cotangents would otherwise spoil the condition of the whole matrix.
 
     Returns:
@@ -68,7 +68,7 @@ def cotangent_laplacian(
         the vertices.
     """
     longest = mesh.turned.square().sum(-1).amax(dim=1)
-    shape = torch.maximum(mesh.area, least_shape * longest)
+    shape = torch.maximum(mesh.area, min_shape * longest)
     blocks = (weight / (4 * shape))[:, None, None] * (mesh.turned @ mesh.turned.mT)
     rows = mesh.faces[:, :, None].expand_as(blocks)
     cols = mesh.faces[:, None, :].expand_as(blocks)

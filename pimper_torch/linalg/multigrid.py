@@ -24,7 +24,7 @@ from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 DEFAULT_TOLERANCE = 1e-10
 
 # The hardest systems of the benchmark take 25 cycles.
-_MOST_CYCLES = 300
+_MAX_CYCLES = 300
 
 # An answer whose residual, with the diagonal scaled to 1, is larger next to the right-hand
 # side than this is no answer; the same bound as that of SparseCholesky.
@@ -80,7 +80,7 @@ def solve_with_hierarchy(
         start=start,
         dims=(0,),
         tolerance=tolerance,
-        max_iterations=_MOST_CYCLES,
+        max_iterations=_MAX_CYCLES,
     )
     reached = found, cycles, converged
     return _checked(reached, rhs - product(found), diagonal, rhs, tolerance, what)
@@ -114,7 +114,7 @@ def solve_by_cycles(
         rhs,
         start=start,
         tolerance=tolerance,
-        max_iterations=_MOST_CYCLES,
+        max_iterations=_MAX_CYCLES,
         dtype=half,
     )
     residual = with_product(matrix, reached[0], rhs, keep=1.0, gain=-1.0)

@@ -23,7 +23,7 @@ from pimper_torch.stage import Stage
 _FILLED_WEIGHT = 1e-4
 
 # Uncertain slopes weigh no less than this: their neighbours are hardly better.
-_LEAST_CONFIDENCE = 0.05
+_MIN_CONFIDENCE = 0.05
 
 
 # Normals farther from the facet's own are brought to this angle, that of the warp's limit: such a
@@ -107,7 +107,7 @@ def integrate_normals(
     # Half-way between samples the mean of the two is right to second order.
     right = (slopes[:, 0, :, 1:] + slopes[:, 0, :, :-1]) / 2
     down = (slopes[:, 1, 1:] + slopes[:, 1, :-1]) / 2
-    weight = torch.where(valid, confidence.double().clamp(_LEAST_CONFIDENCE, 1), _FILLED_WEIGHT)
+    weight = torch.where(valid, confidence.double().clamp(_MIN_CONFIDENCE, 1), _FILLED_WEIGHT)
     relief = integrate_weighted(
         right,
         down,

@@ -14,7 +14,7 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
 
 # Normals are kept this far from the rim, so that all of them face the viewer.
-LEAST_FACING = 0.05
+MIN_FACING = 0.05
 
 # A template finds its surface within this share of its own extent of the facet's plane.
 _REACH = 0.5
@@ -69,9 +69,9 @@ def coarse_normals(
 def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Make unit, and bring what faces away to just before the rim."""
     unit = normalize(normals, dim=-1)
-    aside = (1 - LEAST_FACING**2) ** 0.5 * normalize(unit[..., :2], dim=-1)
-    turned = torch.cat([aside, torch.full_like(unit[..., 2:], -LEAST_FACING)], dim=-1)
-    return torch.where(unit[..., 2:] > -LEAST_FACING, turned, unit)
+    aside = (1 - MIN_FACING**2) ** 0.5 * normalize(unit[..., :2], dim=-1)
+    turned = torch.cat([aside, torch.full_like(unit[..., 2:], -MIN_FACING)], dim=-1)
+    return torch.where(unit[..., 2:] > -MIN_FACING, turned, unit)
 
 
 def _carrying(

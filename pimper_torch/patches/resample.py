@@ -16,7 +16,7 @@ def resampled(
     cameras: Cameras,
     sources: Sources,
     templates: Templates,
-    least_facing: float,
+    min_facing: float,
     dark_level: float,
 ) -> Observations:
     """Resample all views on a bucket of templates; nothing hides anything.
@@ -27,7 +27,7 @@ def resampled(
         cameras: Of all views.
         sources: Photographs.
         templates: The bucket.
-        least_facing: Cosine of the steepest angle between a normal and the way to the camera.
+        min_facing: Cosine of the steepest angle between a normal and the way to the camera.
         dark_level: Radiance at or below which a sample is missing.
     """
     patch_from_world = templates.patch_from_world.double()
@@ -53,7 +53,7 @@ def resampled(
         as_array(templates.depth, torch.float32),
         as_array(outward, torch.float32),
         as_array(templates.inside),
-        least_facing,
+        min_facing,
         dark_level,
         as_array(radiance),
         as_array(valid),

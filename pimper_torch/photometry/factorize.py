@@ -26,11 +26,11 @@ from pimper_torch.photometry.mesh_light import light_of_mesh
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, on_raster, rows_of
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
+from pimper_torch.photometry.status import judge_data, warn_of_undetermined
 from pimper_torch.photometry.variable_projection import solve_variable_projection
-from pimper_torch.photometry.verdicts import judge_data, warn_of_verdicts
 from pimper_torch.records import (
     Observations,
-    PatchVerdict,
+    PatchStatus,
     PatchViews,
     PhotometricPatches,
     Photometry,
@@ -43,7 +43,7 @@ from pimper_torch.stage import Stage
 BORROWED_SAMPLES = 16.0
 
 # Free lights still need a hold where a view has next to no samples: this share of its data.
-LEAST_PULL = 1e-6
+MIN_PULL = 1e-6
 
 # The Gauss-Newton matrix of a patch's lights is summed over about this many samples.
 CURVATURE_SAMPLES = 256
@@ -163,7 +163,7 @@ class _Posed(Record):
 
     rows: Rows
     anchor: Float[Tensor, "patch view 4"]
-    verdict: Int[Tensor, " patch"]
+    status: Int[Tensor, " patch"]
     problem: Bilinear
 
 
@@ -184,8 +184,8 @@ class Factorize(Stage):
 
     Where it fails softly: samples lit in fewer than ``min_views`` views, or found to face
     away, carry the coarse normal, are not ``valid`` and have confidence 0. Patches that light
-    does not determine carry coarse normals throughout and a verdict why (see
-    :class:`~pimper_torch.records.PatchVerdict`); a :class:`PimperWarning` counts them. A view
+    does not determine carry coarse normals throughout and a status why (see
+    :class:`~pimper_torch.records.PatchStatus`); a :class:`PimperWarning` counts them. A view
     that sees nothing of a patch has the light zero there. NaN and infinity in the radiance
     count as missing.
 
@@ -240,7 +240,7 @@ class Factorize(Stage):
     def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
         """Set the scale of albedo over all patches, and say which ones light does not tell."""
         config = self.config
-        warn_of_verdicts(solved.buckets, config.min_views, config.min_light_variation)
+        warn_of_undetermined(solved.buckets, config.min_views, config.min_light_variation)
         return in_gauge(solved)
 
     def _pose(self, bucket: _Bucket, field: LightField) -> _Posed:
@@ -253,7 +253,7 @@ class Factorize(Stage):
         shown = bucket.registered.valid & bucket.templates.inside[:, None]
         finite = rows.seen.flatten(1).any(dim=1)
         rows = rows.replace(seen=rows.seen & faces_lamp(lamp, rows.normals))
-        verdict = judge_data(
+        status = judge_data(
             shown.flatten(1).any(dim=1),
             finite,
             rows.seen,
@@ -263,7 +263,7 @@ class Factorize(Stage):
         )
         raster = bucket.normals.shape[1] * bucket.normals.shape[2]
         problem = self._problem(rows, anchor, raster)
-        return _Posed(rows=rows, anchor=anchor, verdict=verdict, problem=problem)
+        return _Posed(rows=rows, anchor=anchor, status=status, problem=problem)
 
     def _conclude(self, bucket: _Bucket, posed: _Posed, factors: Factors) -> Photometry:
         rows, normals, problem = posed.rows, bucket.normals, posed.problem
@@ -273,9 +273,9 @@ class Factorize(Stage):
         sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
         lit = rows.seen.sum(dim=1) >= self.config.min_views
         sound = factors.lights.isfinite().flatten(1).all(dim=1) & (sure & lit).any(dim=1)
-        failed = (posed.verdict == int(PatchVerdict.DETERMINED)) & ~sound
-        verdict = torch.where(failed, int(PatchVerdict.FAILED), posed.verdict)
-        determined = verdict == int(PatchVerdict.DETERMINED)
+        failed = (posed.status == int(PatchStatus.DETERMINED)) & ~sound
+        status = torch.where(failed, int(PatchStatus.FAILED), posed.status)
+        determined = status == int(PatchStatus.DETERMINED)
         valid = lit & determined[:, None] & sure & (found.normals[..., 2] < 0)
         lights = torch.where(determined[:, None, None], factors.lights, posed.anchor)
         lights = lights * rows.seen.any(dim=2)[..., None]
@@ -291,7 +291,7 @@ class Factorize(Stage):
             lights_patch=lights,
             valid=on_raster(valid, rows.place, nothing),
             confidence=on_raster(found.confidence * valid, rows.place, blank),
-            verdict=verdict,
+            status=status,
             convergence=factors.convergence,
         )
 
@@ -304,7 +304,7 @@ class Factorize(Stage):
         count = (square > 0).sum(dim=1).clamp_min(1)
         seen_square = (weight @ square[..., None])[..., 0]
         borrowed = BORROWED_SAMPLES * square.sum(dim=1) / count
-        pull = max(config.light_pull, LEAST_PULL) * (seen_square + borrowed[:, None])
+        pull = max(config.light_pull, MIN_PULL) * (seen_square + borrowed[:, None])
         views = rows.seen.any(dim=2).sum(dim=1).clamp_min(1)
         level = (anchor**2).sum(dim=(1, 2)) / views
         prior = None

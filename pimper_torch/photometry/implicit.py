@@ -40,7 +40,7 @@ _RIDGE = 1e-10
 
 # Newton's method doubles the digits of a solution at every step, once it is near; before that its
 # steps are halved until they help, down to this share.
-_NEWTON_STEPS, _LEAST_STEP = 30, 1e-3
+_NEWTON_STEPS, _MIN_STEP = 30, 1e-3
 
 # Entries of the mixed part of the Hessian that are held at once.
 _CHUNK_ENTRIES = 10_000_000
@@ -137,7 +137,7 @@ def _polished(problem: Bilinear, factors: Factors) -> Factors:
             L, N = torch.where(keep, L, hessian.lights), torch.where(keep, N, hessian.shading)
             size = torch.where(better, after, size)
             hessian = _hessian(problem, L, N)
-        elif bool((share < _LEAST_STEP).all()):
+        elif bool((share < _MIN_STEP).all()):
             break
     return factors.replace(
         lights=hessian.lights.to(factors.lights), shading=hessian.shading.to(factors.shading)

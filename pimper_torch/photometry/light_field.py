@@ -9,7 +9,7 @@ from torch import Tensor
 from pimper_torch.records import Record
 
 # Cosine of the angle between normal and lamp that a sample needs to be lit beyond doubt.
-_LEAST_COSINE = 0.05
+_MIN_COSINE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -58,4 +58,4 @@ def faces_lamp(
 
     What faces away lies in attached shadow, which no light that is linear in ``(1, n)`` casts.
     """
-    return lamp @ normals.mT >= _LEAST_COSINE * lamp.norm(dim=2, keepdim=True)
+    return lamp @ normals.mT >= _MIN_COSINE * lamp.norm(dim=2, keepdim=True)

@@ -13,12 +13,12 @@ from torch.nn.functional import pad
 
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
-from pimper_torch.photometry.light_models import LEAST_DISTANCE, LightModel
+from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
 from pimper_torch.photometry.shown import Shown
 
 # A fit is done when a step lowers its cost by less than this share; and iterations and share where
 # gradients are asked for, from which Newton's method goes on.
-_LEAST_GAIN, _AT_REST = 1e-7, (300, 1e-13)
+_MIN_GAIN, _AT_REST = 1e-7, (300, 1e-13)
 
 # Share of the diagonal that is added to the normal equations where they precondition others: that
 # light and albedo share a factor makes them singular.
@@ -45,9 +45,9 @@ def fit_lights(model: LightModel, shown: Shown, iterations: int) -> LightFit:
         shown: What they are to explain.
         iterations: At most, where no gradients are asked for.
     """
-    limit, least_gain = _AT_REST if _asked(model, shown) else (iterations, _LEAST_GAIN)
+    limit, min_gain = _AT_REST if _asked(model, shown) else (iterations, _MIN_GAIN)
     with torch.no_grad():
-        return _fit(model, shown, limit, least_gain)
+        return _fit(model, shown, limit, min_gain)
 
 
 def _asked(model: LightModel, shown: Shown) -> bool:
@@ -55,10 +55,10 @@ def _asked(model: LightModel, shown: Shown) -> bool:
     return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
 
 
-def _fit(model: LightModel, shown: Shown, limit: int, least_gain: float) -> LightFit:
+def _fit(model: LightModel, shown: Shown, limit: int, min_gain: float) -> LightFit:
     lights, albedo = model.start(shown)
     descend = _descend_by_kernel if compiled_for(shown.radiance) else _descend
-    lights, albedo = descend(model, shown, model.admit(lights), albedo, limit, least_gain)
+    lights, albedo = descend(model, shown, model.admit(lights), albedo, limit, min_gain)
     residual = shown.residual(albedo, model.shade(lights))
     relative = (residual.abs() / shown.level.clamp_min(1e-300))[shown.seen]
     return LightFit(model=model, lights=lights, albedo=albedo, misfit=float(relative.median()))
@@ -70,7 +70,7 @@ def _descend_by_kernel(
     lights: Float[Tensor, "view parameter"],
     albedo: Float[Tensor, " sample"],
     limit: int,
-    least_gain: float,
+    min_gain: float,
 ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
     from pimper_torch.kernels.lights import TILE, fit
 
@@ -87,9 +87,9 @@ def _descend_by_kernel(
         radiance,
         seen,
         level.numpy(),
-        1 / LEAST_DISTANCE,
+        1 / MIN_DISTANCE,
         limit,
-        least_gain,
+        min_gain,
         lights.numpy(),
         found.numpy(),
     )
@@ -102,7 +102,7 @@ def _descend(
     lights: Float[Tensor, "view parameter"],
     albedo: Float[Tensor, " sample"],
     limit: int,
-    least_gain: float,
+    min_gain: float,
 ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
     """Step on lights and albedo together: alternation crawls along valleys where both mimic."""
     shading = model.shade(lights)
@@ -128,7 +128,7 @@ def _descend(
         if after < cost:
             lights, albedo, shading, residual = moved, changed, under, left
             damping = max(damping / 4, 1e-9)
-            if widen == 1 and after > cost * (1 - least_gain):
+            if widen == 1 and after > cost * (1 - min_gain):
                 break
         else:
             damping = min(damping * 10, 1e6)

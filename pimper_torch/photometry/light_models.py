@@ -11,7 +11,7 @@ from pimper_torch.photometry.shown import Shown
 
 # A lamp starts this far away, in mean distances of the samples from their middle, and comes no
 # nearer than the second: inside the scene its light has a pole.
-_FIRST_DISTANCE, LEAST_DISTANCE = 10.0, 1.3
+_FIRST_DISTANCE, MIN_DISTANCE = 10.0, 1.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +64,7 @@ class Lamp:
 
     def free(self, lights: Float[Tensor, "view 5"]) -> Bool[Tensor, "view 5"]:
         """Mark parameters that no bound holds."""
-        inner = (lights[:, 4:] > 0) & (lights[:, 4:] < 1 / LEAST_DISTANCE)
+        inner = (lights[:, 4:] > 0) & (lights[:, 4:] < 1 / MIN_DISTANCE)
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:4]) > 0, inner], dim=1)
 
     def start(self, shown: Shown) -> tuple[Float[Tensor, "view 5"], Float[Tensor, " sample"]]:
@@ -102,7 +102,7 @@ class Lamp:
     def admit(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "view 5"]:
         """Give the nearest parameters that make sense: lamps outside the scene."""
         ambient = lights[:, :1].clamp_min(0)
-        closeness = lights[:, 4:].clamp(0, 1 / LEAST_DISTANCE)
+        closeness = lights[:, 4:].clamp(0, 1 / MIN_DISTANCE)
         return torch.cat([ambient, lights[:, 1:4], closeness], dim=1)
 
     def _geometry(

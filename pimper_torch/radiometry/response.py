@@ -10,7 +10,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.radiometry.srgb import linear_from_srgb, srgb_from_linear
 
 # A power of 2.2 between so many entries is off by 0.13 % of full scale, half a level of 255.
-LEAST_ENTRIES = 17
+MIN_ENTRIES = 17
 _FULL_SCALE = {8: 255, 16: 65535}
 
 
@@ -131,9 +131,9 @@ def curve_from_table(
             at 0, and a last level that belongs to no file.
     """
     levels, radiance = levels.double(), radiance.double()
-    if len(levels) < LEAST_ENTRIES:
+    if len(levels) < MIN_ENTRIES:
         raise InputError(
-            f"{len(levels)} entries; needed: at least {LEAST_ENTRIES}, as straight lines lead from "
+            f"{len(levels)} entries; needed: at least {MIN_ENTRIES}, as straight lines lead from "
             "one to the next."
         )
     if len(radiance) not in (1, 3):

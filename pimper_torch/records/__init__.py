@@ -2,14 +2,14 @@
 
 from pimper_torch.records.contours import ContourPoints, ContourRays
 from pimper_torch.records.patches import (
-    AlignVerdict,
+    AlignStatus,
     Convergence,
     DepthPatches,
     Depths,
     Heights,
     Observations,
     PatchSet,
-    PatchVerdict,
+    PatchStatus,
     PatchViews,
     PhotometricPatches,
     Photometry,
@@ -34,7 +34,7 @@ from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
 from pimper_torch.records.views import Cameras, Views
 
 __all__ = [
-    "AlignVerdict",
+    "AlignStatus",
     "Cameras",
     "Capture",
     "CoarseMesh",
@@ -51,7 +51,7 @@ __all__ = [
     "Mesh",
     "Observations",
     "PatchSet",
-    "PatchVerdict",
+    "PatchStatus",
     "PatchViews",
     "PhotometricPatches",
     "Photometry",

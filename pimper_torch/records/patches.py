@@ -219,7 +219,7 @@ class Convergence(Record):
         return self.cause <= int(StopCause.STALLED)
 
 
-class PatchVerdict(IntEnum):
+class PatchStatus(IntEnum):
     """Whether light told a patch's shape, or what kept it from that."""
 
     DETERMINED = 0
@@ -247,7 +247,7 @@ class Photometry(Record):
             patch frame, constants folded in. A view without samples has zeros.
         valid: True where the sample was determined by the photographs.
         confidence: In [0, 1]; 0 where not valid.
-        verdict: A :class:`PatchVerdict` each. The normals of a patch that is not determined
+        status: A :class:`PatchStatus` each. The normals of a patch that is not determined
             are those of the coarse mesh, and none of its samples is valid.
         convergence: Of the factorization.
     """
@@ -257,7 +257,7 @@ class Photometry(Record):
     lights_patch: Float[Tensor, "patch view 4"]
     valid: Bool[Tensor, "patch height width"]
     confidence: Float[Tensor, "patch height width"]
-    verdict: Int[Tensor, " patch"]
+    status: Int[Tensor, " patch"]
     convergence: Convergence
 
     @property
@@ -282,7 +282,7 @@ class Photometry(Record):
     @property
     def determined(self) -> Bool[Tensor, " patch"]:
         """Whether light told the patch's shape."""
-        return self.verdict == int(PatchVerdict.DETERMINED)
+        return self.status == int(PatchStatus.DETERMINED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -369,7 +369,7 @@ class SweptPatches(OverPhotometry):
     averaged: float
 
 
-class AlignVerdict(IntEnum):
+class AlignStatus(IntEnum):
     """Whether neighbours bear a patch's relief out."""
 
     ALIGNED = 0
@@ -391,13 +391,13 @@ class Depths(Record):
             outside the enlarged triangle.
         transform: The alignment's ``(h_x, h_y, h_z, h_0)``: ``depth`` is
             ``h . (x, y, z, 1)`` of what integration gave; identity (0, 0, 1, 0) before.
-        verdict: An :class:`AlignVerdict` each; ``None`` before alignment.
+        status: An :class:`AlignStatus` each; ``None`` before alignment.
     """
 
     depth: Float[Tensor, "patch height width"]
     valid: Bool[Tensor, "patch height width"]
     transform: Float[Tensor, "patch 4"]
-    verdict: Int[Tensor, " patch"] | None = None
+    status: Int[Tensor, " patch"] | None = None
 
     @property
     def raster(self) -> tuple[int, ...]:
@@ -413,9 +413,9 @@ class Depths(Record):
     @property
     def aligned(self) -> Bool[Tensor, " patch"]:
         """Whether a neighbour bears the relief out; false before alignment."""
-        if self.verdict is None:
+        if self.status is None:
             return torch.zeros_like(self.transform[:, 0], dtype=torch.bool)
-        return self.verdict == int(AlignVerdict.ALIGNED)
+        return self.status == int(AlignStatus.ALIGNED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

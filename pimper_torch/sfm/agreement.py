@@ -24,7 +24,7 @@ from pimper_torch.sfm.model import SparseModel
 _JUDGES = 3
 
 # Share of those matches that must agree.
-_LEAST_AGREEMENT = 0.5
+_MIN_AGREEMENT = 0.5
 
 
 def misplaced_views(
@@ -54,7 +54,7 @@ def misplaced_views(
         judges = sorted(mine, reverse=True)[:_JUDGES]
         total = sum(count for count, _ in judges)
         agreeing = sum(count * share for count, share in judges)
-        if agreeing < _LEAST_AGREEMENT * total:
+        if agreeing < _MIN_AGREEMENT * total:
             found[name] = agreeing / total
     return found
 

@@ -12,7 +12,7 @@ from pimper_torch.sfm.model import SparseModel, list_some
 
 FEWEST_VIEWS = 3
 # Points seen under less are of no use to the coarse surface (coarse/surface.py).
-LEAST_ANGLE_DEG = 4.0
+MIN_ANGLE_DEG = 4.0
 ADVICE = (
     "Neighbouring photographs should overlap by two thirds and differ by less than about 20 "
     "degrees in viewpoint: add photographs between those that did not register, or give an "
@@ -34,7 +34,7 @@ def count_spread_views(model: SparseModel, fewest: int) -> int:
     """
     centers = invert_rigid(model.cam_from_world)[:, :3, 3]
     angles = triangulation_angles(model.points_world, model.observed, centers)
-    wide = torch.rad2deg(angles) >= LEAST_ANGLE_DEG
+    wide = torch.rad2deg(angles) >= MIN_ANGLE_DEG
     seen = model.observed[wide].sum(dim=0)
     return int((seen >= fewest).sum())
 
@@ -89,7 +89,7 @@ def choose_component(
         raise ReconstructionError(
             f"Structure from motion registered {len(kept)} of {len(names)} photographs, but only "
             f"{spread[largest]} of them see enough points under triangulation angles of "
-            f"{LEAST_ANGLE_DEG:.0f} degrees or more; at least {FEWEST_VIEWS} are needed. The "
+            f"{MIN_ANGLE_DEG:.0f} degrees or more; at least {FEWEST_VIEWS} are needed. The "
             "cameras were found in nearly one place: they stood still, or they were registered on "
             f"a background at rest. {MOVE}"
         )

@@ -37,7 +37,7 @@ _ITERATIONS = 10
 
 # Curvature of a template's match along its worst direction over that along its best, at least:
 # below, it is a stripe, and noise tells its place.
-_LEAST_ROUNDNESS = 0.01
+_MIN_ROUNDNESS = 0.01
 
 # Steps of the plane, about pixels of the reference: the longest at once; the one that ends.
 _LONGEST_STEP, _CONVERGED = 1.5, 0.02
@@ -49,7 +49,7 @@ _TRIAL, _HOPELESS = 4, 0.4
 _CONTRAST = (0.3, 3.0)
 
 # Share of a patch that a view may lack: padding, masked, saturated.
-_MOST_LACKING = 0.1
+_MAX_LACKING = 0.1
 
 _AT_ONCE = 4096
 
@@ -231,7 +231,7 @@ def _templates(
     slopes = torch.stack([window.freed(right.flatten(1)), window.freed(down.flatten(1))], dim=-1)
     normal = slopes.mT @ slopes
     worst, best = torch.linalg.eigvalsh(normal).unbind(dim=1)
-    told = (best > 1e-9) & (worst > _LEAST_ROUNDNESS * best)
+    told = (best > 1e-9) & (worst > _MIN_ROUNDNESS * best)
     safe = torch.where(told[:, None, None], normal, torch.eye(2).to(normal))
     return _Templates(
         values=window.freed(patches),
@@ -388,7 +388,7 @@ def _complete(
     """Tell whose patches a view shows nearly all of."""
     lacking = _look_up(unusable.float(), homographies, window, mode="nearest", outside=1.0)
     share = (lacking * window.root.square()).sum(dim=1) / window.total
-    return share <= _MOST_LACKING
+    return share <= _MAX_LACKING
 
 
 def _look_up(

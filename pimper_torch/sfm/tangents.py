@@ -16,10 +16,10 @@ from pimper_torch.records import Cameras, Record
 _NEIGHBOURS = 16
 
 # Cosine to the mean of the rays at which a normal is no longer believed.
-_LEAST_FACING = 0.5
+_MIN_FACING = 0.5
 
 # Cosine between normal and ray down to which a view is worth asking.
-_LEAST_COSINE = 0.35
+_MIN_COSINE = 0.35
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -63,11 +63,11 @@ def tangents(
     here = reference[:, None]
     pixel = (distance / focals).gather(1, here)
     # Foreshortened along one axis, a pixel covers more of the plane.
-    pixel = pixel / cosine.gather(1, here).clamp(_LEAST_COSINE, 1).sqrt()
+    pixel = pixel / cosine.gather(1, here).clamp(_MIN_COSINE, 1).sqrt()
     pixels, depth = project(points_world, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px[:, None].to(pixels)
     inside = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
-    candidates = inside.mT & (cosine > _LEAST_COSINE)
+    candidates = inside.mT & (cosine > _MIN_COSINE)
     return Tangents(
         points_world=points_world,
         steps_world=pixel[:, None] * _along(normals),
@@ -93,7 +93,7 @@ def plane_normals(
     axes = torch.linalg.eigh(steps.mT @ steps).eigenvectors
     across = axes[:, :, 0]
     facing = (across * towards).sum(dim=-1, keepdim=True)
-    return torch.where(facing.abs() > _LEAST_FACING, across * facing.sign(), towards)
+    return torch.where(facing.abs() > _MIN_FACING, across * facing.sign(), towards)
 
 
 def plane_homographies(

@@ -14,7 +14,7 @@ from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_pixels
 
-_MOST_ZOOM = 1.25
+_MAX_ZOOM = 1.25
 _AT_ONCE = 2**17  # pixels that are distorted at a time: rays and powers of radii take memory
 _TOUCHED = 1e-3  # share of saturated light in a pixel; below is the rounding of its weights
 
@@ -139,7 +139,7 @@ def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:
             reach = undistort_pixels(lens, edge)[:, axis].nan_to_num(nan=torch.inf).abs().min()
             needed = (end - K[axis, 2]).abs() / K[axis, axis]
             zoom = torch.maximum(zoom, needed / reach.clamp_min(1e-12))
-    zoom = zoom.clamp_max(_MOST_ZOOM)
+    zoom = zoom.clamp_max(_MAX_ZOOM)
     return torch.stack([K[0] * K.new_tensor([zoom, 1, 1]), K[1] * K.new_tensor([1, zoom, 1]), K[2]])
 
 

@@ -38,9 +38,9 @@ class Agreement(Record):
     covered: Float[Tensor, " view"]
     extent: Float[Tensor, " view"]
 
-    def trusted(self, least_covered: float) -> Bool[Tensor, " view"]:
+    def trusted(self, min_covered: float) -> Bool[Tensor, " view"]:
         """Mark views whose cut shows something, little of it outside the projection."""
-        return (self.covered >= least_covered) & (self.extent > 0)
+        return (self.covered >= min_covered) & (self.extent > 0)
 
 
 def agreement_of(cuts: Cuts) -> Agreement:

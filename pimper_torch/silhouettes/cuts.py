@@ -29,7 +29,7 @@ from pimper_torch.silhouettes.seeds import (
 )
 
 # Points of the object that a view must observe, in the median, to be seeded by them.
-_LEAST_OBSERVED = 12
+_MIN_OBSERVED = 12
 _WELL = 2.0  # times as deep as is_deep asks for
 _CUTS = 2  # rounds of mixtures and cut inside GrabCut
 _SPECK = 2e-4  # share of the picture
@@ -66,7 +66,7 @@ class Cues(Record):
     def has_points(self) -> bool:
         """Whether views observe enough points of the object to be seeded by them."""
         counts = torch.tensor([len(pixels) for pixels in self.own_px])
-        return int(counts.median()) >= _LEAST_OBSERVED
+        return int(counts.median()) >= _MIN_OBSERVED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -148,7 +148,7 @@ class FindSilhouettes(Stage):
             cameras,
             tolerance=tolerance,
             least_on=details.min_on_plane,
-            most_below=details.max_below_plane,
+            max_below=details.max_below_plane,
             generator=torch.Generator().manual_seed(details.seed),
         )
         region = (

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.records import Cameras, Record, SparseScene
 
 _TRIALS = 2000  # three good points of fifteen in a hundred are missed with probability 0.001
-_LEAST_POINTS = 20
+_MIN_POINTS = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -76,7 +76,7 @@ def supporting_plane(
     *,
     tolerance: float,
     least_on: float,
-    most_below: float,
+    max_below: float,
     generator: torch.Generator,
 ) -> Plane | None:
     """Find the plane that the object stands on, by RANSAC.
@@ -86,7 +86,7 @@ def supporting_plane(
         cameras: All on its upper side.
         tolerance: Distance from the plane up to which a point lies on it, scene units.
         least_on: Share of the points that must lie on it.
-        most_below: Share of the points that may lie below it.
+        max_below: Share of the points that may lie below it.
         generator: Draws the trials.
 
     Returns:
@@ -94,7 +94,7 @@ def supporting_plane(
         do, the one with most points, refitted to them.
     """
     count = len(points_world)
-    if count < _LEAST_POINTS:
+    if count < _MIN_POINTS:
         return None
     drawn = torch.randint(count, (_TRIALS, 3), generator=generator)
     a, b, c = points_world[drawn.to(points_world.device)].unbind(dim=1)
@@ -106,7 +106,7 @@ def supporting_plane(
     height = points_world @ normals.mT - offsets
     on = (height.abs() < tolerance).double().mean(dim=0)
     below = (height < -tolerance).double().mean(dim=0)
-    fits = eyes_above & (on >= least_on) & (below < most_below)
+    fits = eyes_above & (on >= least_on) & (below < max_below)
     if not bool(fits.any()):
         return None
     best = torch.where(fits, on, -1).argmax()

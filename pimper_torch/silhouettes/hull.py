@@ -126,7 +126,7 @@ def visual_hull(
     *,
     num_voxels: int = 2_000_000,
     disagreeing: float = 0.03,
-    least_seen: float = 0.5,
+    min_seen: float = 0.5,
 ) -> Hull | None:
     """Build the hull by the vote of the trusted views.
 
@@ -141,7 +141,7 @@ def visual_hull(
         num_voxels: Of the whole grid; an arc of views gives a hull that is long along their rays.
         disagreeing: Share of the views in sight of a voxel that may see it outside. What only
             a few views cut, such as the ends of an arc, needs a small one.
-        least_seen: Share of the trusted views that a voxel must be in sight of.
+        min_seen: Share of the trusted views that a voxel must be in sight of.
 
     Returns:
         ``None`` where the silhouettes have nothing in common inside the box.
@@ -155,14 +155,14 @@ def visual_hull(
     maps = list(side_by_side(framed, views, tracked=False))
     chosen = cameras.take(views)
     low, high = box_world.to(chosen.intrinsics)
-    first = _voted(maps, chosen, box_world, _FIRST, (disagreeing, least_seen))
+    first = _voted(maps, chosen, box_world, _FIRST, (disagreeing, min_seen))
     # A voxel whose border lies within half its diagonal may be met by a part of the hull.
     where = (first.distance > -0.87 * first.spacing).nonzero()
     if len(where) == 0:
         return None
     reach = first.spacing * torch.stack([where.amin(dim=0) - 1, where.amax(dim=0) + 1])
     fitted = torch.maximum(torch.minimum(first.origin_world + reach, high), low)
-    hull = _voted(maps, chosen, fitted, num_voxels, (disagreeing, least_seen))
+    hull = _voted(maps, chosen, fitted, num_voxels, (disagreeing, min_seen))
     return hull if bool(hull.occupied.any()) else None
 
 
@@ -288,7 +288,7 @@ def _vote(
         reach: Numbers of the voxels along each axis.
         shares: Of views that may disagree, and that must look.
     """
-    disagreeing, least_seen = shares
+    disagreeing, min_seen = shares
     shape = tuple(len(axis) for axis in reach)
     ranks = int(disagreeing * len(maps)) + 1
     smallest = [reach[0].new_full(shape, _UNSEEN) for _ in range(ranks)]
@@ -312,7 +312,7 @@ def _vote(
             value = larger
     outvoted = (disagreeing * seen).long()
     chosen = torch.stack(smallest).gather(0, outvoted[None])[0]
-    enough = (seen >= least_seen * len(maps)) & (seen > 0)
+    enough = (seen >= min_seen * len(maps)) & (seen > 0)
     return torch.where(enough, chosen, -torch.inf)
 
 

@@ -31,7 +31,7 @@ _STEP = 2.0  # working pixels at the fixation point between samples of the plane
 # The same for brightness, where there is no texture.
 _FAR_REACH, _FAR_STEP = 2.0, 8.0
 _NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
-_LEAST_VIEWS = 3  # of which two agree
+_MIN_VIEWS = 3  # of which two agree
 _SAMPLES = 2**20  # of the plane, over all views, at once
 
 
@@ -115,7 +115,7 @@ def _middle(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row colu
     """Give the views' median and the spread round it; NaN where too few see the plane."""
     common = seen.nanmedian(dim=0).values
     spread = (seen - common).abs().nanmedian(dim=0).values
-    few = seen.isfinite().sum(dim=0) < _LEAST_VIEWS
+    few = seen.isfinite().sum(dim=0) < _MIN_VIEWS
     return torch.stack([common, spread]).masked_fill(few, torch.nan)
 
 

@@ -44,7 +44,7 @@ class RayConfig:
         max_concave_deg: The same of one that bends into it: where one part of the surface
             hides another, the silhouette has a concave corner, and no normal.
         border_px: Rays keep so far from the photograph's border.
-        least_length_px: Shorter silhouettes are specks.
+        min_length_px: Shorter silhouettes are specks.
     """
 
     per_view: int = 300
@@ -54,7 +54,7 @@ class RayConfig:
     max_convex_deg: float = 90.0
     max_concave_deg: float = 40.0
     border_px: float = 3.0
-    least_length_px: float = 24.0
+    min_length_px: float = 24.0
 
     def __post_init__(self) -> None:
         require(self.per_view >= 1, "contours.per_view", self.per_view, "1 or more")
@@ -65,7 +65,7 @@ class RayConfig:
             degrees = getattr(self, name)
             require(0 < degrees <= 180, f"contours.{name}", degrees, "in (0, 180]")
         require(self.border_px >= 0, "contours.border_px", self.border_px, "0 or more")
-        require(self.least_length_px >= 0, "contours.least_length_px", self.least_length_px, "0 up")
+        require(self.min_length_px >= 0, "contours.min_length_px", self.min_length_px, "0 up")
 
 
 def contour_rays(
@@ -125,7 +125,7 @@ def _of_view(
         inside[:height, :width].detach().cpu().double().numpy(), config.blur_px, mode="nearest"
     )
     lines = [_resampled(line) for line in find_contours(smooth, 0.5)]
-    lines = [line for line in lines if len(line.places) >= config.least_length_px]
+    lines = [line for line in lines if len(line.places) >= config.min_length_px]
     stride = max(1.0, sum(len(line.places) for line in lines) / config.per_view)
     rows = [_samples(line, smooth, stride, config) for line in lines]
     table = torch.from_numpy(np.concatenate([np.zeros((0, 7)), *rows])).to(like)

@@ -23,7 +23,7 @@ def compiled_costs(
     scale: Float[Tensor, " patch"],
     num_views: int,
     min_views: int,
-    least_facing: float,
+    min_facing: float,
 ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
     """Give the robust cost of every height, and 1 where a sample is swept, else 0.
 
@@ -38,7 +38,7 @@ def compiled_costs(
         scale: Of the robust cost, in units of radiance.
         num_views: At most so many judge a sample.
         min_views: At least so many judge one that is swept.
-        least_facing: Cosine of the angle from which on footprints shrink no more.
+        min_facing: Cosine of the angle from which on footprints shrink no more.
     """
     patch_from_world = templates.patch_from_world.double()
     exact = cameras.to(torch.float64)
@@ -65,7 +65,7 @@ def compiled_costs(
         as_array(ladder, torch.float64),
         num_views,
         min_views,
-        least_facing,
+        min_facing,
         as_array(cost),
         as_array(swept),
     )

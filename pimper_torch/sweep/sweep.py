@@ -40,10 +40,10 @@ from pimper_torch.sweep.windows import level_weight, window_mean, window_size
 CORRELATED_SAMPLES = 4.0
 
 # A sample seen at a flatter angle (cosine) is looked up as if seen at this one.
-_LEAST_FACING = 0.05
+_MIN_FACING = 0.05
 
 # Residuals of a patch that suits its light perfectly still have this spread, of saturation.
-LEAST_SPREAD = 1e-4
+MIN_SPREAD = 1e-4
 
 
 # Samples of the template between heights that are tried, and of the standard deviation of the
@@ -192,7 +192,7 @@ class Sweep(Stage):
 
     def _scale(self, photometry: Photometry) -> Float[Tensor, " patch"]:
         """Give the residuals of each patch that count as large."""
-        return _LOSS_SCALE * photometry.convergence.residual.clamp_min(LEAST_SPREAD)
+        return _LOSS_SCALE * photometry.convergence.residual.clamp_min(MIN_SPREAD)
 
     def _compiled_costs(
         self,
@@ -216,7 +216,7 @@ class Sweep(Stage):
             scale=self._scale(photometry),
             num_views=config.num_views,
             min_views=config.min_views,
-            least_facing=_LEAST_FACING,
+            min_facing=_MIN_FACING,
         )
 
     def _costs(
@@ -316,7 +316,7 @@ class Sweep(Stage):
             one = cameras.take([view])
             across = self._footprint(start, spacing, one)[:, 0]
             away = normalize(one.centers_world - start, dim=-1)
-            squeezed = (away * outward).sum(dim=-1).clamp_min(_LEAST_FACING)
+            squeezed = (away * outward).sum(dim=-1).clamp_min(_MIN_FACING)
             level = (across * squeezed.sqrt()).clamp_min(1).log2()
             level = level[:, None].expand(-1, moves.shape[1]).flatten()
             radiance = look_up(sources.gray.levels(view), pixels, level)

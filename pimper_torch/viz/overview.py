@@ -26,7 +26,7 @@ _ACROSS = 4
 _PANEL_IN, _GAP_IN, _TITLE_IN, _HEADLINE_IN = 3.9, 0.1, 0.35, 0.4
 _DPI = 100
 _THUMBNAILS_ACROSS = 8
-_MOST_FACES = 200_000  # more than a panel has pixels to show; rays take four times as long at 10^6
+_MAX_FACES = 200_000  # more than a panel has pixels to show; rays take four times as long at 10^6
 _TALLEST = 1.6  # a panel that is higher for its width is shown narrower
 
 
@@ -155,7 +155,7 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     """Make the pictures of the contact sheet."""
     reference = result.coarse.reference
     own = result.cameras.take([reference])
-    shape = with_few_faces(result.mesh, _MOST_FACES)
+    shape = with_few_faces(result.mesh, _MAX_FACES)
     vertices = result.mesh.vertices_world
     camera = frame(own, vertices, panel_px, _MARGIN)
     name = result.scene.views.names[reference]

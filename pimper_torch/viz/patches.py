@@ -97,7 +97,7 @@ def by_facet(patches: AnyPatch, name: str) -> Float[Tensor, " face"]:
 
     Args:
         patches: Whose buckets have the field.
-        name: Of the field, such as ``verdict``, or of one inside, ``convergence.residual``; one
+        name: Of the field, such as ``status``, or of one inside, ``convergence.residual``; one
             value a patch.
 
     Raises:

@@ -16,7 +16,7 @@ from pimper_torch.records import Silhouettes
 
 SETTINGS = (
     CoarseSurfaceConfig(num_facets=600),
-    DensifyConfig(coarsest_px=120, levels=1, most_hypotheses=48),
+    DensifyConfig(coarsest_px=120, levels=1, max_hypotheses=48),
     FineSurfaceConfig(hole_px=12.0),
 )
 

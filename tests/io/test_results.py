@@ -203,7 +203,7 @@ def test_the_common_light_is_what_the_patches_see_of_one_light(reconstruction):
                 normals_patch=normals,
                 lights_patch=lights,
                 valid=torch.ones_like(found.valid),
-                verdict=torch.zeros_like(found.verdict),
+                status=torch.zeros_like(found.status),
             )
         )
     patches = reconstruction.patches

@@ -79,7 +79,7 @@ def test_needles_are_taken_for_less_sharp_ones():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.5, 1e-9, 0]], dtype=torch.float64)
     mesh = elements(vertices, torch.tensor([[0, 1, 2]]))
     _, _, sharp = cotangent_laplacian(mesh, torch.ones(1).double())
-    _, _, blunt = cotangent_laplacian(mesh, torch.ones(1).double(), least_shape=1e-4)
+    _, _, blunt = cotangent_laplacian(mesh, torch.ones(1).double(), min_shape=1e-4)
     assert sharp.abs().max() > 1e8
     assert blunt.abs().max() <= 0.25e4 * (1 + 1e-12)
 

@@ -377,7 +377,7 @@ def test_refusals_say_what_is_wrong():
 
 
 def test_a_solve_that_does_not_converge_says_how_far_it_came(generator, monkeypatch):
-    monkeypatch.setattr("pimper_torch.linalg.multigrid._MOST_CYCLES", 3)
+    monkeypatch.setattr("pimper_torch.linalg.multigrid._MAX_CYCLES", 3)
     solver = system(equal(100, 100), method="multigrid", what="the moon")
     with pytest.raises(SingularSystemError, match=r"the moon.*after 3 iterations.*residual is"):
         solver.solve(random(generator, 100, 100))

@@ -59,7 +59,7 @@ def photographed():
                     lights_patch=torch.ones(count, 1, 4, dtype=x.dtype),
                     valid=valid,
                     confidence=valid.to(x),
-                    verdict=0 * one.long(),
+                    status=0 * one.long(),
                     convergence=Convergence(
                         iterations=one.long(), residual=0 * one, cause=0 * one.long()
                     ),

@@ -141,7 +141,7 @@ def test_whole_factorizations_agree_and_nan_is_missing(scene):
         with using(how), pytest.warns(PimperWarning, match="1 of 8"):
             results.append(Factorize()(seen))
     for one, other in zip(results[0].buckets, results[1].buckets, strict=True):
-        assert_close(one.verdict, other.verdict)
+        assert_close(one.status, other.status)
         assert_close(one.valid, other.valid)
         for name in ("normals_patch", "albedo", "lights_patch", "confidence"):
             assert_close(getattr(one, name), getattr(other, name), rtol=0, atol=5e-3)

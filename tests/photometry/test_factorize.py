@@ -9,7 +9,7 @@ from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.patches.carry import coarse_normals
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.records import PatchVerdict, PatchViews
+from pimper_torch.records import PatchStatus, PatchViews
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
 
@@ -95,7 +95,7 @@ def test_a_patch_that_few_views_see_is_told_from_one_that_none_sees(scene):
     seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
     with pytest.warns(PimperWarning, match="1 are nowhere seen lit in 4 views"):
         found = Factorize()(seen).buckets[0]
-    assert found.verdict.tolist() == [0, PatchVerdict.FEW_VIEWS, 0, 0, 0]
+    assert found.status.tolist() == [0, PatchStatus.FEW_VIEWS, 0, 0, 0]
     assert (found.lights_patch[1, 3:] == 0).all()
     assert found.convergence.residual.isfinite().all()
 
@@ -106,7 +106,7 @@ def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
     with pytest.warns(PimperWarning, match="8 of 8 patches keep the normals of the coarse mesh"):
         found = Factorize()(true.seen)
     for bucket, templates in zip(found.buckets, true.seen.patches.buckets, strict=True):
-        assert (bucket.verdict == PatchVerdict.CONSTANT_LIGHT).all()
+        assert (bucket.status == PatchStatus.CONSTANT_LIGHT).all()
         assert not bucket.valid.any()
         coarse = coarse_normals(true.seen.patches.coarse, templates)
         assert_close(bucket.normals_patch, coarse)
@@ -134,8 +134,8 @@ def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how)
     with pytest.warns(PimperWarning):
         plain = Factorize()(without)
     bad, good = found.buckets[0], plain.buckets[0]
-    reason = PatchVerdict.UNSEEN if how == "masked" else PatchVerdict.NOT_FINITE
-    assert bad.verdict[2] == reason
+    reason = PatchStatus.UNSEEN if how == "masked" else PatchStatus.NOT_FINITE
+    assert bad.status[2] == reason
     assert not bad.determined[2]
     assert not bad.valid[2].any()
     for name in ("normals_patch", "albedo", "lights_patch", "confidence"):

@@ -80,6 +80,7 @@ def test_a_record_shows_shapes_instead_of_numbers(cameras):
     assert len(shown) < 300
 
 
+@pytest.mark.usefixtures("shapes_unchecked")
 def test_tensors_of_the_wrong_shape_or_kind_are_refused(cameras):
     with pytest.raises(InputError, match=r"Cameras.cam_from_world is float64\[1, 4, 4\]; needed: "):
         cameras.replace(cam_from_world=cameras.cam_from_world[:1])  # one camera, two intrinsics
@@ -119,7 +120,7 @@ def test_records_inside_are_taken_along():
         lights_patch=torch.zeros(3, 5, 4),
         valid=torch.zeros(3, 2, 2, dtype=torch.bool),
         confidence=torch.zeros(3, 2, 2),
-        verdict=torch.zeros(3).long(),
+        status=torch.zeros(3).long(),
         convergence=convergence,
     )
     assert photometry.take([2]).convergence.iterations.tolist() == [2]

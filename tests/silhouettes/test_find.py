@@ -151,7 +151,7 @@ def test_a_region_is_two_corners():
 def test_the_table_is_the_supporting_plane(staged, generator):
     scene = staged.scene
     plane = supporting_plane(
-        scene.points_world, scene.cameras, tolerance=0.01, least_on=0.1, most_below=0.05,
+        scene.points_world, scene.cameras, tolerance=0.01, least_on=0.1, max_below=0.05,
         generator=generator,
     )  # fmt: skip
     assert plane is not None
@@ -167,7 +167,7 @@ def test_points_without_a_plane_have_none(generator):
     cameras = arc_cameras(5, width=80, height=60, focal_px=90.0, distance=4.0).to(torch.float32)
     points = torch.randn(500, 3, generator=generator)
     found = supporting_plane(
-        points, cameras, tolerance=0.01, least_on=0.1, most_below=0.05, generator=generator
+        points, cameras, tolerance=0.01, least_on=0.1, max_below=0.05, generator=generator
     )
     assert found is None
 

@@ -120,7 +120,7 @@ def test_views_abstain_outside_their_photographs(cameras):
         BOX,
         num_voxels=48**3,
         disagreeing=0.0,
-        least_seen=0.4,
+        min_seen=0.4,
     )
     assert hull is not None
     assert 4.1 < float(hull.occupied.sum() * hull.spacing**3) < 4.8
@@ -130,7 +130,7 @@ def test_what_too_few_views_look_at_is_outside(cameras):
     near = visual_hull(ball_silhouettes(cameras), cameras, BOX + 4.0, num_voxels=32**3)
     assert near is None  # the box stands beside the ball
     everything = ball_silhouettes(cameras, radius=100.0)
-    hull = visual_hull(everything, cameras, 4 * BOX, num_voxels=32**3, least_seen=0.9)
+    hull = visual_hull(everything, cameras, 4 * BOX, num_voxels=32**3, min_seen=0.9)
     assert hull is not None
     radius = (hull.origin_world + hull.spacing * hull.occupied.nonzero()).norm(dim=1)
     assert radius.max() < 2.5  # beyond the pictures' width at the origin, 2, few views look

@@ -36,7 +36,7 @@ from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 from pimper_torch.stage import Stage
 
 # A needle's area is taken as at least this share of its longest edge squared.
-_LEAST_SHAPE = 1e-3
+_MIN_SHAPE = 1e-3
 
 # Rows, columns and values of a sparse matrix.
 Entries = tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]
@@ -159,7 +159,7 @@ def _laplacian(lattice: Lattice) -> tuple[Entries, Float[Tensor, " vertex"]]:
     corners = lattice.points.double()[lattice.faces]
     doubled = face_normals(lattice.points.double(), lattice.faces)
     opposite = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
-    least = _LEAST_SHAPE * opposite.square().sum(dim=-1).amax(dim=1)
+    least = _MIN_SHAPE * opposite.square().sum(dim=-1).amax(dim=1)
     area = torch.maximum(doubled.norm(dim=-1) / 2, least)
     gradients = torch.linalg.cross(
         normalize(doubled, dim=-1)[:, None].expand_as(opposite), opposite

@@ -71,7 +71,7 @@ RESULT_NAMES = (
     "sparse_pc.ply",
 )
 # Enough to start from or to see the object's extent, and no more than viewers like.
-_MOST_POINTS = 100_000
+_MAX_POINTS = 100_000
 
 
 _PHOTOGRAPHS = ("response", "saturation", "black")
@@ -285,9 +285,9 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
 def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
     """Give points of the true surface, at most a hundred thousand, or ``None``."""
     points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
-    if points is None or len(points) <= _MOST_POINTS:
+    if points is None or len(points) <= _MAX_POINTS:
         return points
-    chosen = torch.linspace(0, len(points) - 1, _MOST_POINTS, dtype=torch.float64)
+    chosen = torch.linspace(0, len(points) - 1, _MAX_POINTS, dtype=torch.float64)
     return points[chosen.round().long().to(points.device)]
 
 

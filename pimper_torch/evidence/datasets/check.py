@@ -32,8 +32,8 @@ from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Capture, Mesh, Truth, Views
 
-_MOST_VIEWS = 8
-_MOST_POINTS = 20_000
+_MAX_VIEWS = 8
+_MAX_POINTS = 20_000
 # A mistake is believed where undoing it takes away 40 % of the misfit and raises the mean score
 # by 0.05: the right cameras of a body of revolution may be a little worse than mirrored ones.
 # Scores of matched features end far below 1, as many matches are wrong (0.34 with the right
@@ -291,9 +291,9 @@ def _subject(capture: Capture, cameras: Cameras) -> _Subject:
 
 def _spread(views: list[int]) -> list[int]:
     """Pick pairs of successive views all along; successive ones show most in common."""
-    if len(views) <= _MOST_VIEWS:
+    if len(views) <= _MAX_VIEWS:
         return views
-    starts = np.linspace(0, len(views) - 2, _MOST_VIEWS // 2).round().astype(int)
+    starts = np.linspace(0, len(views) - 2, _MAX_VIEWS // 2).round().astype(int)
     return [views[index] for start in starts for index in (start, start + 1)]
 
 
@@ -324,7 +324,7 @@ def _surface_points(truth: Truth) -> Float[Tensor, "point 3"] | None:
     points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
     if points is None or len(points) == 0:
         return None
-    return points[torch.randperm(len(points), generator=generator)[:_MOST_POINTS]]
+    return points[torch.randperm(len(points), generator=generator)[:_MAX_POINTS]]
 
 
 def _sampled(mesh: Mesh, generator: torch.Generator) -> Float[Tensor, "point 3"]:
@@ -333,7 +333,7 @@ def _sampled(mesh: Mesh, generator: torch.Generator) -> Float[Tensor, "point 3"]
     area = face_normals(mesh.vertices_world.detach().cpu().double(), mesh.faces.cpu()).norm(dim=1)
     # By the cumulative area, as multinomial draws from 2^24 faces at most.
     total = area.cumsum(0)
-    draw = torch.rand(_MOST_POINTS, 3, generator=generator, dtype=torch.float64)
+    draw = torch.rand(_MAX_POINTS, 3, generator=generator, dtype=torch.float64)
     face = torch.searchsorted(total, draw[:, 0] * total[-1]).clamp_max(len(area) - 1)
     root = draw[:, 1].sqrt()
     weights = torch.stack([1 - root, root * (1 - draw[:, 2]), root * draw[:, 2]], dim=1)

@@ -13,7 +13,7 @@ from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Views
 
 # Less than this moves no pixel by an amount that calibration knows.
-_LEAST_SKEW_PX = 0.01
+_MIN_SKEW_PX = 0.01
 
 
 def write_picture(views: Views, index: int, path: Path) -> None:
@@ -73,7 +73,7 @@ def refuse_skew(cameras: Cameras, names: Sequence[str], kind: str) -> None:
     height = cameras.sizes_px[:, 1].cpu().double()
     moved = (K[:, 0, 1] / K[:, 1, 1]).abs() * height / 2
     sheared = [
-        name for name, shift in zip(names, moved.tolist(), strict=True) if shift > _LEAST_SKEW_PX
+        name for name, shift in zip(names, moved.tolist(), strict=True) if shift > _MIN_SKEW_PX
     ]
     if sheared:
         raise InputError(

@@ -23,7 +23,7 @@ from pimper_torch.sfm.undistort import pinhole_for, undistort
 
 _HALF = 0.5
 # Files round a rotation to some digits; more than this is a scale or a reflection.
-_MOST_FROM_ROTATION = 1e-2
+_MAX_FROM_ROTATION = 1e-2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -231,7 +231,7 @@ def rigid_or_refuse(
     off = float((rotation - nearest).abs().max())
     mirrored = bool(torch.linalg.det(nearest) < 0)
     expect(
-        off <= _MOST_FROM_ROTATION and not mirrored,
+        off <= _MAX_FROM_ROTATION and not mirrored,
         place,
         kind,
         f"a rotation in {what}",

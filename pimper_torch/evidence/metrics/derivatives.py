@@ -23,7 +23,7 @@ _JUMP = 0.01
 _ROUNDINGS = 16
 
 # A direction in which more than this share of an output's elements jump tells nothing of it.
-_MOST_JUMPS = 0.5
+_MAX_JUMPS = 0.5
 
 Tensors = Mapping[str, Tensor]
 
@@ -132,7 +132,7 @@ def check_derivatives(
         jumps = {
             name: torch.stack([jumps[output] for _, jumps in each]) for name, each in moving.items()
         }
-        smooth = {name: jump.double().mean(dim=1) <= _MOST_JUMPS for name, jump in jumps.items()}
+        smooth = {name: jump.double().mean(dim=1) <= _MAX_JUMPS for name, jump in jumps.items()}
         apart = torch.stack([jumps[name][smooth[name]].any(dim=0) for name in inputs]).any(dim=0)
         sums = torch.randn(weights, values.numel(), generator=generator).to(values)
         sums = torch.where(apart, 0, sums)

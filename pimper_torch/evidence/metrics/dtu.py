@@ -17,7 +17,7 @@ from pimper_torch.records import DtuProtocol, Mesh, Record
 # is an outlier, and the side of the cells by which it searches for neighbours.
 THINNING_MM, CAP_MM, _CELL_MM = 0.2, 20.0, 60.0
 # The sets' objects have some ten million points 0.2 mm apart; a hundred million take gigabytes.
-_MOST_POINTS = 2e8
+_MAX_POINTS = 2e8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,10 +140,10 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
     n1, n2 = n1[usable].long(), n2[usable].long()
     counts = (n1 + 1) * (n2 + 1)
     total = float(counts.double().sum())
-    if total > _MOST_POINTS:
+    if total > _MAX_POINTS:
         raise InputError(
             f"points {distance:g} apart on the faces would be about {total / 2:.1g}; needed: at "
-            f"most {_MOST_POINTS / 2:.0g}. Is the result in the millimetres of the set? Align it "
+            f"most {_MAX_POINTS / 2:.0g}. Is the result in the millimetres of the set? Align it "
             "by its cameras first."
         )
     face = torch.arange(len(usable)).repeat_interleave(counts)

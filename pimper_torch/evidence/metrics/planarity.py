@@ -32,7 +32,7 @@ _SMOOTHING = 0.01
 _FEWEST_INSIDE = 12
 
 # At so many rounds over the mesh, at most.
-_MOST_ROUNDS = 60
+_MAX_ROUNDS = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -157,7 +157,7 @@ def dihedrals(
     *,
     reach: float = 0.04,
     min_length: float = 0.3,
-    least_turn_deg: float = 20.0,
+    min_turn_deg: float = 20.0,
 ) -> tuple[Dihedral, ...]:
     """Measure the angles between flat sides that meet.
 
@@ -166,7 +166,7 @@ def dihedrals(
         sides: From :func:`planar_faces`.
         reach: How near they must come, as a share of the mesh's diagonal.
         min_length: Of the border they share, as a share of the shorter one's edge.
-        least_turn_deg: Sides turned less are two halves of one.
+        min_turn_deg: Sides turned less are two halves of one.
     """
     vertices, faces = mesh.vertices_world.detach().cpu().double(), mesh.faces.cpu()
     far = reach * float((vertices.amax(dim=0) - vertices.amin(dim=0)).norm())
@@ -179,7 +179,7 @@ def dihedrals(
             turn = math.degrees(math.acos(float((first.normal @ second.normal).clamp(-1, 1))))
             distance, _ = trees[other].query(places[one], distance_upper_bound=far)
             border = places[one][np.isfinite(distance)]
-            if len(border) < 2 or turn < least_turn_deg:
+            if len(border) < 2 or turn < min_turn_deg:
                 continue
             along = normalize(torch.linalg.cross(first.normal, second.normal), dim=0).numpy()
             length = float(np.ptp(border @ along))
@@ -274,7 +274,7 @@ def _smoothed_face_normals(
     """Average normals over about ``length``: n rounds over the mesh reach the root of n edges."""
     corners = vertices[faces]
     edge = float(side_lengths(corners).median())
-    rounds = min(_MOST_ROUNDS, round((length / max(edge, 1e-30)) ** 2))
+    rounds = min(_MAX_ROUNDS, round((length / max(edge, 1e-30)) ** 2))
     if rounds == 0:
         return normalize(face_normals(vertices, faces), dim=1)
     smooth = vertex_normals(vertices, faces)

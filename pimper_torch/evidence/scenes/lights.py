@@ -106,7 +106,7 @@ def wandering_lights(
     *,
     distance: float,
     spread_deg: float = 65.0,
-    least_tilt_deg: float = 15.0,
+    min_tilt_deg: float = 15.0,
     irradiance: float = 0.8,
     ambient: float = 0.12,
     flash: float = 0.0,
@@ -120,7 +120,7 @@ def wandering_lights(
         generator: Decides where the lamp goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
         spread_deg: Greatest angle from ``toward``.
-        least_tilt_deg: Smallest angle from ``toward``.
+        min_tilt_deg: Smallest angle from ``toward``.
         irradiance: Mean over the views; drawn up to a quarter less or more.
         ambient: The same.
         flash: The same for every view.
@@ -131,7 +131,7 @@ def wandering_lights(
     aside = torch.linalg.svd(axis[None]).Vh[1:]
     square = _even_square(num_views, generator)
     turn = 2 * torch.pi * square[:, 0]
-    lowest, highest = torch.deg2rad(torch.tensor([spread_deg, least_tilt_deg])).cos().tolist()
+    lowest, highest = torch.deg2rad(torch.tensor([spread_deg, min_tilt_deg])).cos().tolist()
     cosine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
     sine = (1 - cosine**2).sqrt()
     across = turn.cos()[:, None] * aside[0] + turn.sin()[:, None] * aside[1]

@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 # A dielectric mirrors everything at grazing incidence; no real one mirrors less than 2 % head
 # on, so that what is given less than that stands for something wholly or partly matte.
-_LEAST_SPECULAR = 0.02
+_MIN_SPECULAR = 0.02
 
 
 def fresnel(
@@ -28,7 +28,7 @@ def fresnel(
         cosine: Between the light and what it falls on.
         specular: The share at a cosine of 1; 0 mirrors nothing at any angle.
     """
-    grazing = (specular / _LEAST_SPECULAR).clamp_max(1)
+    grazing = (specular / _MIN_SPECULAR).clamp_max(1)
     return specular + (grazing - specular) * (1 - cosine).clamp(0, 1) ** 5
 
 

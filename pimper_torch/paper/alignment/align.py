@@ -35,7 +35,7 @@ from pimper_torch.paper.alignment.trust import (
     trust_by_distance,
 )
 from pimper_torch.progress import report
-from pimper_torch.records import AlignVerdict, DepthPatches, Depths, PatchSet, Record
+from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Record
 from pimper_torch.stage import Stage
 
 # An arc over an edge whose middle stands out by 0.7 % of its length has this C; flatter
@@ -148,12 +148,12 @@ class Align(Stage):
 
     *Who stays.* A patch that meets no neighbour stays on the mesh, where its own anchors
     alone put it, and so does one whose relief lies elsewhere than that of every neighbour it
-    meets even after all; their verdicts tell, an :class:`~pimper_torch.records.AlignVerdict`
+    meets even after all; their statuses tell, an :class:`~pimper_torch.records.AlignStatus`
     each. One without relief stays as it is.
 
     Rigid motions and the scale of the world change nothing. Differentiable in the depths
     through all rounds; which samples meet, and what they and the anchors weigh by distance,
-    is decided along the way like the rest, verdicts without gradient.
+    is decided along the way like the rest, statuses without gradient.
 
     Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; Milano, Chung,
     Blum, Siegwart, Ott: continuous components of normal integration, 2025, for joint relative
@@ -168,7 +168,7 @@ class Align(Stage):
         """Align all patches.
 
         Returns:
-            Changed depths with the transforms that changed them, a verdict each, and how far
+            Changed depths with the transforms that changed them, a status each, and how far
             neighbours were apart before and after each round. Where no patch meets a
             neighbour, what came in.
 
@@ -199,8 +199,8 @@ class Align(Stage):
             report(done + 1, config.rounds)
         with torch.no_grad():
             pulls = self._met(problem, depths, transforms)
-            verdict = self._judged(pulls, transforms)
-        borne_out = (verdict == int(AlignVerdict.ALIGNED))[:, None]
+            status = self._judged(pulls, transforms)
+        borne_out = (status == int(AlignStatus.ALIGNED))[:, None]
         if not bool(borne_out.all()):
             on_mesh = self._on_mesh(problem, pulls, transforms)
             transforms = torch.where(borne_out, transforms, on_mesh)
@@ -209,7 +209,7 @@ class Align(Stage):
         with torch.no_grad():
             mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * problem.unit
         return depths.replace(
-            buckets=_apply(depths, transforms * problem.in_scene, verdict),
+            buckets=_apply(depths, transforms * problem.in_scene, status),
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
         )
 
@@ -371,7 +371,7 @@ def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Floa
 
 
 def _apply(
-    depths: DepthPatches, transforms: Float[Tensor, "face 4"], verdict: Int[Tensor, " face"]
+    depths: DepthPatches, transforms: Float[Tensor, "face 4"], status: Int[Tensor, " face"]
 ) -> tuple[Depths, ...]:
     buckets = []
     for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
@@ -383,7 +383,7 @@ def _apply(
             relief.replace(
                 depth=depth.to(relief.depth),
                 transform=chained.to(relief.transform),
-                verdict=verdict[templates.facet],
+                status=status[templates.facet],
             )
         )
     return tuple(buckets)

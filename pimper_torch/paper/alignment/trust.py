@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.records import AlignVerdict
+from pimper_torch.records import AlignStatus
 
 # Reliefs this close, in edge lengths, agree; only beyond it can a sample be an outlier.
 SAME_PLACE = 5e-3
@@ -58,7 +58,7 @@ def judge_patches(
     reliable: Bool[Tensor, " seam"],
     count: int,
 ) -> Int[Tensor, " face"]:
-    """Give every patch its :class:`~pimper_torch.records.AlignVerdict`.
+    """Give every patch its :class:`~pimper_torch.records.AlignStatus`.
 
     Args:
         facets: The two patches of each seam.
@@ -66,7 +66,7 @@ def judge_patches(
         reliable: Whether they also agree.
         count: Patches.
     """
-    verdict = torch.full((count,), int(AlignVerdict.ALONE), device=facets.device)
-    verdict[facets[overlapping].flatten()] = int(AlignVerdict.DISPUTED)
-    verdict[facets[overlapping & reliable].flatten()] = int(AlignVerdict.ALIGNED)
-    return verdict
+    status = torch.full((count,), int(AlignStatus.ALONE), device=facets.device)
+    status[facets[overlapping].flatten()] = int(AlignStatus.DISPUTED)
+    status[facets[overlapping & reliable].flatten()] = int(AlignStatus.ALIGNED)
+    return status

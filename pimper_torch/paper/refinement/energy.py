@@ -29,7 +29,7 @@ _TIE = 1e-9
 
 # A needle's area is taken as at least this share of its longest edge squared: its cotangents
 # would otherwise spoil the condition of the whole system.
-_LEAST_SHAPE = 1e-4
+_MIN_SHAPE = 1e-4
 
 # A facet with a smaller share of supported vertices is taken to lie as the coarse mesh does.
 _TREND_SHARE = 0.5
@@ -84,7 +84,7 @@ def assemble(
     mass = lumped_mass(mesh, fidelity.double()[lattice.face_facet])
     mass = mass * (1 - weights) * torch.where(supported, 1, _TIE)
     seams = weights[lattice.faces].mean(dim=1)
-    rows, cols, values = cotangent_laplacian(mesh, seams, _LEAST_SHAPE)
+    rows, cols, values = cotangent_laplacian(mesh, seams, _MIN_SHAPE)
     diagonal = torch.arange(mesh.count, device=mass.device)
     return System(
         rows=torch.cat([rows, diagonal]),

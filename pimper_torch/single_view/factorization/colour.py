@@ -16,7 +16,7 @@ from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.records import Convergence, Record
 
 # A channel with less than this share of a sample's brightness has nothing to say of its normal.
-_LEAST_CHROMA = 0.02
+_MIN_CHROMA = 0.02
 
 # Turns of tints and chroma before the first factorization; each halves what is left at least.
 _TINTING = 8
@@ -99,7 +99,7 @@ def split_colours(
 ) -> Bilinear:
     """Make every channel of a view a view of its own."""
     channels = radiance.shape[2]
-    told = chroma > _LEAST_CHROMA
+    told = chroma > _MIN_CHROMA
     scale = torch.where(told, chroma, 1)[:, None]
     weight = problem.weight[:, :, None] * torch.where(told, chroma, 0)[:, None] ** 2
     return problem.replace(

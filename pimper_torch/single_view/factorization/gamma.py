@@ -44,13 +44,13 @@ _CLOSE = 1e-4
 _ROUNDING = 1e-3
 
 # A relative standard error above which 1.8 and 2.2 are not told apart.
-_MOST_UNCERTAIN = 0.1
+_MAX_UNCERTAIN = 0.1
 
 # Four levels of 255: more than noise, that is shadows, highlights, or a curve that is no gamma.
-_MOST_RESIDUAL = 0.015
+_MAX_RESIDUAL = 0.015
 
 # Residuals of this size, half the rounding of 8 bits, are no outliers whatever the others are.
-_LEAST_SCALE = 5e-4
+_MIN_SCALE = 5e-4
 # Cauchy's loss is as good as least squares on Gaussian noise to 95 % at 2.385 deviations
 # (Holland & Welsch, 1977).
 _CAUCHY = 2.385
@@ -58,7 +58,7 @@ _CAUCHY = 2.385
 # The estimate is checked without the darker third and half of the entries.
 _DARKEST_SHARES = (1 / 3, 1 / 2)
 # Fewer degrees of freedom say little of their own error.
-_LEAST_FREE = 100
+_MIN_FREE = 100
 # Beyond so many standard errors of theirs the brighter entries are believed instead; beyond the
 # first number the estimate becomes less sure.
 _DOUBTED, _CONTRADICTED = 2.0, 3.0
@@ -100,7 +100,7 @@ class GammaEstimate(Record):
         )
         if self.determined:
             return f"{found}."
-        noisy = self.residual > _MOST_RESIDUAL
+        noisy = self.residual > _MAX_RESIDUAL
         why = (
             "shadows, highlights or another curve leave more than noise"
             if noisy
@@ -299,7 +299,7 @@ def _chosen_by_fit(
         used = problem.used
     residual = (encoded - predicted)[used]
     scale = _CAUCHY * float(spread(residual, torch.ones_like(residual, dtype=torch.bool)))
-    return problem.replace(used=used, scale=max(scale, _LEAST_SCALE))
+    return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
 
 
 def _coarsely(problem: EncodedMatrix, rounds: int) -> tuple[float, EncodedFit]:
@@ -347,7 +347,7 @@ def _most_trusted(problem: EncodedMatrix) -> _Minimum:
     for share in _DARKEST_SHARES:
         level = predicted[problem.used].quantile(share)
         used = enough(problem.used & (predicted > level), problem.rank)
-        if freedom(used, problem.rank) < _LEAST_FREE:
+        if freedom(used, problem.rank) < _MIN_FREE:
             break
         found.append(_minimise(problem.replace(used=used), found[0].fit, LEAST, MOST))
     for place, estimate in enumerate(found):
@@ -380,7 +380,7 @@ def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> fl
     slope = (above.loss - below.loss) / (2 * step)
     noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
     # On data without noise everything but the curvature is rounding.
-    bends = curvature * gamma**2 > (_LEAST_SCALE * 0.1) ** 2 * int(problem.used.sum())
+    bends = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(problem.used.sum())
     return noise / curvature if bends else math.inf
 
 
@@ -390,11 +390,11 @@ def _judged(found: _Minimum) -> GammaEstimate:
     residual = residual_spread(problem, found.fit)
     linear = fit_encoded(problem, Linear(), found.fit, 2 * ROUNDS)
     srgb = fit_encoded(problem, Srgb(), found.fit, 2 * ROUNDS)
-    sure = found.inner and found.error < _MOST_UNCERTAIN * found.gamma
+    sure = found.inner and found.error < _MAX_UNCERTAIN * found.gamma
     return GammaEstimate(
         gamma=found.gamma,
         standard_error=found.error,
-        determined=sure and residual < _MOST_RESIDUAL,
+        determined=sure and residual < _MAX_RESIDUAL,
         residual=residual,
         residual_linear=residual_spread(problem, linear),
         residual_srgb=residual_spread(problem, srgb),

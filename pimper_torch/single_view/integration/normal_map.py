@@ -24,6 +24,7 @@ from pimper_torch.single_view.integration.discontinuities import (
 from pimper_torch.single_view.integration.frankot_chellappa import integrate_fourier
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
+Raster = Tensor | np.ndarray
 Integration = Literal["discontinuities", "weighted", "cosine", "frankot-chellappa"]
 
 # Steps over pixels without a normal tie, and no more: their slopes were filled in.
@@ -53,14 +54,14 @@ class IntegratedMap(Record):
 
 
 def integrate_normal_map(
-    normals: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"] | None = None,
+    normals: Raster,
+    mask: Raster | None = None,
     *,
-    intrinsics: Float[Tensor, "3 3"] | None = None,
+    intrinsics: Raster | None = None,
     spacing: tuple[float, float] = (1.0, 1.0),
-    weight: Float[Tensor, "height width"] | None = None,
-    known_depth: Float[Tensor, "height width"] | None = None,
-    known_weight: Float[Tensor, "height width"] | None = None,
+    weight: Raster | None = None,
+    known_depth: Raster | None = None,
+    known_weight: Raster | None = None,
     method: Integration = "discontinuities",
     config: DiscontinuityConfig | None = None,
     solver: Solver = "auto",
@@ -68,9 +69,9 @@ def integrate_normal_map(
     """Find the surface that has the normals.
 
     Args:
-        normals: x right, y down, z forward into the surface; facing the viewer. Of any length;
-            where not finite, zero or turned away the surface is bridged. Arrays of numpy are
-            taken for this and the other rasters, too.
+        normals: ``height width 3``: x right, y down, z forward into the surface; facing the
+            viewer. Of any length; where not finite, zero or turned away the surface is bridged.
+            Arrays of numpy are taken for this and the other rasters, too.
         mask: Pixels of the surface; all if not given.
         intrinsics: Of the pinhole, in pixels from the corner of the top-left one; without it
             rays are parallel.
@@ -262,7 +263,7 @@ def _whole_rectangle(steps: Steps, method: Integration) -> Float[Tensor, "height
     return RasterSystem(right, down, method="cosine").fit_steps(*steps.wanted)
 
 
-def _tensor(values: Tensor | np.ndarray | None) -> Tensor | None:
+def _tensor(values: Raster | None) -> Tensor | None:
     return None if values is None else torch.as_tensor(values)
 
 
@@ -317,11 +318,11 @@ def _curl(
 
 
 def _refuse(
-    normals: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"] | None,
-    weight: Float[Tensor, "height width"] | None,
-    known_depth: Float[Tensor, "height width"] | None,
-    known_weight: Float[Tensor, "height width"] | None,
+    normals: Tensor,
+    mask: Tensor | None,
+    weight: Tensor | None,
+    known_depth: Tensor | None,
+    known_weight: Tensor | None,
     spacing: tuple[float, float],
 ) -> None:
     if normals.ndim != 3 or normals.shape[-1] != 3 or not normals.is_floating_point():

@@ -24,7 +24,7 @@ from pimper_torch.single_view.photometric_stereo.factors import (
 # In the standard form a ball cut at 75 degrees has lambda 0.9 and a relief with slopes of 0.15
 # has 0.15; the object's mean slope, which the form takes away, is rarely above one.
 _FLATTEST, _STEEPEST, _LAMBDAS = 0.125, 4.0, 23
-_MOST_TILT, _TILTS = 1.0, 17
+_MAX_TILT, _TILTS = 1.0, 17
 
 # The kernel's width in logarithm of albedo at first. A wider one smooths the right minimum away
 # where albedos are close, a narrower one needs a finer grid.
@@ -116,7 +116,7 @@ def _minimised(
     b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], width: float, max_pixels: int
 ) -> Float[Tensor, " 3"]:
     few, few_labels = _chosen(b, labels, _FEW_PIXELS)
-    tilts = torch.linspace(-_MOST_TILT, _MOST_TILT, _TILTS).to(b)
+    tilts = torch.linspace(-_MAX_TILT, _MAX_TILT, _TILTS).to(b)
     flat, steep = (torch.tensor(value).to(b).log() for value in (_FLATTEST, _STEEPEST))
     lambdas = torch.linspace(float(flat), float(steep), _LAMBDAS).to(b)
     grid = torch.cartesian_prod(tilts, tilts, lambdas)

@@ -34,14 +34,14 @@ from pimper_torch.single_view.photometric_stereo.factors import (
 from pimper_torch.single_view.photometric_stereo.relief_metric import relief_of_metric
 
 # Maxima whose pairs are tried; pairs are half their square.
-_MOST_MAXIMA = 120
+_MAX_MAXIMA = 120
 _REFINEMENTS = 30
 # Share of a view's brightest value below which a pixel may be in shadow.
 _SHADOW = 0.05
 # Share of the maxima that are expected where the surface faces the lamp; on one paint more are.
 _RIGHT = 0.2
 # From the standard form hardly a surface is flatter than this, and none as steep.
-_MOST_LOG_LAMBDA = 2.0
+_MAX_LOG_LAMBDA = 2.0
 # Lamps that each maximum is tried with to learn how near it comes by chance.
 _OTHERS = 10
 
@@ -113,7 +113,7 @@ def resolve_by_diffuse_maxima(
                 f"{len(maxima.view)} maxima of brightness found in {len(images)} views; needed: "
                 "two at least, in different places. Lower `radius`, or use another method."
             )
-        best = maxima.deviation.argsort()[:_MOST_MAXIMA]
+        best = maxima.deviation.argsort()[:_MAX_MAXIMA]
         light = start.on_lights(lights.double())[maxima.view[best]].mT
         floor = torch.deg2rad(maxima.deviation.new_tensor(agreement_deg))
         scale = (maxima.deviation[best].square() + floor * floor).sqrt()
@@ -198,7 +198,7 @@ def _agreed(
     # Above what it is on the whole sphere.
     likelier = alike / (chance + scale**2 / 2)
     support = (_RIGHT * likelier).log1p().sum(dim=1)
-    extreme = reliefs.lam.log().abs().nan_to_num(nan=99.0) > _MOST_LOG_LAMBDA
+    extreme = reliefs.lam.log().abs().nan_to_num(nan=99.0) > _MAX_LOG_LAMBDA
     support = torch.where(extreme, 0, support)
     best = int(support.argmax())
     if int((angles[best] < 3 * scale).sum()) < 2 or bool(extreme[best]):

@@ -24,7 +24,7 @@ from pimper_torch.single_view.photometric_stereo.relief import convex
 _ROUNDS = 20
 # The least singular value of the equations, as a share of the largest: below, the vectors lie on
 # a cone, and more than one form measures them alike.
-_LEAST_SHARE = 1e-6
+_MIN_SHARE = 1e-6
 # Depths, as factors of the given one, from which a bas-relief is looked for.
 _DEPTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _STEPS = 60
@@ -169,7 +169,7 @@ def _form(
         for _ in range(_ROUNDS):
             root = heavy.sqrt()
             singular = torch.linalg.svdvals(root * monomials)
-            if not singular[-1] > _LEAST_SHARE * singular[0]:
+            if not singular[-1] > _MIN_SHARE * singular[0]:
                 raise InputError(
                     f"{what}: theirs are on one cone, which more than one measure makes equal; "
                     "needed: others besides. Take more, in other directions."

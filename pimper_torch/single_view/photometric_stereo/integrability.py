@@ -33,7 +33,7 @@ from pimper_torch.records import Record
 _CELLS, _BLOCKS = 64, 16
 _ROUNDS = 10
 # Where the next best solution has a curl, as a share of the terms, below this, rounding decides.
-_LEAST_RIVAL = 1e-6
+_MIN_RIVAL = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -257,7 +257,7 @@ def _least(equations: Curls) -> tuple[Float[Tensor, " both"], float, float]:
         vectors = torch.linalg.solve_triangular(root.mT, vectors, upper=True)
         weighed = equations.replace(weight=reweighed(equations, vectors[:, 0]))
     share = [_curl(full, terms, vectors[:, one]) for one in (0, 1)]
-    if not share[1] > _LEAST_RIVAL:
+    if not share[1] > _MIN_RIVAL:
         raise InputError(
             "integrability: more than one matrix makes these pseudo-normals a surface, as for a "
             "plane or a cylinder; needed: normals that turn both ways. Widen the mask."

@@ -20,7 +20,7 @@ from pimper_torch.records import Record
 # value, so that a bad start does not decide which samples are outliers.
 _WIDEST, _NARROWING = 4.0, 0.7
 # Residuals below this share of the brightness are never outliers: 8 bits have 4e-3 steps.
-_LEAST_SCALE = 1e-4
+_MIN_SCALE = 1e-4
 
 Shadows = Literal["attached", "none"]
 
@@ -115,7 +115,7 @@ def reweigh(
     seen = (weight > 0) & lit
     level = radiance[seen].abs().mean() if seen.any() else radiance.new_ones(())
     scale = CAUCHY_TUNING * spread(residual.flatten(), seen.flatten())
-    return weight * cauchy_weights(residual, widen * scale.maximum(_LEAST_SCALE * level)), lit
+    return weight * cauchy_weights(residual, widen * scale.maximum(_MIN_SCALE * level)), lit
 
 
 def brightness(

@@ -40,7 +40,7 @@ _STARTS, _RAPIDITY = 48, 1.0
 _LORENTZ_FACTOR = 6.0
 _STEPS, _ROUNDS = 40, 5
 _NUDGE = 1e-6  # of forward differences in float64
-_LEAST_GAIN = 1e-6  # a step that gains less of the misfit is the last
+_MIN_GAIN = 1e-6  # a step that gains less of the misfit is the last
 _MAX_PIXELS = 1000  # for the map from nine dimensions to normals, which has 27 numbers
 
 
@@ -213,7 +213,7 @@ def _explain(
         if after.square().sum() < residual.square().sum():
             gain = 1 - float(after.square().sum() / residual.square().sum())
             at, residual, damping = moved, after, max(damping * 0.2, 1e-12)
-            if gain < _LEAST_GAIN:
+            if gain < _MIN_GAIN:
                 break
         else:
             damping = min(damping * 5.0, 1e12)

@@ -45,7 +45,7 @@ def photographed():
             generator,
             distance=5.0,
             spread_deg=35.0,
-            least_tilt_deg=5.0,
+            min_tilt_deg=5.0,
             irradiance=0.6,
             ambient=ambient,
         )

@@ -101,7 +101,7 @@ def _blank(patches):
                 lights_patch=like.new_ones(count, 1, 4),
                 valid=templates.inside,
                 confidence=templates.inside.to(like),
-                verdict=0 * one.long(),
+                status=0 * one.long(),
                 convergence=Convergence(
                     iterations=one.long(), residual=0 * one, cause=0 * one.long()
                 ),

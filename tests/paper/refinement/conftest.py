@@ -102,7 +102,7 @@ def _exact(templates, height):
         lights_patch=torch.zeros(count, 1, 4, dtype=torch.float64),
         valid=exact,
         confidence=exact.double(),
-        verdict=torch.zeros(count, dtype=torch.long),
+        status=torch.zeros(count, dtype=torch.long),
         convergence=Convergence(
             iterations=torch.ones(count, dtype=torch.long),
             residual=torch.zeros(count, dtype=torch.float64),

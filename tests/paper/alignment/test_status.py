@@ -8,20 +8,20 @@ from pimper_torch.paper.alignment.trust import (
     overlapping_seams,
     reliable_seams,
 )
-from pimper_torch.records import AlignVerdict
+from pimper_torch.records import AlignStatus
 from pimper_torch.reporting import figures
 
 RADIUS = 2.0
 CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)
-ALIGNED, ALONE, DISPUTED = (int(verdict) for verdict in AlignVerdict)
+ALIGNED, ALONE, DISPUTED = (int(status) for status in AlignStatus)
 
 
 def cap(x, y):
     return RADIUS - (RADIUS**2 - x**2 - y**2).sqrt()
 
 
-def verdicts(depths):
-    return torch.cat([relief.verdict for relief in depths.buckets])
+def statuses(depths):
+    return torch.cat([relief.status for relief in depths.buckets])
 
 
 def with_first(depths, change):
@@ -34,10 +34,10 @@ def test_before_alignment_nobody_is_aligned_and_after_it_all_are(
     facets_over, reliefs, sphere_relief
 ):
     sphere = reliefs(facets_over(cap), sphere_relief(CENTER, RADIUS))
-    assert all(relief.verdict is None for relief in sphere.buckets)
+    assert all(relief.status is None for relief in sphere.buckets)
     assert not any(relief.aligned.any() for relief in sphere.buckets)
     found = Align()(sphere)
-    assert (verdicts(found) == ALIGNED).all()
+    assert (statuses(found) == ALIGNED).all()
     assert all(relief.aligned.all() for relief in found.buckets)
     assert "aligned_patches" not in figures(sphere)
     assert figures(found)["aligned_patches"] == found.patches.num_patches
@@ -53,8 +53,8 @@ def test_a_patch_without_relief_is_alone_and_stays_as_it_is(facets_over, reliefs
         return relief.replace(valid=valid)
 
     found = Align()(with_first(sphere, blind))
-    assert verdicts(found)[0] == ALONE
-    assert (verdicts(found)[1:] == ALIGNED).all()
+    assert statuses(found)[0] == ALONE
+    assert (statuses(found)[1:] == ALIGNED).all()
     identity = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
     assert_close(found.buckets[0].transform[0], identity)
 
@@ -69,10 +69,10 @@ def test_a_patch_with_relief_in_its_middle_only_is_alone(facets_over, reliefs, s
         return relief.replace(valid=valid)
 
     found = Align()(with_first(sphere, islet))
-    assert verdicts(found)[0] == ALONE
+    assert statuses(found)[0] == ALONE
     # A facet in a corner of the mesh has no other neighbour.
-    assert (verdicts(found) == ALONE).sum() <= 2
-    assert not (verdicts(found) == DISPUTED).any()
+    assert (statuses(found) == ALONE).sum() <= 2
+    assert not (statuses(found) == DISPUTED).any()
 
 
 def test_a_patch_of_nonsense_is_disputed_put_on_its_vertices_and_drags_nobody(
@@ -89,8 +89,8 @@ def test_a_patch_of_nonsense_is_disputed_put_on_its_vertices_and_drags_nobody(
         return relief.replace(depth=depth)
 
     found = Align()(with_first(sphere, nonsense))
-    assert verdicts(found)[0] == DISPUTED
-    assert (verdicts(found)[1:] == ALIGNED).all()
+    assert statuses(found)[0] == DISPUTED
+    assert (statuses(found)[1:] == ALIGNED).all()
     others = torch.cat([relief.transform for relief in found.buckets])[1:]
     away = others - torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
     assert away.abs().mean() < 0.01
@@ -121,4 +121,4 @@ def test_with_infinite_outlier_distance_nobody_is_disputed(facets_over, reliefs,
         lambda points, _: torch.randn(points.shape[:3], generator=generator, dtype=torch.float64),
     )
     found = Align(AlignConfig(outlier=float("inf")))(wild)
-    assert not (verdicts(found) == DISPUTED).any()
+    assert not (statuses(found) == DISPUTED).any()

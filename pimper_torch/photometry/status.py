@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.errors import caution
 from pimper_torch.photometry.certainty import light_varies
-from pimper_torch.records import PatchVerdict, Photometry
+from pimper_torch.records import PatchStatus, Photometry
 
 
 def judge_data(
@@ -31,39 +31,39 @@ def judge_data(
         min_light_variation: See :func:`~pimper_torch.photometry.certainty.light_varies`.
 
     Returns:
-        A :class:`~pimper_torch.records.PatchVerdict` each.
+        A :class:`~pimper_torch.records.PatchStatus` each.
     """
     count = seen.sum(dim=2)
     share = count / count.amax(dim=1, keepdim=True).clamp_min(1)
-    verdict = torch.zeros_like(count[:, 0])
+    status = torch.zeros_like(count[:, 0])
     varies = light_varies(lights, share, min_light_variation)
-    verdict[~varies] = int(PatchVerdict.CONSTANT_LIGHT)
-    verdict[~(seen.sum(dim=1) >= min_views).any(dim=1)] = int(PatchVerdict.FEW_VIEWS)
-    verdict[~finite] = int(PatchVerdict.NOT_FINITE)
-    verdict[~shown] = int(PatchVerdict.UNSEEN)
-    return verdict
+    status[~varies] = int(PatchStatus.CONSTANT_LIGHT)
+    status[~(seen.sum(dim=1) >= min_views).any(dim=1)] = int(PatchStatus.FEW_VIEWS)
+    status[~finite] = int(PatchStatus.NOT_FINITE)
+    status[~shown] = int(PatchStatus.UNSEEN)
+    return status
 
 
-def warn_of_verdicts(
+def warn_of_undetermined(
     buckets: Sequence[Photometry], min_views: int, min_light_variation: float
 ) -> None:
     """Say once how many patches light could not determine, and why."""
-    verdicts = Counter(code for bucket in buckets for code in bucket.verdict.tolist())
-    total = sum(verdicts.values())
-    undetermined = total - verdicts[PatchVerdict.DETERMINED]
+    statuses = Counter(code for bucket in buckets for code in bucket.status.tolist())
+    total = sum(statuses.values())
+    undetermined = total - statuses[PatchStatus.DETERMINED]
     if undetermined == 0:
         return
     causes = {
-        PatchVerdict.UNSEEN: "{} have no valid sample in any view",
-        PatchVerdict.NOT_FINITE: "in {} all that views have is NaN or infinite",
-        PatchVerdict.FEW_VIEWS: f"{{}} are nowhere seen lit in {min_views} views",
-        PatchVerdict.CONSTANT_LIGHT: (
+        PatchStatus.UNSEEN: "{} have no valid sample in any view",
+        PatchStatus.NOT_FINITE: "in {} all that views have is NaN or infinite",
+        PatchStatus.FEW_VIEWS: f"{{}} are nowhere seen lit in {min_views} views",
+        PatchStatus.CONSTANT_LIGHT: (
             "in {} the light varies too little between the views to tell shape from shading "
             f"(variation below {min_light_variation})"
         ),
-        PatchVerdict.FAILED: "in {} the solver found no finite answer",
+        PatchStatus.FAILED: "in {} the solver found no finite answer",
     }
-    parts = [text.format(verdicts[code]) for code, text in causes.items() if verdicts[code]]
+    parts = [text.format(statuses[code]) for code, text in causes.items() if statuses[code]]
     caution(
         f"Factorization: {undetermined} of {total} patches keep the normals of the coarse mesh: "
         f"{'; '.join(parts)}. Their geometry is delivered without photometric detail. "
