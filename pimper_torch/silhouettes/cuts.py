@@ -1,5 +1,6 @@
 """Rounds of cutting every view and of voting on what the cuts have in common."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,7 @@ from pimper_torch.silhouettes.opencv import (
     OBJECT,
     convex_hull_of,
     grab_cut,
+    grab_cut_halved,
     signed_distance,
     without_specks,
 )
@@ -33,6 +35,8 @@ _MIN_OBSERVED = 12
 _WELL = 2.0  # times as deep as is_deep asks for
 _CUTS = 2  # rounds of mixtures and cut inside GrabCut
 _SPECK = 2e-4  # share of the picture
+
+Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -127,7 +131,10 @@ def _filled(
 
 
 def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
-    """Cut from points and parallax; where hardly any points are the object's, parallax alone."""
+    """Cut from points and parallax; where hardly any points are the object's, parallax alone.
+
+    Every other pixel is enough: all are cut again.
+    """
     height, width = cues.pictures.grey.shape[1:]
 
     def first(view: int) -> Bool[Tensor, "height width"]:
@@ -137,7 +144,7 @@ def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
             return off_plane(agreement)
         labels = labels_from_points(own_px, cues.other_px[view], agreement, (width, height))
         margin = signed_distance(convex_hull_of(own_px, (width, height)))
-        return _cut(cues, view, labels, margin)
+        return _cut(grab_cut_halved, cues, view, labels, margin)
 
     return of_views(first, cues.num_views)
 
@@ -153,13 +160,14 @@ def _again(
         own_px = cues.own_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
         labels = labels_from_hull(seen[view], masks[view], own_px, agreement)
-        cut = _cut(cues, view, labels, seen[view])
+        cut = _cut(grab_cut, cues, view, labels, seen[view])
         return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
 
     return of_views(again, cues.num_views)
 
 
 def _cut(
+    how: Cutter,
     cues: Cues,
     view: int,
     labels: UInt8[Tensor, "height width"],
@@ -171,12 +179,12 @@ def _cut(
     object's unless the plane is seen there.
     """
     if cues.agreement is None:
-        return grab_cut(cues.pictures.opponent[view], labels, _CUTS)
+        return how(cues.pictures.opponent[view], labels, _CUTS)
     agreement = cues.agreement[view]
     surrounded = not_seen_through(cues.own_px[view], agreement)
     surrounded &= ~(agreement >= DISPUTED)
     labels = torch.where(is_deep(margin / _WELL) & surrounded, OBJECT, labels)
-    return grab_cut(cues.pictures.opponent[view], labels, _CUTS)
+    return how(cues.pictures.opponent[view], labels, _CUTS)
 
 
 def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:

@@ -67,6 +67,15 @@ def window_means(
     return torch.from_numpy(means).movedim(-1, 0)
 
 
+def grab_cut_halved(
+    colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], rounds: int
+) -> Bool[Tensor, "height width"]:
+    """Cut as :func:`grab_cut`, but every other pixel each way: right to two, in a quarter of it."""
+    half = grab_cut(colours[::2, ::2], labels[::2, ::2], rounds)
+    height, width = labels.shape
+    return half.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)[:height, :width]
+
+
 def grab_cut(
     colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], rounds: int
 ) -> Bool[Tensor, "height width"]:

@@ -1,0 +1,27 @@
+"""What OpenCV computes on masks and photographs."""
+
+import torch
+
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.silhouettes.opencv import (
+    BACKGROUND,
+    OBJECT,
+    PERHAPS_BACKGROUND,
+    grab_cut_halved,
+    signed_distance,
+)
+
+
+def test_a_cut_of_every_other_pixel_is_right_to_two_pixels(generator):
+    width, height = 121, 95  # odd: the last column and row stand for half a pixel
+    away = pixel_centers(width, height, like=torch.zeros(())) - torch.tensor([70.0, 40.0])
+    disc = away.norm(dim=-1) < 30
+    noise = torch.randint(0, 20, (height, width, 3), generator=generator)
+    colours = (torch.where(disc[..., None], 180, 60) + noise).byte()
+    labels = torch.full((height, width), PERHAPS_BACKGROUND, dtype=torch.uint8)
+    labels[away.norm(dim=-1) < 8] = OBJECT
+    labels[:4] = BACKGROUND
+    cut = grab_cut_halved(colours, labels, 2)
+    assert cut.shape == disc.shape
+    assert not (cut != disc)[signed_distance(disc).abs() > 2].any()
+    assert not cut[:4].any()
