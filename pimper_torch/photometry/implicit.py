@@ -193,13 +193,9 @@ def _by_deviation(
         told = torch.zeros_like(at)
         if deviation.requires_grad:
             (told,) = torch.autograd.grad(deviation.sum(), at)
-    deviation = deviation.detach()[:, None, None]
-    change = torch.func.jvp(
-        lambda spread: problem.loss.weights(residual, spread),
-        (deviation,),
-        (torch.ones_like(deviation),),
-    )[1]
-    pulled = problem.weight.double() * change * residual
+    # w depends on r / d alone, so that d dw/dd = w - d(w r)/dr: no derivative of it is needed.
+    deviation = deviation.detach()[:, None, None].clamp_min(1e-300)
+    pulled = (hessian.pulled - hessian.bent * residual) / deviation
     return told, (
         pulled @ hessian.shading.mT,
         coordinates(hessian.columns, hessian.lights.mT @ pulled),

@@ -1,3 +1,5 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -136,3 +138,19 @@ def test_a_solution_that_stopped_early_is_taken_to_rest(noisy):
     assert (early.lights - exact.lights).abs().max() > 1e-5
     assert_close(found.lights, exact.lights, rtol=0, atol=1e-10)
     assert_close(found.shading, exact.shading, rtol=0, atol=1e-10)
+
+
+def test_threads_do_not_disturb_one_another(noisy):
+    # Forward-mode differentiation, which counts its levels for all threads at once, would.
+    problem = noisy(Cone(), Cauchy(), patches=1, samples=12)
+    found = solved(problem)
+
+    def slope(_):
+        radiance = problem.radiance.clone().requires_grad_()
+        lights = differentiable(problem.replace(radiance=radiance), found).lights
+        return torch.autograd.grad(lights.sum(), radiance)[0]
+
+    alone = slope(None)
+    with ThreadPoolExecutor(4) as pool:
+        for other in pool.map(slope, range(60)):
+            assert_close(other, alone)
