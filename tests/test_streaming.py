@@ -11,7 +11,7 @@ from pimper_torch.kernels.switch import using
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry.factorize import Factorize
-from pimper_torch.photometry.mesh_light import thinned
+from pimper_torch.photometry.lights import thinned
 from pimper_torch.records import Silhouettes, StageReport
 from pimper_torch.reporting import Silent
 from pimper_torch.silhouettes.contours import Contours

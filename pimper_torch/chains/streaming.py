@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.sources import Sources
 from pimper_torch.photometry.factorize import Illumination
-from pimper_torch.photometry.mesh_light import thinned
+from pimper_torch.photometry.lights import thinned
 from pimper_torch.records import (
     Cameras,
     Heights,

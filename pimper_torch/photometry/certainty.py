@@ -99,23 +99,6 @@ def start_from_mesh(
     return fit_albedo(radiance[:, :, None], weight, lights, basis) * basis
 
 
-def light_varies(
-    lights: Float[Tensor, "patch view rank"],
-    share: Float[Tensor, "patch view"],
-    least: float,
-) -> Bool[Tensor, " patch"]:
-    r"""Tell in which patches the light changed enough between the views that see them.
-
-    The lights, each scaled to length 1 so that exposure does not count, are weighed by the
-    share of the patch that their view sees. A shading vector has three degrees of freedom:
-    the third singular value of the weighted lights, over the first, must reach ``least``.
-    """
-    unit = (lights / lights.norm(dim=2, keepdim=True).clamp_min(1e-30)).double()
-    moment = unit.mT @ (share.double()[..., None] * unit)
-    values = torch.linalg.eigvalsh(moment).clamp_min(0)
-    return (values[:, -3] > 0) & (values[:, -3] >= least**2 * values[:, -1])
-
-
 def _standard_error(
     problem: Bilinear, factors: Factors, curvature: Float[Tensor, "patch 6 sample"]
 ) -> Float[Tensor, "patch sample"]:

@@ -21,8 +21,8 @@ from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold, st
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.light_field import LightField, faces_lamp
+from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.manifolds import Cone
-from pimper_torch.photometry.mesh_light import light_of_mesh
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, on_raster, rows_of
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
@@ -162,7 +162,6 @@ class _Posed(Record):
     """Their factorization, ready to be solved."""
 
     rows: Rows
-    anchor: Float[Tensor, "patch view 4"]
     status: Int[Tensor, " patch"]
     problem: Bilinear
 
@@ -213,7 +212,7 @@ class Factorize(Stage):
 
         Args:
             seen: Of all patches; views on templates that are
-                :func:`~pimper_torch.photometry.mesh_light.thinned` are enough.
+                :func:`~pimper_torch.photometry.lights.thinned` are enough.
         """
         coarse = [carried_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
         field = light_of_mesh(seen, coarse, self.config.min_views, self.config.light)
@@ -263,7 +262,7 @@ class Factorize(Stage):
         )
         raster = bucket.normals.shape[1] * bucket.normals.shape[2]
         problem = self._problem(rows, anchor, raster)
-        return _Posed(rows=rows, anchor=anchor, status=status, problem=problem)
+        return _Posed(rows=rows, status=status, problem=problem)
 
     def _conclude(self, bucket: _Bucket, posed: _Posed, factors: Factors) -> Photometry:
         rows, normals, problem = posed.rows, bucket.normals, posed.problem
@@ -277,7 +276,7 @@ class Factorize(Stage):
         status = torch.where(failed, int(PatchStatus.FAILED), posed.status)
         determined = status == int(PatchStatus.DETERMINED)
         valid = lit & determined[:, None] & sure & (found.normals[..., 2] < 0)
-        lights = torch.where(determined[:, None, None], factors.lights, posed.anchor)
+        lights = torch.where(determined[:, None, None], factors.lights, problem.anchor)
         lights = lights * rows.seen.any(dim=2)[..., None]
         chosen = torch.where(valid[..., None], found.normals, rows.normals)
         weight = torch.where(determined[:, None, None], factors.weight, problem.weight)

@@ -21,6 +21,7 @@ from pimper_torch.photometry.cone import (
     tangent_columns,
     tangents,
 )
+from pimper_torch.photometry.harmonics import harmonics
 
 
 @runtime_checkable
@@ -73,41 +74,24 @@ class Cone:
     rank: ClassVar[int] = 4
     flat: ClassVar[bool] = False
 
-    def project(self, shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-        """Give the nearest vector of the manifold."""
-        return project_to_cone(shading)
-
-    def retract(self, shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-        """Bring back what a small step along the tangents has left."""
-        return project_to_cone(shading)
-
-    def tangents(self, shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
-        """Span the tangent space at each column; see :func:`tangent_columns`."""
-        return tangent_columns(shading)
+    project = retract = staticmethod(project_to_cone)
+    tangents = staticmethod(tangent_columns)
+    split = staticmethod(split_shading)
 
     def curvature(
         self, shading: Float[Tensor, "*batch 4 sample"], slope: Float[Tensor, "*batch 4 sample"]
     ) -> Float[Tensor, "*batch sample 3 3"]:
-        r"""Give the manifold's part of the second derivatives by the tangents' coordinates.
-
-        Of a function with gradient ``slope``, :math:`g \cdot \partial^2 s`.
-        """
+        r"""Give the manifold's part of second derivatives; see :meth:`Manifold.curvature`."""
         albedo, normal = self.split(shading.mT)
         first, second = tangents(normal)
         along = [(slope[..., 1:, :].mT * part).sum(dim=-1) for part in (normal, first, second)]
         return bending(-along[0], along[1], along[2], torch.zeros_like(albedo), albedo)
 
-    def split(
-        self, shading: Float[Tensor, "*batch 4"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Read albedo and unit normal off the vectors."""
-        return split_shading(shading)
-
     def join(
         self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
     ) -> Float[Tensor, "*batch 4"]:
         """Give the vectors of albedo and normal."""
-        return albedo[..., None] * torch.cat([torch.ones_like(normals[..., :1]), normals], dim=-1)
+        return albedo[..., None] * harmonics(normals)
 
     def bend(self, normals: Float[Tensor, "*batch 3 sample"]) -> Float[Tensor, "*batch 10 sample"]:
         r"""Give the quadratic form :math:`\lVert b - \rho \bar n \rVert^2`, packed."""

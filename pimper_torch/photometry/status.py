@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import caution
-from pimper_torch.photometry.certainty import light_varies
 from pimper_torch.records import PatchStatus, Photometry
 
 
@@ -28,7 +27,7 @@ def judge_data(
         seen: Samples that are finite, and face the lamp.
         lights: The field's.
         min_views: Views a sample must be lit in.
-        min_light_variation: See :func:`~pimper_torch.photometry.certainty.light_varies`.
+        min_light_variation: See :func:`light_varies`.
 
     Returns:
         A :class:`~pimper_torch.records.PatchStatus` each.
@@ -42,6 +41,23 @@ def judge_data(
     status[~finite] = int(PatchStatus.NOT_FINITE)
     status[~shown] = int(PatchStatus.UNSEEN)
     return status
+
+
+def light_varies(
+    lights: Float[Tensor, "patch view rank"],
+    share: Float[Tensor, "patch view"],
+    least: float,
+) -> Bool[Tensor, " patch"]:
+    r"""Tell in which patches the light changed enough between the views that see them.
+
+    The lights, each scaled to length 1 so that exposure does not count, are weighed by the
+    share of the patch that their view sees. A shading vector has three degrees of freedom:
+    the third singular value of the weighted lights, over the first, must reach ``least``.
+    """
+    unit = (lights / lights.norm(dim=2, keepdim=True).clamp_min(1e-30)).double()
+    moment = unit.mT @ (share.double()[..., None] * unit)
+    values = torch.linalg.eigvalsh(moment).clamp_min(0)
+    return (values[:, -3] > 0) & (values[:, -3] >= least**2 * values[:, -1])
 
 
 def warn_of_undetermined(

@@ -8,8 +8,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import PimperWarning
 from pimper_torch.kernels.switch import using
 from pimper_torch.photometry.factorize import Factorize
-from pimper_torch.photometry.lights import fit_light_field
-from pimper_torch.photometry.mesh_light import thinned
+from pimper_torch.photometry.lights import fit_light_field, thinned
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
@@ -165,7 +164,7 @@ def test_patches_can_be_factorized_one_by_one(scene):
 
 def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
     true = scene(bumps=0.0)
-    monkeypatch.setattr("pimper_torch.photometry.mesh_light.LIGHT_SAMPLES", 30)
+    monkeypatch.setattr("pimper_torch.photometry.lights.LIGHT_SAMPLES", 30)
     thin = thinned(true.seen.patches)
     registered = []
     for few, templates, each in zip(

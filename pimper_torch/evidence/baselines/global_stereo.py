@@ -36,7 +36,7 @@ from pimper_torch.photometry.bilinear import Factors
 from pimper_torch.photometry.certainty import refine_on_manifold, start_from_mesh
 from pimper_torch.photometry.cone import split_shading
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.photometry.lights import fit_distant_lights
+from pimper_torch.photometry.lights import fit_light_field
 from pimper_torch.records import CoarseMesh, Convergence, Estimate, Record, SparseScene
 from pimper_torch.single_view.factorization.ambiguity import align_factorizations
 from pimper_torch.single_view.factorization.starts import start_from_data
@@ -219,6 +219,22 @@ def solve_from_mesh(matrix: Matrix, config: GlobalStereoConfig) -> Whole:
         lights, steps = few_solved.lights[0], int(few_solved.convergence.iterations)
     shading = _best_shading(matrix, lights)
     return solve_whole(matrix, lights, shading, config.max_iterations, config.tolerance, steps)
+
+
+def fit_distant_lights(
+    radiance: Float[Tensor, "sample view"],
+    seen: Bool[Tensor, "sample view"],
+    normals: Float[Tensor, "sample 3"],
+) -> Float[Tensor, "view 4"]:
+    """Fit lights that are the same everywhere, as the chain fits its own.
+
+    See :func:`~pimper_torch.photometry.lights.fit_light_field`.
+
+    Returns:
+        First-order lights in the frame of the normals, of what faces the lamp.
+    """
+    field = fit_light_field(radiance, seen, normals)
+    return field.lights_at(field.origin[None])[0]
 
 
 def fix_ambiguity(matrix: Matrix, whole: Whole, min_views: int) -> Whole:

@@ -17,6 +17,7 @@ from pimper_torch.evidence.baselines.anchoring import (
     points_on,
 )
 from pimper_torch.evidence.baselines.global_stereo import (
+    fit_distant_lights,
     in_gauge,
     refuse_few_views,
     refuse_little_overlap,
@@ -43,7 +44,6 @@ from pimper_torch.evidence.baselines.template import (
 from pimper_torch.geometry.reliefs import sample_raster
 from pimper_torch.paper.integrate import integrate_normals
 from pimper_torch.patches.warp import WarpConfig
-from pimper_torch.photometry.lights import fit_distant_lights
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, Record, SparseScene
 from pimper_torch.stage import Stage
 
