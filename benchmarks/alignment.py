@@ -3,11 +3,11 @@
     python benchmarks/alignment.py [--facets 5000] [--side 60] [--noise 0.0] [--only METHOD]
 
 Facets of a subdivided icosahedron on a sphere with bumps of a facet's size; every patch has
-the exact relief, spoiled by a bas-relief transform of its own: tilts of 0.15, scales of a
+the exact height field, spoiled by a bas-relief transform of its own: tilts of 0.15, scales of a
 factor 1.4, offsets of a fiftieth of an edge, one standard deviation each; ``--what scale``
 spoils scales only. ``--noise`` adds waves of
-a quarter edge's length to each patch, in shares of the relief's own root mean square. Times
-are the best of ``--repeat`` runs, memory is what the process holds above its size before.
+a quarter edge's length to each patch, in fractions of the height field's own root mean square.
+Times are the best of ``--repeat`` runs, memory is what the process holds above its size before.
 """
 
 import argparse
@@ -56,7 +56,7 @@ def main() -> None:
     options = parser.parse_args()
     generator = torch.Generator().manual_seed(0)
     patches = sphere_patches(options.facets, options.side)
-    truth = with_relief(patches, bumpy_relief)
+    truth = with_height_field(patches, bumpy_height_field)
     transforms = random_transforms(patches.num_patches, truth, generator)
     if options.what == "scale":
         transforms[:, [0, 1, 3]] = 0
@@ -68,7 +68,7 @@ def main() -> None:
     print(  # noqa: T201
         f"{patches.num_patches} patches of {samples**0.5:.0f} x {samples**0.5:.0f} samples "
         f"({len(sizes)} buckets), {torch.get_num_threads()} threads, "
-        f"reliefs off by {100 * error(bad, truth):.1f} % of their own size\n"
+        f"height fields off by {100 * error(bad, truth):.1f} % of their own size\n"
     )
     print("| method | s | CPU s | extra memory, MB | error before, % | after, % | scale, % off |")  # noqa: T201
     print("|---|--:|--:|--:|--:|--:|--:|")  # noqa: T201
@@ -122,7 +122,7 @@ def sphere_patches(facets: int, side: int) -> PatchSet:
     return Decompose(DecomposeConfig(overlap_samples=overlap))(coarse, cameras)
 
 
-def bumpy_relief(templates: Templates) -> Tensor:
+def bumpy_height_field(templates: Templates) -> Tensor:
     """Give the near side of a unit sphere with bumps, along each patch's z, by Newton's steps."""
     world_from_patch = invert_rigid(templates.patch_from_world.double())
     flat = templates.points_patch.double().flatten(1, 2)
@@ -140,14 +140,16 @@ def bumpy_relief(templates: Templates) -> Tensor:
     return depth.reshape(templates.depth.shape).to(templates.depth)
 
 
-def with_relief(patches: PatchSet, relief: Callable[[Templates], Tensor]) -> DepthPatches:
-    """Give every patch its relief, and photometry that says nothing."""
-    reliefs, photometry = [], []
+def with_height_field(
+    patches: PatchSet, height_field: Callable[[Templates], Tensor]
+) -> DepthPatches:
+    """Give every patch its height field, and photometry that says nothing."""
+    height_fields, photometry = [], []
     for templates in patches.buckets:
-        depth = relief(templates)
+        depth = height_field(templates)
         count, height, width = depth.shape
         one = depth.new_ones(count)
-        reliefs.append(
+        height_fields.append(
             Depths(
                 depth=depth,
                 valid=templates.inside,
@@ -169,7 +171,7 @@ def with_relief(patches: PatchSet, relief: Callable[[Templates], Tensor]) -> Dep
         )
     return DepthPatches(
         photometric=PhotometricPatches(patches=patches, buckets=tuple(photometry)),
-        buckets=tuple(reliefs),
+        buckets=tuple(height_fields),
     )
 
 
@@ -186,44 +188,44 @@ def random_transforms(count: int, depths: DepthPatches, generator: torch.Generat
 def spoil(depths: DepthPatches, transforms: Tensor) -> DepthPatches:
     """Apply transforms to all patches."""
     buckets = []
-    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
         x, y, _ = templates.points_patch.unbind(dim=-1)
         own = transforms[templates.facet]
         hx, hy, hz, h0 = own[:, :, None, None].unbind(dim=1)
-        depth = hx * x + hy * y + hz * relief.depth + h0
-        buckets.append(relief.replace(depth=depth, transform=own))
+        depth = hx * x + hy * y + hz * height_field.depth + h0
+        buckets.append(height_field.replace(depth=depth, transform=own))
     return depths.replace(buckets=tuple(buckets))
 
 
 def add_waves(depths: DepthPatches, amplitude: float, generator: torch.Generator) -> DepthPatches:
     """Add waves of its own to every patch, about a quarter of its facet's edge long."""
     buckets = []
-    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
         x, y, _ = templates.points_patch.unbind(dim=-1)
         length = templates.spacing[:, None, None] * 10 / (2 * torch.pi)
         waves = torch.zeros_like(x)
         for _ in range(6):
             fx, fy, start = torch.randn(3, len(x), 1, 1, generator=generator)
             waves = waves + torch.cos((fx * x + fy * y) / length + 9 * start)
-        buckets.append(relief.replace(depth=relief.depth + amplitude * waves / 3**0.5))
+        buckets.append(height_field.replace(depth=height_field.depth + amplitude * waves / 3**0.5))
     return depths.replace(buckets=tuple(buckets))
 
 
 def error(found: DepthPatches, truth: DepthPatches) -> float:
-    """Give the root mean square error, as a share of the relief's own."""
+    """Give the root mean square error, as a fraction of the height field's own."""
     pairs = zip(found.buckets, truth.buckets, strict=True)
     square = torch.cat([(a.depth - b.depth)[b.valid].square() for a, b in pairs])
     return float(square.mean().sqrt()) / rms(truth)
 
 
 def rms(depths: DepthPatches) -> float:
-    """Give the root mean square of the reliefs about each patch's mean plane's height."""
+    """Give the root mean square of the height fields about each patch's mean plane's height."""
     return float(torch.cat([b.depth[b.valid].square() for b in depths.buckets]).mean().sqrt())
 
 
 def scales(depths: DepthPatches) -> Tensor:
     """Give ``h_z`` of every patch, in the order of the buckets."""
-    return torch.cat([relief.transform[:, 2] for relief in depths.buckets])
+    return torch.cat([height_field.transform[:, 2] for height_field in depths.buckets])
 
 
 def peak_mb() -> float:

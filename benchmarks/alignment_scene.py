@@ -2,10 +2,10 @@
 
     python benchmarks/alignment_scene.py FOLDER
 
-The chain runs once from the photographs to the reliefs, with cameras from structure from
-motion; then each row aligns and refines the same reliefs. Depth errors are distances along
+The chain runs once from the photographs to the height fields, with cameras from structure from
+motion; then each row aligns and refines the same height fields. Depth errors are distances along
 the rays of the reference view in per cent of the object's extent: their median, the mean of
-those below 3 %, and the share above. Normals are those of the mesh's shape, in degrees.
+those below 3 %, and the fraction above. Normals are those of the mesh's shape, in degrees.
 """
 
 import argparse

@@ -4,8 +4,9 @@
 
 Prints Markdown tables of mean normal errors in degrees, the median over scenes with the worst in
 brackets. Scenes are balls and bumps, painted in five colours by regions or in one, under random
-lamps; shading is fitted with the true lights to values out of shadow and hidden by a random
-bas-relief, so that the tables show the resolvers alone. `best` is the relief nearest to the truth.
+point lights; shading is fitted with the true lights to values out of shadow and hidden by a random
+bas-relief, so that the tables show the resolvers alone. `best` is the height field nearest to the
+truth.
 """
 
 import argparse
@@ -23,11 +24,11 @@ from pimper_torch.evidence.scenes.one_view import (
     ball,
     bumps,
     bumps_in_perspective,
-    lamps,
     photograph,
+    point_lights,
     regions,
 )
-from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_reliefs
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_height_fields
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles
@@ -36,7 +37,7 @@ from pimper_torch.single_view.photometric_stereo.perspective import factorize_in
 
 NOISES = (0.0, 0.005, 0.01)
 VIEWS = (10, 20)
-# Values below this share of the brightest are left out as shadow.
+# Values below this fraction of the brightest are left out as shadow.
 DARK = 0.03
 
 Resolver = Callable[[OneView, Tensor, Tensor], BasRelief]
@@ -81,7 +82,7 @@ def scene(
     generator = torch.Generator().manual_seed(seed)
     normals, mask = ball(size) if shape == "ball" else bumps(size, generator)
     albedo = paint(name, size, generator)
-    made = photograph(normals, albedo, mask, lamps(views, generator), generator, noise)
+    made = photograph(normals, albedo, mask, point_lights(views, generator), generator, noise)
     return made, generator
 
 
@@ -122,10 +123,10 @@ def resolved(shape: str, name: str, size: int, scenes: int) -> None:
             for seed in range(scenes):
                 made, generator = scene(shape, name, size, views, noise, seed)
                 shading, known = fitted(made)
-                relief = hidden(generator)
-                b, lights = relief.on_shading(shading), relief.on_lights(made.lights)
+                height_field = hidden(generator)
+                b, lights = height_field.on_shading(shading), height_field.on_lights(made.lights)
                 errors["before"].append(error_deg(b, made.normals, known))
-                nearest = align_reliefs(b, made.shading, known.double())
+                nearest = align_height_fields(b, made.shading, known.double())
                 errors["best"].append(error_deg(nearest.on_shading(b), made.normals, known))
                 for label, resolve in RESOLVERS.items():
                     began = time.process_time()
@@ -155,7 +156,7 @@ def in_perspective(size: int, scenes: int) -> None:
                 for field in fields:
                     generator = torch.Generator().manual_seed(seed)
                     normals, mask, intrinsics, _ = bumps_in_perspective(size, generator, field)
-                    albedo, lights = regions(size, generator), lamps(views, generator)
+                    albedo, lights = regions(size, generator), point_lights(views, generator)
                     made = photograph(normals, albedo, mask, lights, generator, noise)
                     values = made.images.sum(dim=1)[:, made.mask]
                     shading, known = fitted(made)

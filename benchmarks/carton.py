@@ -37,14 +37,14 @@ from pimper_torch.sfm.scene import write_model
 from pimper_torch.stage import Given
 from pimper_torch.viz.render import crop
 
-# Share of the views whose masks a point must lie in to be the object's: masks were drawn for
+# Fraction of the views whose masks a point must lie in to be the object's: masks were drawn for
 # each view apart, and miss a pixel of the contour here and there.
 IN_MASKS = 0.9
 
 # Neighbours that a plane is fitted to round a point, and the least cosine it must face a view by.
 NEIGHBOURS, MIN_FACING = 16, 0.25
 
-# Angles further from right than this belong to the gable; and only sides with this share of the
+# Angles further from right than this belong to the gable; and only sides with this fraction of the
 # area that is flat are walls, whose angles are averaged.
 RIGHT, WALL = 10.0, 0.12
 
@@ -190,9 +190,9 @@ def carton_scene(
     seen = framed & masked & (facing > MIN_FACING)
     if num_views:
         names = list(views.names)
-        middle = names.index(reference) if reference else len(names) // 2
+        centre = names.index(reference) if reference else len(names) // 2
         axes = cameras.cam_from_world[:, 2, :3]
-        chosen = (axes @ axes[middle]).argsort(descending=True)[:num_views].sort().values.tolist()
+        chosen = (axes @ axes[centre]).argsort(descending=True)[:num_views].sort().values.tolist()
         views, cameras = views.take(chosen), cameras.take(chosen)
         pixels, seen = pixels[chosen], seen[chosen]
     kept = seen.sum(dim=0) >= 3

@@ -4,8 +4,8 @@
 
 SCENE is a folder that ``pimper render`` wrote. Cameras are found without masks. Each way is
 simplified to the facets of ``default`` and compared with the truth before any round: in the
-reference view the share of the object's pixels that it meets, the 3D error and the normals of its
-shape there; accuracy, and completeness of what three views see, in per cent of the diagonal.
+reference view the fraction of the object's pixels that it meets, the 3D error and the normals of
+its shape there; accuracy, and completeness of what three views see, in per cent of the diagonal.
 """
 
 import argparse
@@ -78,8 +78,8 @@ def masks_of(folder: Path, scene: SparseScene) -> Silhouettes:
     inside = torch.zeros_like(views.images[:, 0])
     for view, (_, mask) in enumerate(undistorted(views, scene.lenses)):
         inside[view, : mask.shape[0], : mask.shape[1]] = mask.to(inside)
-    trusted = torch.ones(len(inside), dtype=torch.bool)
-    return Silhouettes(inside=inside, trusted=trusted, source="masks")
+    reliable = torch.ones(len(inside), dtype=torch.bool)
+    return Silhouettes(inside=inside, reliable=reliable, source="masks")
 
 
 def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[], Surface]]:
@@ -87,8 +87,8 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
     builder = CoarseSurface()
     contours = TraceContours()(silhouettes, scene.cameras)
     hull = contours.hull
-    trusted = builder.trusted(scene)
-    inside = trusted[hull.depth_of(scene.points_world[trusted]) > 0]
+    reliable = builder.reliable(scene)
+    inside = reliable[hull.depth_of(scene.points_world[reliable]) > 0]
     part = cropped(scene, silhouettes)
     cloud, maps, pixel = matched_cloud(part, inside, builder.densify, builder.fine.point_px)
     away, cell = builder.fine.tolerance_px * pixel, builder.fine.cell_px * pixel
@@ -105,9 +105,9 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
     def facets(some: Surface) -> Surface:
         vertices, faces = some
         said = evidence(vertices, faces, maps.level, maps)
-        middle = vertices[faces].mean(dim=1)
-        support = supports(middle, cloud, contour, said, builder.fine.reach_px * pixel)
-        within = hull.depth_of(middle) > -max(away, float(hull.spacing))
+        centre = vertices[faces].mean(dim=1)
+        support = supports(centre, cloud, contour, said, builder.fine.reach_px * pixel)
+        within = hull.depth_of(centre) > -max(away, float(hull.spacing))
         kept = seen_surface(vertices, faces, support, said, within, pixel, builder.outlined)
         used, faces = torch.unique(faces[kept], return_inverse=True)
         if len(faces) <= builder.config.num_facets:
@@ -121,11 +121,11 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
 
     def both() -> Surface:
         corners, cells = cut_surface(cloud, maps, hull, contour)
-        middle, normals = corners[cells].mean(dim=1), face_normals(corners, cells)
-        unknown = point_distances(middle, joined.points_world) > _UNKNOWN_PX * pixel
-        unknown &= hull.depth_of(middle) > hull.spacing
+        centre, normals = corners[cells].mean(dim=1), face_normals(corners, cells)
+        unknown = point_distances(centre, joined.points_world) > _UNKNOWN_PX * pixel
+        unknown &= hull.depth_of(centre) > hull.spacing
         filled = OrientedPoints(
-            points_world=middle[unknown],
+            points_world=centre[unknown],
             normals_world=normalize(normals[unknown], dim=1),
             noise=torch.zeros(int(unknown.sum())),
         )

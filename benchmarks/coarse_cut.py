@@ -136,14 +136,14 @@ def _shapes(corners: Float[Tensor, "cell 4 3"], beside: Int[Tensor, "cell 4"]) -
     edges = corners[:, 1:] - corners[:, :1]
     safe = edges + 1e-12 * torch.eye(3, dtype=edges.dtype)
     offset = torch.linalg.solve(safe, 0.5 * edges.square().sum(dim=2, keepdim=True))[..., 0]
-    middle, radius = corners[:, 0] + offset, offset.norm(dim=1)
+    centre, radius = corners[:, 0] + offset, offset.norm(dim=1)
     cosines = []
     for slot in range(4):
         others = [corner for corner in range(4) if corner != slot]
         a, b, c = corners[:, others].unbind(dim=1)
         normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
         side = (((corners[:, slot] - a) * normal).sum(dim=1)).sign()
-        cosines.append(side * ((middle - a) * normal).sum(dim=1) / radius.clamp_min(1e-12))
+        cosines.append(side * ((centre - a) * normal).sum(dim=1) / radius.clamp_min(1e-12))
     cosine = torch.stack(cosines, dim=1)
     cell, slot = torch.nonzero(beside >= 0, as_tuple=True)
     other = beside[cell, slot]

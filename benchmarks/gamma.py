@@ -35,14 +35,16 @@ OBJECTS = ("gray", "cat", "horse", "buddha")
 
 
 def radiance(ambient: float, generator: torch.Generator) -> Float[Tensor, "16 400"]:
-    """Shade half a sphere of normals and albedos under 16 distant lamps, shadows included."""
+    """Shade half a sphere under 16 distant point lights, shadows included."""
     normals = normalize(torch.randn(400, 3, generator=generator, dtype=torch.float64), dim=1)
     normals[:, 2] = -normals[:, 2].abs()
     aside = 0.6 * torch.randn(16, 2, generator=generator, dtype=torch.float64)
-    lamps = normalize(torch.cat([aside, -torch.ones(16, 1, dtype=torch.float64)], dim=1), dim=1)
+    point_lights = normalize(
+        torch.cat([aside, -torch.ones(16, 1, dtype=torch.float64)], dim=1), dim=1
+    )
     albedo = 0.3 + 0.7 * torch.rand(400, generator=generator, dtype=torch.float64)
     gain = 0.6 + 0.2 * torch.rand(16, 1, generator=generator, dtype=torch.float64)
-    return gain * albedo * ((lamps @ normals.T).clamp_min(0) + ambient)
+    return gain * albedo * ((point_lights @ normals.T).clamp_min(0) + ambient)
 
 
 def main() -> None:

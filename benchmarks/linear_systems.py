@@ -23,7 +23,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, cg, spsolve
 from torch import Tensor
 
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.linalg.hierarchy import sparse_product, torch_product
 from pimper_torch.linalg.meshes import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.linalg.multigrid import Multigrid
@@ -94,8 +94,8 @@ def mesh(side: int) -> tuple[tuple[Tensor, Tensor, Tensor], int]:
     lower = torch.stack([first, first + 1, first + count + 2], dim=1)
     upper = torch.stack([first, first + count + 2, first + count + 1], dim=1)
     facets = torch.cat([lower, upper])
-    lattice = subdivide(corners, facets, torch.full((len(facets),), 1.48 / side).double())
-    parts = elements(lattice.points, lattice.faces)
+    subdivision = subdivide(corners, facets, torch.full((len(facets),), 1.48 / side).double())
+    parts = elements(subdivision.points, subdivision.faces)
     one = torch.ones_like(parts.area)
     rows, cols, values = cotangent_laplacian(parts, one)
     loop = torch.arange(parts.count)

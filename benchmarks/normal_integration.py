@@ -134,11 +134,11 @@ def without_depth(folders: list[Path], figure: Path | None) -> None:
             began = time.perf_counter()
             found[method] = result = integrate(one, method)
             seconds = time.perf_counter() - began
-            angle = turned_by(one, result)
+            angle = rotated_by(one, result)
             given_up = torch.nan
             if result.continuity is not None:
-                shares = result.continuity.right, result.continuity.down
-                inside = torch.cat([share[share > 0] for share in shares])
+                fractions = result.continuity.right, result.continuity.down
+                inside = torch.cat([fraction[fraction > 0] for fraction in fractions])
                 given_up = 100 * float((inside < 0.25).double().mean())
             print(  # noqa: T201
                 f"| {folder.name} | {method} | {given_up:.2f} | {float(angle.mean()):.2f} "
@@ -150,7 +150,7 @@ def without_depth(folders: list[Path], figure: Path | None) -> None:
         draw(panels, figure)
 
 
-def turned_by(one: NormalMap, found: IntegratedMap) -> Tensor:
+def rotated_by(one: NormalMap, found: IntegratedMap) -> Tensor:
     """Give the angle between the normals given and those of the surface, by its own steps."""
     depth, K = found.depth, one.intrinsics
     unknown = depth if K is None else torch.where(one.mask, depth, 1).log()

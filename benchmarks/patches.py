@@ -23,7 +23,7 @@ from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.single_view.factorization import solve_alternation, solve_descent
 
-# How strongly lights are held to their start, as a share of what the data say, and the loss.
+# How strongly lights are held to their start, as a fraction of what the data say, and the loss.
 CASES = ((1.0, Squares()), (1.0, Cauchy(2.0)), (1e-6, Squares()))
 LIMITS = {"variable-projection": 60, "alternation": 300, "balm": 300, "descent": 300}
 SOLVERS = {**CHAIN, "alternation": solve_alternation, "descent": solve_descent}
@@ -57,7 +57,7 @@ def main() -> None:
     )
     print("|---|---|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|")  # noqa: T201
     for name in options.solvers:
-        for hold, loss in CASES:
+        for damping, loss in CASES:
             before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
             began, spent = time.perf_counter(), time.process_time()
             steps, cost, error, limited = 0, 0.0, [], 0
@@ -65,7 +65,9 @@ def main() -> None:
             for first in range(0, options.patches, chunk):
                 some = torch.arange(first, min(first + chunk, options.patches))
                 problem = pose(radiance[some], seen[some], lights[some], normals[some])
-                problem = problem.replace(loss=loss, stride=7, pull=hold * problem.pull)
+                problem = problem.replace(
+                    loss=loss, stride=7, regularization=damping * problem.regularization
+                )
                 found = SOLVERS[name](problem, LIMITS[name], TOLERANCES[name])
                 steps += int(found.convergence.iterations.sum())
                 ended = (found.lights, found.shading, found.weight)
@@ -77,7 +79,7 @@ def main() -> None:
             seconds, cpu = time.perf_counter() - began, time.process_time() - spent
             sweeps = steps / options.patches
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3 - before
-            case = f"{name} | {'held' if hold == 1 else 'free'} | {type(loss).__name__}"
+            case = f"{name} | {'held' if damping == 1 else 'free'} | {type(loss).__name__}"
             print(  # noqa: T201
                 f"| {case} | {seconds:.1f} | {cpu:.1f} | {sweeps:.1f} "
                 f"| {1e3 * seconds / sweeps:.0f} | {1e3 * seconds / sweeps / walk:.0f} "
@@ -124,7 +126,7 @@ def pose(
     square = (weight * shade**2).sum(dim=1)
     albedo = (weight * shade * radiance).sum(dim=1) / torch.where(square > 0, square, 1)
     shading = albedo.clamp_min(0)[:, None] * basis
-    pull = (weight @ (shading[:, 0] ** 2)[..., None])[..., 0]
+    regularization = (weight @ (shading[:, 0] ** 2)[..., None])[..., 0]
     level = lights.square().sum(dim=2).mean(dim=1)
     return Bilinear(
         radiance=radiance,
@@ -132,7 +134,7 @@ def pose(
         lights=lights,
         anchor=lights,
         shading=shading,
-        pull=pull,
+        regularization=regularization,
         prior=0.1 * level[:, None, None] * Cone().bend(normals.mT),
     )
 

@@ -3,9 +3,9 @@
     python benchmarks/photometric_stereo.py FOLDER [FOLDER ...]
 
 Each FOLDER is one of: `images` of the UW photometric stereo set, a face of the Yale database B,
-or meshes, of which spot.obj and bunny_hr.obj are rendered under 20 lamps with cast shadows. Only
-the grey sphere (its circle is fitted to the mask) and the rendered meshes have true normals; the
-others are compared with those of known lights, and say so.
+or meshes, of which spot.obj and bunny_hr.obj are rendered under 20 point lights with cast shadows.
+Only the grey sphere (its circle is fitted to the mask) and the rendered meshes have true normals;
+the others are compared with those of known lights, and say so.
 """
 
 import argparse
@@ -36,10 +36,12 @@ from pimper_torch.single_view.photometric_stereo import PhotometricStereo, photo
 from pimper_torch.single_view.photometric_stereo.methods import METHODS
 
 HEIGHT = 240  # pixels of the rendered photographs
-LAMPS, SPREAD_DEG = 20, 60.0
+POINT_LIGHTS, SPREAD_DEG = 20, 60.0
 FAR = 40.0  # of the camera, in sizes of the mesh: orthographic to a degree
 SATURATED = 0.99
-FRONTAL_DEG = 60.0  # of the Yale database's lamps, those nearer to the camera's axis than this
+FRONTAL_DEG = (
+    60.0  # of the Yale database's point lights, those nearer to the camera's axis than this
+)
 
 COLUMNS = (
     "scene",
@@ -62,7 +64,7 @@ class Scene:
     name: str
     images: Tensor
     mask: Tensor
-    lights: Tensor  # towards the lamp, camera frame
+    lights: Tensor  # towards the point light, camera frame
     normals: Tensor | None  # None: those of known lights are taken
 
 
@@ -98,7 +100,11 @@ def scenes(folder: Path) -> dict[str, Callable[[], Scene]]:
         ),
         "soft": lambda: softened(
             rendered(
-                folder / "bunny_hr.obj", "bunny, soft light", False, spread_deg=110.0, lamps=80
+                folder / "bunny_hr.obj",
+                "bunny, soft light",
+                False,
+                spread_deg=110.0,
+                point_lights=80,
             )
         ),
     }
@@ -167,8 +173,8 @@ def figures(found: PhotometricStereo, truth: Tensor, lights: Tensor) -> list[str
         best_normals = project_to_cone(lorentz.on_shading(cone).mT).mT[1:]
         best_lights = lorentz.on_lights(mine)
     best = angles_deg(best_normals, true).mean()
-    lamps = [one[:, 1:4] if one.shape[1] > 3 else one for one in (mine, best_lights)]
-    aims = [angles_deg(one.mT, given.mT).mean() for one in lamps]
+    point_lights = [one[:, 1:4] if one.shape[1] > 3 else one for one in (mine, best_lights)]
+    aims = [angles_deg(one.mT, given.mT).mean() for one in point_lights]
     return [*cells, f"{best:.2f}", f"{aims[0]:.2f}", f"{aims[1]:.2f}"]
 
 
@@ -224,7 +230,7 @@ def uw(folder: Path, name: str) -> Scene:
 
 
 def sphere_normals(mask: Tensor) -> Tensor:
-    """Fit a circle to a disc by its area and middle; zero on the outermost 2 % of the radius."""
+    """Fit a circle to a disc by its area and centre; zero on the outermost 2 % of the radius."""
     rows, columns = torch.nonzero(mask, as_tuple=True)
     radius = math.sqrt(len(rows) / math.pi)
     y, x = torch.meshgrid(*(torch.arange(side) for side in mask.shape), indexing="ij")
@@ -240,24 +246,24 @@ def encoding(folder: Path) -> str:
     scene = uw(folder, "gray")
     inner = (scene.normals[..., 2] < -0.3) & scene.mask
     normals = scene.normals[inner].double()
-    shares = []
+    fractions = []
     for images in (scene.images, linear_from_srgb(scene.images)):
         samples = images.mean(dim=1)[:, inner].double()
         errors, total = [], []
         for row in samples:
             lit = row > 0.02
-            lamp = torch.linalg.lstsq(normals[lit], row[lit, None]).solution
-            errors.append((row[lit] - (normals[lit] @ lamp)[:, 0]).square().mean())
+            point_light = torch.linalg.lstsq(normals[lit], row[lit, None]).solution
+            errors.append((row[lit] - (normals[lit] @ point_light)[:, 0]).square().mean())
             total.append(row[lit].square().mean())
-        shares.append(float((torch.stack(errors).sum() / torch.stack(total).sum()).sqrt()))
+        fractions.append(float((torch.stack(errors).sum() / torch.stack(total).sum()).sqrt()))
     return (
-        "Residual of the cosine on the grey sphere, as a share of its brightness: "
-        f"{100 * shares[0]:.1f} % as the files are, {100 * shares[1]:.1f} % with sRGB undone."
+        "Residual of the cosine on the grey sphere, as a fraction of its brightness: "
+        f"{100 * fractions[0]:.1f} % as the files are, {100 * fractions[1]:.1f} % with sRGB undone."
     )
 
 
 def yale(folder: Path) -> Scene:
-    """Read a face under the lamps nearer to the camera's axis; dark pixels are not the face."""
+    """Read a face under the point lights near the camera's axis, dark pixels masked."""
     capture = read_yale_b(folder)
     truth = capture.truth
     assert truth is not None
@@ -281,30 +287,30 @@ def rendered(
     one_strength: bool,
     *,
     spread_deg: float = SPREAD_DEG,
-    lamps: int = LAMPS,
+    point_lights: int = POINT_LIGHTS,
 ) -> Scene:
-    """Photograph a mesh under lamps far away, matte, with cast shadows and a little noise."""
+    """Photograph a matte mesh under distant point lights, with cast shadows and noise."""
     generator = torch.Generator().manual_seed(7)
     mesh = read_mesh(path)
     low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)
-    middle, size = (low + high) / 2, float((high - low).norm())
+    centre, size = (low + high) / 2, float((high - low).norm())
     mesh = mesh.replace(
-        vertices_world=(mesh.vertices_world - middle) / size, normals_world=None, albedo=None
+        vertices_world=(mesh.vertices_world - centre) / size, normals_world=None, albedo=None
     )
-    turn = math.radians(200.0 if "spot" in path.name else 25.0)
-    toward = torch.tensor([math.sin(turn), 0.25, math.cos(turn)], dtype=torch.float64)
+    rotation = math.radians(200.0 if "spot" in path.name else 25.0)
+    toward = torch.tensor([math.sin(rotation), 0.25, math.cos(rotation)], dtype=torch.float64)
     toward = normalize(toward, dim=0)
     pose = look_at(FAR * toward[None], torch.zeros(3).to(toward), toward.new_tensor([0.0, 1, 0]))
-    cameras = pinholes(pose.expand(lamps, -1, -1), 0.95 * HEIGHT * FAR, HEIGHT, HEIGHT)
+    cameras = pinholes(pose.expand(point_lights, -1, -1), 0.95 * HEIGHT * FAR, HEIGHT, HEIGHT)
     # A sunflower's seeds fill the cap evenly.
-    index = torch.arange(lamps, dtype=torch.float64) + 0.5
-    cosine = 1 - index / lamps * (1 - math.cos(math.radians(spread_deg)))
+    index = torch.arange(point_lights, dtype=torch.float64) + 0.5
+    cosine = 1 - index / point_lights * (1 - math.cos(math.radians(spread_deg)))
     around, sine = index * math.pi * (3 - math.sqrt(5)), (1 - cosine**2).sqrt()
     directions = torch.stack([sine * around.cos(), sine * around.sin(), -cosine], dim=1)
     rotation = pose[0, :3, :3].double()
-    strength = torch.full((lamps,), 0.9, dtype=torch.float64)
+    strength = torch.full((point_lights,), 0.9, dtype=torch.float64)
     if not one_strength:
-        strength = 0.5 + 0.4 * torch.rand(lamps, generator=generator, dtype=torch.float64)
+        strength = 0.5 + 0.4 * torch.rand(point_lights, generator=generator, dtype=torch.float64)
     lights = Lights(
         positions_world=1e5 * directions @ rotation,
         irradiance=strength,
@@ -334,13 +340,13 @@ def softened(scene: Scene) -> Scene:
     aims[:, 2] = -aims[:, 2].abs()
     directions = normalize(scene.lights, dim=1)
     # A lobe of 60 degrees or so over light from everywhere.
-    share = 0.4 + (3 * (aims @ directions.mT - 1)).exp()
-    share = share / len(directions) * 2
+    fraction = 0.4 + (3 * (aims @ directions.mT - 1)).exp()
+    fraction = fraction / len(directions) * 2
     return Scene(
         name=scene.name,
-        images=torch.einsum("vl,lchw->vchw", share, scene.images).clamp_max(1),
+        images=torch.einsum("vl,lchw->vchw", fraction, scene.images).clamp_max(1),
         mask=scene.mask,
-        lights=share @ scene.lights,
+        lights=fraction @ scene.lights,
         normals=scene.normals,
     )
 

@@ -38,7 +38,7 @@ COLMAP = ReconstructConfig(
     guided_pairs=0,
     max_error_px=4.0,
     starts=0,
-    track_rounds=0,
+    track_iterations=0,
 )
 
 
@@ -67,8 +67,8 @@ def variants() -> dict[str, ReconstructConfig]:
     """Name the settings to compare: COLMAP's own with one change, and ours with one change."""
     change = dataclasses.replace
     ours = ReconstructConfig()
-    first = change(ours, guided_pairs=0, starts=0, track_rounds=0)
-    guided = change(ours, starts=0, track_rounds=0)
+    first = change(ours, guided_pairs=0, starts=0, track_iterations=0)
+    guided = change(ours, starts=0, track_iterations=0)
     return {
         "COLMAP's": COLMAP,
         "COLMAP's, contrast 0.002": change(COLMAP, peak_threshold=0.002),

@@ -5,8 +5,8 @@
 RESULT is a folder that ``pimper reconstruct`` wrote, PHOTOS the photographs it was made of. The
 first side is the reference view, each further one the view that looks from furthest away from
 those before. What lies beyond a photograph's border is black. The surface is grey matte stuff
-under a lamp from the upper left: what looks like relief is relief. Printed is whether the surface
-is closed, and what keeps it from that.
+under a point light from the upper left: what looks like height field is height field. Printed is
+whether the surface is closed, and what keeps it from that.
 """
 
 import argparse
@@ -65,10 +65,10 @@ def tell(skin: Closedness) -> None:
 
 
 def far_apart(
-    cameras: Cameras, middle: Float[Tensor, " 3"], first: int, count: int
+    cameras: Cameras, centre: Float[Tensor, " 3"], first: int, count: int
 ) -> Int[Tensor, " side"]:
-    """Choose views that look at the middle from directions as different as can be."""
-    towards = normalize(cameras.centers_world - middle, dim=-1)
+    """Choose views that look at the centre from directions as different as can be."""
+    towards = normalize(cameras.centers_world - centre, dim=-1)
     chosen = [first]
     while len(chosen) < min(count, len(towards)):
         nearest = (towards @ towards[chosen].T).amax(dim=1)

@@ -52,7 +52,7 @@ def main() -> None:
             for found, known in zip(silhouettes.masks, known_masks(masks, scene), strict=True)
         ] or [float("nan")]
         say(
-            f"| {photos} | {scene.views.num_views} | {int(silhouettes.trusted.sum())} "
+            f"| {photos} | {scene.views.num_views} | {int(silhouettes.reliable.sum())} "
             f"| {sum(overlap) / len(overlap):.4f} | {min(overlap):.4f} | {seconds:.2f} |",
         )
         if options.overlays:

@@ -3,7 +3,7 @@
 Run as ``python benchmarks/speed.py TARGET [options of pimper reconstruct]``. TARGET is ``demo``, a
 rendered scene's name (it is rendered first, to ``--renderings``), or a folder: of photographs, or
 as ``pimper render`` writes it. Prints a Markdown table: the rounds' stages added up, or one by one
-with ``--rounds``. ``busy cores`` is CPU seconds over seconds and cores, so that other programs
+with ``--scales``. ``busy cores`` is CPU seconds over seconds and cores, so that other programs
 lower it. ``of floor`` is the time over what cannot be avoided, measured in the same run:
 
 - ``warp``, ``sweep``: one pass over all radiance that is looked up, as fast as memory is copied.
@@ -166,8 +166,8 @@ def added(stage: str, costs: Sequence[Cost]) -> Cost:
     """
     seconds = sum(cost.seconds for cost in costs)
     known = [cost for cost in costs if not math.isnan(cost.floor_seconds)]
-    share = sum(cost.seconds for cost in known) / seconds if seconds else 0
-    floor = sum(cost.floor_seconds for cost in known) / share if share else math.nan
+    fraction = sum(cost.seconds for cost in known) / seconds if seconds else 0
+    floor = sum(cost.floor_seconds for cost in known) / fraction if fraction else math.nan
     return Cost(
         stage=stage,
         seconds=seconds,
@@ -192,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("target", help="demo, a scene's name or a folder")
     parser.add_argument("-o", "--out", type=Path, help="JSON file for the figures")
     parser.add_argument("--against", type=Path, help="JSON file of an earlier run")
-    parser.add_argument("--rounds", action="store_true", help="one row a round")
+    parser.add_argument("--scales", action="store_true", help="one row a scale")
     parser.add_argument("--scaling", action="store_true", help="at three sizes")
     parser.add_argument("--colmap", action="store_true", help="COLMAP's own settings, too")
     parser.add_argument("--renderings", type=Path, default=Path("renderings"))
@@ -203,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         found = measured(job_of(target, others, Path(folder) / "result"), options.colmap)
-    print_table(found, options.rounds)
+    print_table(found, options.scales)
     if options.against:
         print_ratios(found, json.loads(options.against.read_text(encoding="utf-8")))
     if options.out:
@@ -284,11 +284,11 @@ def with_floors(
     a_step = _ENTRY_FLOPS / (floors["batched_product_gflop_per_s"] * 1e9)
     an_entry = {"warp": a_pass, "factorize": a_step, "sweep": a_pass}
     an_entry["photometry"] = sum(an_entry.values())
-    found, rounds = [], dict.fromkeys(an_entry, 0)
+    found, iterations = [], dict.fromkeys(an_entry, 0)
     for cost in costs:
-        if cost.stage in an_entry and rounds[cost.stage] < len(entries):
-            least = an_entry[cost.stage] * entries[rounds[cost.stage]]
-            rounds[cost.stage] += 1
+        if cost.stage in an_entry and iterations[cost.stage] < len(entries):
+            least = an_entry[cost.stage] * entries[iterations[cost.stage]]
+            iterations[cost.stage] += 1
             found.append(replace(cost, floor_seconds=least))
         elif cost.stage == "reconstruct":
             found.append(replace(cost, floor_seconds=floors["colmap_seconds"]))
@@ -373,19 +373,19 @@ def costs_of(found: Mapping[str, Any]) -> list[Cost]:
     return [Cost(**cost) for cost in found["costs"]]
 
 
-def rows_of(found: Mapping[str, Any], rounds: bool = False) -> list[Cost]:
+def rows_of(found: Mapping[str, Any], scales: bool = False) -> list[Cost]:
     """Give the stages, all of them, and all after structure from motion."""
     costs = costs_of(found)
     names = [cost.stage for cost in costs]
     after = costs[names.index("reconstruct") + 1 :] if "reconstruct" in names else costs
     return [
-        *(costs if rounds else by_stage(costs)),
+        *(costs if scales else by_stage(costs)),
         replace(added("after structure from motion", after), floor_seconds=math.nan),
         replace(added("all", costs), floor_seconds=math.nan),
     ]
 
 
-def print_table(found: Mapping[str, Any], rounds: bool) -> None:
+def print_table(found: Mapping[str, Any], scales: bool) -> None:
     """Print what a run cost."""
     cores, floors = found["machine"]["cores"], found["floors"]
     width, height = found["size_px"]
@@ -397,7 +397,7 @@ def print_table(found: Mapping[str, Any], rounds: bool) -> None:
         f"{found['machine']['cpu']}, {cores} cores; copies {floors['copy_gb_per_s']:.1f} GB/s, "
         f"batched products {floors['batched_product_gflop_per_s']:.1f} GFLOP/s.\n"
     )
-    table(("stage", *COLUMNS), [[row.stage, *row.cells(cores)] for row in rows_of(found, rounds)])
+    table(("stage", *COLUMNS), [[row.stage, *row.cells(cores)] for row in rows_of(found, scales)])
 
 
 def print_ratios(found: Mapping[str, Any], earlier: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor, nn
 
 from pimper_torch.geometry.components import boundary_loops
-from pimper_torch.patches.warp import missing_share
+from pimper_torch.patches.warp import missing_fraction
 from pimper_torch.progress import listening
 from pimper_torch.records import (
     CoarseMesh,
@@ -84,7 +84,7 @@ _recording: ContextVar[_Recording | None] = ContextVar("recording", default=None
 def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]]:
     """Time the direct submodules of ``chain`` while the ``with`` block calls them.
 
-    Threads that share ``chain`` have reports of their own.
+    Threads that fraction ``chain`` have reports of their own.
 
     Yields:
         The list that a report is appended to whenever a submodule has run.
@@ -144,7 +144,7 @@ def peak_memory_mb() -> float:
 
 @singledispatch
 def figures(record: object) -> dict[str, int | float]:
-    """Give the counts and shares of a record that are worth telling."""
+    """Give the counts and fractions of a record that are worth telling."""
     return {}
 
 
@@ -163,8 +163,8 @@ def _(scene: SparseScene) -> dict[str, int | float]:
 @figures.register
 def _(silhouettes: Silhouettes) -> dict[str, int | float]:
     return {
-        "trusted_views": int(silhouettes.trusted.sum()),
-        "object_share": _mean(silhouettes.masks.flatten().float()),
+        "reliable_views": int(silhouettes.reliable.sum()),
+        "object_fraction": _mean(silhouettes.masks.flatten().float()),
     }
 
 
@@ -194,7 +194,7 @@ def _(patches: PatchSet) -> dict[str, int | float]:
 def _(seen: PatchViews) -> dict[str, int | float]:
     num_views = seen.buckets[0].valid.shape[1]
     samples = sum(int(bucket.inside.sum()) for bucket in seen.patches.buckets) * num_views
-    return {"samples": samples, "missing_share": missing_share(seen)}
+    return {"samples": samples, "missing_fraction": missing_fraction(seen)}
 
 
 @figures.register
@@ -204,7 +204,7 @@ def _(photometric: PhotometricPatches) -> dict[str, int | float]:
     count = photometric.patches.num_patches
     ended = [bucket.convergence for _, bucket in pairs]
     return {
-        "valid_share": sum(int(bucket.valid.sum()) for _, bucket in pairs) / inside,
+        "valid_fraction": sum(int(bucket.valid.sum()) for _, bucket in pairs) / inside,
         "determined_patches": sum(int(bucket.determined.sum()) for _, bucket in pairs),
         "converged_patches": sum(int(end.converged.sum()) for end in ended),
         "mean_iterations": sum(float(end.iterations.sum()) for end in ended) / count,
@@ -228,8 +228,8 @@ def _(depths: DepthPatches) -> dict[str, int | float]:
 @figures.register
 def _(surface: Surface) -> dict[str, int | float]:
     return {
-        "lattice_points": len(surface.vertices_world),
-        "supported_share": _mean((surface.confidence > 0).float()),
+        "subdivision_points": len(surface.vertices_world),
+        "supported_fraction": _mean((surface.confidence > 0).float()),
         "relative_residual": _mean(surface.convergence.residual),
     }
 

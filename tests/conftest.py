@@ -157,7 +157,7 @@ def reconstruction():
                 name="warp",
                 seconds=1.5,
                 peak_memory_mb=300.0,
-                figures={"samples": 96, "missing_share": 0.25},
+                figures={"samples": 96, "missing_fraction": 0.25},
             ),
             StageReport(name="extract", seconds=0.5, peak_memory_mb=310.0, figures={}),
         ),
@@ -195,7 +195,7 @@ def lift():
     def make(height: float, textured: bool = True) -> SimpleNamespace:
         generator = torch.Generator().manual_seed(64)
         cameras = arc_cameras(9, width=120, height=90, focal_px=330.0, distance=3.0, span_deg=50.0)
-        lamps = wandering_lights(
+        point_lights = wandering_lights(
             9, generator, distance=5.0, spread_deg=35.0, min_tilt_deg=5.0, irradiance=0.6
         )
         speckle = random_speckle(generator, cells=(0.12, 0.05), contrast=1.0)
@@ -204,7 +204,7 @@ def lift():
             return torch.full_like(points, 0.5)
 
         texture = speckle if textured else bare
-        scene = render_shape(Plane(normal=slant), cameras, lamps.harmonics_world(), texture)
+        scene = render_shape(Plane(normal=slant), cameras, point_lights.harmonics_world(), texture)
         normal = torch.tensor(slant, dtype=torch.float64)
         normal = normal / normal.norm()
         xy = torch.tensor([[-0.3, -0.25], [0.3, -0.25], [0.3, 0.25], [-0.3, 0.25]]).double()
@@ -221,11 +221,11 @@ def lift():
         buckets = []
         for templates in patches.buckets:
             shape = templates.depth.shape
-            turned = rotate(templates.patch_from_world, normal.expand(len(templates.facet), 1, 3))
+            rotated = rotate(templates.patch_from_world, normal.expand(len(templates.facet), 1, 3))
             count = len(templates.facet)
             buckets.append(
                 Photometry(
-                    normals_patch=turned[:, :, None].expand(*shape, 3),
+                    normals_patch=rotated[:, :, None].expand(*shape, 3),
                     albedo=torch.ones(*shape, 3).double(),
                     lights_patch=rotate_lights(templates.patch_from_world, scene.lights_world),
                     valid=templates.inside,
@@ -328,7 +328,7 @@ def problem(generator):
             lights=start,
             anchor=start,
             shading=from_shading,
-            pull=torch.zeros(patches, views, dtype=torch.float64),
+            regularization=torch.zeros(patches, views, dtype=torch.float64),
         )
         return given, lights, shading
 

@@ -19,7 +19,7 @@ class Stub(nn.Module):
         return self.work()
 
 
-def rounds(messages):
+def iterations(messages):
     """A chain whose factorization warns of something else in every round."""
     chain, left = CoarseToFine(), list(messages)
     for name, _ in list(chain.named_children()):
@@ -37,12 +37,12 @@ def rounds(messages):
 
 def test_the_last_rounds_figures_are_said_once():
     with pytest.warns(PimperWarning) as caught:
-        rounds([["9 of 10", "no contours"], ["5 of 10"], ["3 of 10"]])
+        iterations([["9 of 10", "no contours"], ["5 of 10"], ["3 of 10"]])
     assert [str(warning.message) for warning in caught] == ["3 of 10"]
 
 
 def test_what_the_last_round_has_mended_is_not_said(recwarn):
-    rounds([["9 of 10"], [], []])
+    iterations([["9 of 10"], [], []])
     assert not recwarn.list
 
 

@@ -69,11 +69,11 @@ def photographed(shape: Shape, seed: int, **settings: object) -> RenderedScene:
     options = {"width": 80, "height": 60, "focal_px": 235.0, "distance": 3.0, "span_deg": 40.0}
     cameras = arc_cameras(9, **(options | settings))
     # At most 35 degrees off: no shadow anywhere on what is seen, so first order is exact.
-    lamps = wandering_lights(
+    point_lights = wandering_lights(
         9, generator, distance=5.0, spread_deg=35.0, min_tilt_deg=5.0, irradiance=0.6
     )
     texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
-    return render_shape(shape, cameras, lamps.harmonics_world(), texture)
+    return render_shape(shape, cameras, point_lights.harmonics_world(), texture)
 
 
 def small_chain(preset: str, scene: SparseScene) -> pt.Chain:

@@ -53,9 +53,9 @@ def photographed() -> tuple[RenderedScene, SparseScene]:
     """Nine small photographs of a ball, and what structure from motion would make of them."""
     generator = torch.Generator().manual_seed(18)
     cameras = arc_cameras(9, width=56, height=42, focal_px=70.0, distance=4.0, span_deg=40.0)
-    lamps = wandering_lights(9, generator, distance=5.0, spread_deg=35.0)
+    point_lights = wandering_lights(9, generator, distance=5.0, spread_deg=35.0)
     texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
-    scene = render_shape(Sphere(), cameras, lamps.harmonics_world(), texture)
+    scene = render_shape(Sphere(), cameras, point_lights.harmonics_world(), texture)
     return scene, sparse_scene(scene, 30, generator)
 
 
@@ -104,9 +104,11 @@ def a_ball() -> tuple[torch.Tensor, torch.Tensor]:
 def photographs_of_one_viewpoint(_: pytest.MonkeyPatch) -> dict[str, object]:
     normals, mask = a_ball()
     generator = torch.Generator().manual_seed(5)
-    lamps = torch.randn(12, 3, generator=generator, dtype=torch.float64) - torch.tensor([0, 0, 3.0])
+    point_lights = torch.randn(12, 3, generator=generator, dtype=torch.float64) - torch.tensor(
+        [0, 0, 3.0]
+    )
     albedo = 0.3 + 0.6 * (normals[..., 0] > 0)
-    shading = torch.einsum("hwx,lx->lhw", normals, normalize(lamps, dim=1))
+    shading = torch.einsum("hwx,lx->lhw", normals, normalize(point_lights, dim=1))
     return {"images": (albedo * shading.clamp_min(0))[:, None], "mask": mask}
 
 

@@ -37,14 +37,14 @@ def assert_agree(stage, pairs, tolerance):
         assert abs(check.ratio - 1) < tolerance, text
 
 
-def in_rounds(**changes):
+def in_iterations(**changes):
     return chain_of("default", scales=[0.5, 1.0], **changes)
 
 
 @pytest.fixture(scope="module")
-def rounds(tiny):
+def iterations(tiny):
     """What the stages of the second round are handed: templates that carry a surface."""
-    return probes(in_rounds(), *tiny)
+    return probes(in_iterations(), *tiny)
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +53,10 @@ def published():
 
 
 @pytest.mark.parametrize("stage", ["warp", "decompose", "sweep", "fuse", "repair", "remesh"])
-def test_stages_of_the_rounds_agree_with_finite_differences(rounds, stage, generator):
+def test_stages_of_the_rounds_agree_with_finite_differences(iterations, stage, generator):
     # What sways the surface little is told from rounding by longer steps.
     steps = (3e-6, 1e-6) if stage == "fuse" else (1e-6, 1e-7)
-    assert_agree(stage, rounds[stage].check(generator, directions=3, steps=steps), STAGE)
+    assert_agree(stage, iterations[stage].check(generator, directions=3, steps=steps), STAGE)
 
 
 @pytest.mark.parametrize("stage", ["integrate", "align", "refine"])
@@ -65,11 +65,11 @@ def test_stages_of_the_published_chain_agree_with_finite_differences(published, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("light", ["soft", "lamp"])
+@pytest.mark.parametrize("light", ["soft", "point_light"])
 @pytest.mark.parametrize("loss", ["squares", "cauchy"])
 def test_factorization_agrees_with_finite_differences(light, loss, generator):
     few = small_scene(num_views=5, width=32, num_points=6)
-    chain = in_rounds(factorize={"light": light, "loss": loss})
+    chain = in_iterations(factorize={"light": light, "loss": loss})
     found = probes(chain, *few)["factorize"].check(generator, directions=1)
     assert_agree("factorize", found, STAGE)
 
@@ -77,7 +77,7 @@ def test_factorization_agrees_with_finite_differences(light, loss, generator):
 @pytest.mark.slow
 def test_the_chain_whole_agrees_with_finite_differences(generator):
     few = small_scene(num_views=5, width=32, num_points=6)
-    found = probes(in_rounds(), *few)["chain"].check(generator, directions=2, weights=4)
+    found = probes(in_iterations(), *few)["chain"].check(generator, directions=2, weights=4)
     assert_agree("chain", found, WHOLE)
 
 

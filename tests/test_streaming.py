@@ -109,7 +109,7 @@ class Listener(Silent):
         self.reports.append(report)
 
 
-def in_rounds(listener, **changes):
+def in_iterations(listener, **changes):
     chain = pt.load_chain("default", {"scales": [0.5, 1.0], **changes}, listener)
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
     chain.reconstruct = Given(scene)
@@ -119,7 +119,7 @@ def in_rounds(listener, **changes):
 
 
 def test_steps_show_the_records_of_every_pass_and_end_where_the_run_ends():
-    chain, scene = in_rounds(Silent())
+    chain, scene = in_iterations(Silent())
     steps = list(chain.steps(scene.views))
     result = chain(scene.views)
     assert [(step.scale, step.last) for step in steps] == [(0.5, False), (1.0, True)]
@@ -140,20 +140,20 @@ def test_a_stage_that_the_chain_has_not_is_refused():
 
 def test_a_round_reports_its_photometry_once_and_what_each_part_takes():
     listener = Listener()
-    chain, scene = in_rounds(listener, decompose={"bucket_entries": 6000})
+    chain, scene = in_iterations(listener, decompose={"bucket_entries": 6000})
     result = chain(scene.views)
     told = [report for report in result.report if report.name == "photometry"]
     assert len(told) == 2
     assert not {"warp", "factorize", "sweep"} & set(listener.heard)
-    shares = [told[1].figures[f"{part}_share"] for part in ("warp", "factorize", "sweep")]
-    assert sum(shares) == pytest.approx(1)
-    assert min(shares) > 0
+    fractions = [told[1].figures[f"{part}_share"] for part in ("warp", "factorize", "sweep")]
+    assert sum(fractions) == pytest.approx(1)
+    assert min(fractions) > 0
     patches = result.patches.patches
     samples = 6 * sum(int(bucket.inside.sum()) for bucket in patches.buckets)
     assert told[1].figures["samples"] == samples
     seen = Warp()(scene.views, scene.cameras, patches)
     valid = sum(int(bucket.valid.sum()) for bucket in seen.buckets)
-    assert told[1].figures["missing_share"] == pytest.approx(1 - valid / samples, abs=0.01)
+    assert told[1].figures["missing_fraction"] == pytest.approx(1 - valid / samples, abs=0.01)
     count = len(patches.buckets)
     assert f"{count}/{count}" in listener.heard
 
@@ -161,7 +161,7 @@ def test_a_round_reports_its_photometry_once_and_what_each_part_takes():
 def test_without_kernels_the_chain_gives_the_same_surface():
     found, expected = (
         chain(scene.views).mesh.vertices_world
-        for chain, scene in (in_rounds(Silent(), kernels=name) for name in ("numba", "torch"))
+        for chain, scene in (in_iterations(Silent(), kernels=name) for name in ("numba", "torch"))
     )
     assert found.shape == expected.shape
     spacing = (found[1:] - found[:-1]).norm(dim=1).median()

@@ -125,9 +125,9 @@ def photometry_and_heights(
         photometric = factorize.conclude(solved)
         samples = cameras.num_views * sum(int(each.inside.sum()) for each in patches.buckets)
         told["samples"] = samples
-        told["missing_share"] = 1 - sum(bucket.num_valid for bucket in found) / max(1, samples)
+        told["missing_fraction"] = 1 - sum(bucket.num_valid for bucket in found) / max(1, samples)
         told.update(figures(photometric))
-        told.update(clock.shares())
+        told.update(clock.fractions())
     return SweptPatches(
         photometric=photometric,
         buckets=tuple(bucket.heights for bucket in found),
@@ -150,7 +150,7 @@ class _Clock:
         with self.lock:
             self.seconds[part] = self.seconds.get(part, 0.0) + took
 
-    def shares(self) -> dict[str, float]:
-        """Give each part's share of the whole."""
+    def fractions(self) -> dict[str, float]:
+        """Give each part's fraction of the whole."""
         whole = sum(self.seconds.values()) or 1.0
         return {f"{part}_share": took / whole for part, took in self.seconds.items()}

@@ -59,7 +59,7 @@ class InputOptions:
         mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB), used instead of the
             one that the photographs themselves give.
         object: Whether silhouettes of the object are found (auto), taken from masks, or everything
-            is the object, as for walls, reliefs and scenes; as `--silhouettes.object`.
+            is the object, as for walls, height fields and scenes; as `--silhouettes.object`.
         region: Box that the object is inside, smallest and largest corner in scene units, such as
             (-1,-1,0,1,1,2); as `--silhouettes.region`.
     """

@@ -13,7 +13,7 @@ from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 # residuals, of which a track of three views leaves three.
 _COMMON_FREEDOM = 6.0
 
-# Share of its mean information that a point is taken to have in every direction: a depth is
+# Fraction of its mean information that a point is taken to have in every direction: a depth is
 # at most 1,000 times less certain than a place across, as where only one view sees it.
 _MIN_INFORMATION = 1e-6
 
@@ -23,7 +23,7 @@ _TESTS_AT_ONCE = 2_000_000
 
 def with_cloud(
     scene: SparseScene,
-    trusted: Int[Tensor, " trusted"],
+    reliable: Int[Tensor, " reliable"],
     mesh: Mesh,
     reference: int,
     source: Int[Tensor, " vertex"],
@@ -32,14 +32,14 @@ def with_cloud(
 
     Args:
         scene: The cloud.
-        trusted: Its points that lie on the object.
+        reliable: Its points that lie on the object.
         mesh: The facets.
         reference: The view they were triangulated in.
         source: The point that each vertex is, -1 for a vertex that is none.
     """
     is_point = source >= 0
     at_vertices = point_covariances(scene, source.clamp_min(0))
-    between = trusted[~torch.isin(trusted, source)]
+    between = reliable[~torch.isin(reliable, source)]
     camera = scene.cameras.cam_from_world[reference], scene.cameras.intrinsics[reference]
     pixels, _ = project(scene.points_world[between], *camera)
     corners, _ = project(mesh.vertices_world[mesh.faces], *camera)

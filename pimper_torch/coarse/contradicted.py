@@ -8,9 +8,9 @@ from pimper_torch.geometry.components import face_components
 from pimper_torch.records import Photometry, Support
 
 # How many times more the photographs may disagree on surface that light alone supports than on
-# surface that points do and that is as occluded, and by what share of its brightness in any case.
-# Pieces with more than 10 determined facets: the lid that closes a mug's mouth 4.9 times and 0.16,
-# its plain handle and bottom 1.2 and 0.08, plain sides of a jar 1.1 to 1.9 (first round of 16
+# surface that points do and that is as occluded, and by what fraction of its brightness in any
+# case. Pieces with more than 10 determined facets: the lid that closes a mug's mouth 4.9 times and
+# 0.16, its plain handle and bottom 1.2 and 0.08, plain sides of a jar 1.1 to 1.9 (first round of 16
 # photographs of 640x480), a skull's orbits and plain bone 0.9 to 2.0 (24 photographs, two rounds).
 _MORE, _LEAST = 3.0, 0.1
 

@@ -29,7 +29,7 @@ class DensifyConfig:
         sources: Views that a view is matched with.
         best_sources: Of these, the ones believed at a pixel.
         radius: Of the windows, pixels.
-        likeness: Difference of root radiance to the middle of a window beyond which a pixel
+        likeness: Difference of root radiance to the centre of a window beyond which a pixel
             counts little; 1 is bright.
         contrast: Of root radiance in a window, below which it says little; 1 is bright.
         margin: Share by which the searched range of inverse depths exceeds the points'.
@@ -291,10 +291,10 @@ def _pixels_per_inverse_depth(
     cameras = level.cameras
     frames, intrinsics = cameras.cam_from_world.double(), cameras.intrinsics.double()
     relative = frames[view] @ torch.linalg.inv(frames[others])
-    turn = intrinsics[view] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[others])
+    rotation = intrinsics[view] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[others])
     shift = (intrinsics[view] @ relative[:, :3, 3:])[..., 0].to(place)[:, :, None]
     homogeneous = torch.cat([place, torch.ones_like(place[:, :1])], dim=1)
-    ray = torch.einsum("oij,ojp->oip", turn.to(place), homogeneous)
+    ray = torch.einsum("oij,ojp->oip", rotation.to(place), homogeneous)
     at = ray + inverse_depth[:, None] * shift
     depth = at[:, 2:].clamp_min(1e-6)
     rate = (shift[:, :2] - at[:, :2] / depth * shift[:, 2:]) / depth
@@ -342,8 +342,8 @@ def push_pull(
     if bool(known.all()) or not bool(known.any()) or min(values.shape) == 1:
         return values if bool(known.any()) else torch.zeros_like(values)
     stacked = torch.stack([values * weight, weight])[None]
-    total, share = avg_pool2d(stacked, 2, ceil_mode=True, count_include_pad=False)[0]
-    below = push_pull(total / share.clamp_min(1e-12), share > 0)
+    total, fraction = avg_pool2d(stacked, 2, ceil_mode=True, count_include_pad=False)[0]
+    below = push_pull(total / fraction.clamp_min(1e-12), fraction > 0)
     up = interpolate(below[None, None], values.shape, mode="bilinear", align_corners=False)
     return torch.where(known, values, up[0, 0])
 
@@ -366,14 +366,14 @@ def spanned(
 def median3(values: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     """Take the median of every pixel and its eight neighbours."""
     wide = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    # Columns of three sorted once, then the largest of the smallest, the median of the middle ones
+    # Columns of three sorted once, then the largest of the smallest, the median of the centre ones
     # and the smallest of the largest: their median is that of the nine.
     height, width = values.shape
-    low, middle, high = _sorted3(*(wide[row : row + height] for row in range(3)))
-    lows, middles, highs = (
-        [one[:, column : column + width] for column in range(3)] for one in (low, middle, high)
+    low, centre, high = _sorted3(*(wide[row : row + height] for row in range(3)))
+    lows, centres, highs = (
+        [one[:, column : column + width] for column in range(3)] for one in (low, centre, high)
     )
-    return _sorted3(_sorted3(*lows)[2], _sorted3(*middles)[1], _sorted3(*highs)[0])[1]
+    return _sorted3(_sorted3(*lows)[2], _sorted3(*centres)[1], _sorted3(*highs)[0])[1]
 
 
 def _sorted3(one: Tensor, other: Tensor, third: Tensor) -> tuple[Tensor, Tensor, Tensor]:

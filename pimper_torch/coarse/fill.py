@@ -22,21 +22,21 @@ NEIGHBOURS = 50
 def fill_pixels(
     pixels: Float[Tensor, "point 2"], faces: Int[Tensor, "face 3"], edge_px: float
 ) -> Float[Tensor, "filled 2"]:
-    """Propose pixels on a triangular lattice, inside facets and away from their vertices."""
+    """Propose pixels of a triangular grid, inside facets and away from their vertices."""
     known = pixels.detach().cpu().double().numpy()
     low, high = known.min(axis=0), known.max(axis=0)
     rows = np.arange(low[1], high[1], edge_px * math.sqrt(3) / 2)
     columns = np.arange(low[0], high[0], edge_px)
-    lattice = np.concatenate(
+    subdivision = np.concatenate(
         [
             np.stack([columns + (index % 2) * edge_px / 2, np.full_like(columns, v)], axis=1)
             for index, v in enumerate(rows)
         ]
         or [np.zeros((0, 2))]
     )
-    distance, _ = cKDTree(known).query(lattice)
-    lattice = lattice[distance > 0.8 * edge_px]
-    proposed = torch.from_numpy(lattice).to(pixels)
+    distance, _ = cKDTree(known).query(subdivision)
+    subdivision = subdivision[distance > 0.8 * edge_px]
+    proposed = torch.from_numpy(subdivision).to(pixels)
     return proposed[_inside_any(proposed, pixels, faces)]
 
 
@@ -77,8 +77,8 @@ def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
     faces = torch.from_numpy(simplices.astype(np.int64)).to(pixels.device)
     a, b, c = pixels[faces].unbind(dim=1)
     ab, ac = b - a, c - a
-    turned = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0
-    return torch.where(turned[:, None], faces.flip(1), faces)
+    rotated = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0
+    return torch.where(rotated[:, None], faces.flip(1), faces)
 
 
 def _inside_any(

@@ -15,13 +15,13 @@ from pimper_torch.coarse.matched import matched_cloud, pixel_size_at
 from pimper_torch.coarse.matching import level_of
 from pimper_torch.coarse.oriented import OrientedPoints, joined_points, no_points
 from pimper_torch.coarse.trim import (
-    Evidence,
+    Terms,
     enclosed_holes,
-    evidence,
     fringes,
     hanging_together,
     point_distances,
     supported_pieces,
+    terms,
     too_far,
     without_small_holes,
 )
@@ -66,9 +66,9 @@ class FineSurfaceConfig:
         reach_px: A face nearer to a point, or a contour point, than this is supported by it.
         hole_px: Side of a square as large as the largest hole that is closed whatever made it.
             Strips along a border that are narrower go, where they are small or unsupported.
-        max_unseen: Share of the area seen that a hole may have which only lack of views made,
+        max_unseen: Fraction of the area seen that a hole may have which only lack of views made,
             such as the bottom of a deep concavity, to be closed.
-        min_share: Of the area that points or contours support, which a piece apart has to have.
+        min_fraction: Of the area that points or contours support, which a piece apart has to have.
     """
 
     point_px: float = 1.0
@@ -79,7 +79,7 @@ class FineSurfaceConfig:
     reach_px: float = 4.0
     hole_px: float = 24.0
     max_unseen: float = 0.02
-    min_share: float = 0.01
+    min_fraction: float = 0.01
 
     def __post_init__(self) -> None:
         name = "fine_surface"
@@ -89,7 +89,7 @@ class FineSurfaceConfig:
         require(self.tolerance_px >= 0, f"{name}.tolerance_px", self.tolerance_px, "0 or more")
         require(self.point_px > 0, f"{name}.point_px", self.point_px, "above 0")
         require(self.reach_px > 0, f"{name}.reach_px", self.reach_px, "above 0")
-        require(0 <= self.min_share < 1, f"{name}.min_share", self.min_share, "in [0, 1)")
+        require(0 <= self.min_fraction < 1, f"{name}.min_share", self.min_fraction, "in [0, 1)")
         require(self.hole_px >= 0, f"{name}.hole_px", self.hole_px, "0 or more")
         require(0 <= self.max_unseen < 1, f"{name}.max_unseen", self.max_unseen, "in [0, 1)")
 
@@ -112,10 +112,10 @@ class FineSurface(Record):
 
     def support_of(self, corners: Float[Tensor, "facet 3 3"]) -> Int[Tensor, " facet"]:
         """Give facets the support that most of their places have on this surface."""
-        middle = self.vertices_world[self.faces].mean(dim=1)
+        centre = self.vertices_world[self.faces].mean(dim=1)
         weights = corners.new_tensor(_PLACES) / 6
         places = torch.einsum("pk,fkc->fpc", weights, corners).flatten(0, 1)
-        tree = cKDTree(middle.detach().cpu().numpy())
+        tree = cKDTree(centre.detach().cpu().numpy())
         _, nearest = tree.query(places.detach().cpu().numpy())
         found = self.support[torch.from_numpy(nearest).to(self.support.device)]
         return found.reshape(len(corners), len(_PLACES)).mode(dim=1).values
@@ -123,7 +123,7 @@ class FineSurface(Record):
 
 def fine_surface(
     scene: SparseScene,
-    trusted: Int[Tensor, " trusted"],
+    reliable: Int[Tensor, " reliable"],
     contours: Contours,
     densify: DensifyConfig,
     config: FineSurfaceConfig,
@@ -132,7 +132,7 @@ def fine_surface(
 
     Args:
         scene: Photographs, cameras and cloud.
-        trusted: Points of the cloud inside the visual hull; an object without texture has none.
+        reliable: Points of the cloud inside the visual hull; an object without texture has none.
         contours: What silhouettes say about the surface.
         densify: How photographs are matched.
         config: Settings.
@@ -147,25 +147,25 @@ def fine_surface(
         ReconstructionError: Silhouettes and photographs tell of no surface.
     """
     part = cropped(scene, contours.silhouettes)
-    middle = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
-    cloud, maps = no_points(middle), None
-    if len(trusted) >= _MIN_POINTS or not contours.confine:
-        found, maps, pixel = matched_cloud(part, trusted, densify, config.point_px)
+    centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
+    cloud, maps = no_points(centre), None
+    if len(reliable) >= _MIN_POINTS or not contours.confine:
+        found, maps, pixel = matched_cloud(part, reliable, densify, config.point_px)
         cloud = found.take(
             contours.hull.depth_of(found.points_world) > -config.tolerance_px * pixel
         )
         level = maps.level
     else:
         factor = densify.factors(max(part.views.images.shape[-2:]))[-1]
-        pixel, level = factor * pixel_size_at(middle, scene.cameras), level_of(part, factor)
+        pixel, level = factor * pixel_size_at(centre, scene.cameras), level_of(part, factor)
     vertices, faces, contour = closed_surface(cloud, contours, pixel, config)
-    said = evidence(vertices, faces, level, maps)
-    middles = vertices[faces].mean(dim=1)
-    support = supports(middles, cloud, contour, said, config.reach_px * pixel)
+    said = terms(vertices, faces, level, maps)
+    centres = vertices[faces].mean(dim=1)
+    support = supports(centres, cloud, contour, said, config.reach_px * pixel)
     if contours.confine:
-        inside = contours.hull.holds(middles, config.tolerance_px * pixel)
+        inside = contours.hull.holds(centres, config.tolerance_px * pixel)
     else:
-        inside = near_points(faces, middles, cloud, support, said, pixel)
+        inside = near_points(faces, centres, cloud, support, said, pixel)
     kept = seen_surface(vertices, faces, support, said, inside, pixel, config)
     if not bool(kept.any()):
         raise ReconstructionError(
@@ -261,52 +261,52 @@ def poisson(
     """
     points = cloud.points_world
     # COLMAP works in single precision: a cloud far from the origin is brought there.
-    middle = points.median(dim=0).values
+    centre = points.median(dim=0).values
     extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
     cells = extent / cell
     depth = min(max_depth, round(math.log2(cells)))
     vertices, faces = poisson_surface(
-        points - middle, cloud.normals_world, depth=depth, point_weight=1.0
+        points - centre, cloud.normals_world, depth=depth, point_weight=1.0
     )
-    return vertices.to(points) + middle, faces.to(points.device)
+    return vertices.to(points) + centre, faces.to(points.device)
 
 
 def near_points(
     faces: Int[Tensor, "face 3"],
-    middle: Float[Tensor, "face 3"],
+    centre: Float[Tensor, "face 3"],
     cloud: OrientedPoints,
     support: Int[Tensor, " face"],
-    said: Evidence,
+    said: Terms,
     pixel: float,
 ) -> Bool[Tensor, " face"]:
     """Mark faces with points, and those between points that views see and that are near to some.
 
     Args:
         faces: Of the closed surface.
-        middle: Of them.
+        centre: Of them.
         cloud: Matched points.
         support: Of each face.
         said: What the photographs say about each.
         pixel: Size of one, scene units.
     """
     supported = support == Support.POINTS
-    distance = point_distances(middle, cloud.points_world)
+    distance = point_distances(centre, cloud.points_world)
     between = (said.lit >= _LIGHTING) & (said.denied < _DENYING) & ~supported
     far = too_far(faces, between, distance, _GAP_PX * pixel, _BRINK_PX * pixel)
     return (supported & (said.seen >= _LIGHTING)) | (between & ~far)
 
 
 def supports(
-    middle: Float[Tensor, "face 3"],
+    centre: Float[Tensor, "face 3"],
     cloud: OrientedPoints,
     contour: ContourPoints,
-    said: Evidence,
+    said: Terms,
     reach: float,
 ) -> Int[Tensor, " face"]:
     """Tell what supports each face of a fine surface.
 
     Args:
-        middle: Of the faces.
+        centre: Of the faces.
         cloud: Matched points.
         contour: TraceContours points.
         said: What the photographs say about the faces.
@@ -319,7 +319,7 @@ def supports(
         (cloud.points_world, Support.POINTS),
     ):
         if len(points):
-            found[point_distances(middle, points) <= reach] = support
+            found[point_distances(centre, points) <= reach] = support
     return found
 
 
@@ -327,7 +327,7 @@ def seen_surface(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     support: Int[Tensor, " face"],
-    said: Evidence,
+    said: Terms,
     inside: Bool[Tensor, " face"],
     pixel: float,
     config: FineSurfaceConfig,
@@ -359,6 +359,6 @@ def seen_surface(
     rings = int(config.hole_px / (2 * config.cell_px))
     kept &= ~fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)
     (chosen,) = torch.nonzero(kept, as_tuple=True)
-    pieces = supported_pieces(vertices, faces[chosen], known[chosen], config.min_share)
+    pieces = supported_pieces(vertices, faces[chosen], known[chosen], config.min_fraction)
     kept[chosen[~pieces]] = False
     return kept

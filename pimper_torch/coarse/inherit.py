@@ -13,9 +13,9 @@ from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Surface
 # The surface's normals count this much where no photograph told them.
 UNSURE = 0.05
 
-# How strongly the facets' own normals hold those fitted to the surface, in shares of a typical
+# How strongly the facets' own normals hold those fitted to the surface, in fractions of a typical
 # vertex's data: next to nothing, except where there are none.
-_HOLD = 0.01
+_DAMPING = 0.01
 
 
 def fitted_normals(
@@ -23,8 +23,8 @@ def fitted_normals(
 ) -> Float[Tensor, "vertex 3"]:
     """Fit normals at the vertices so that, blended over facets, they are the surface's.
 
-    Least squares over the lattice, weighted by confidence; where there is no lattice the
-    facets' own.
+    Least squares over the subdivided mesh, weighted by confidence; where there is no subdivided
+    mesh the facets' own.
 
     Args:
         mesh: After splitting and dropping.
@@ -39,24 +39,24 @@ def fitted_normals(
     face, place = face[on], place[on].double()
     weight = (surface.confidence[on].double() + UNSURE)[:, None] * place
     normals = surface.normals_world[on].double()
-    # Facet by facet first: a million lattice vertices are a few thousand blocks.
+    # Facet by facet first: a million subdivided mesh vertices are a few thousand blocks.
     blocks = place.new_zeros(len(faces), 3, 3)
     blocks.index_add_(0, face, weight[:, :, None] * place[:, None])
-    shares = place.new_zeros(len(faces), 3, 3)
-    shares.index_add_(0, face, weight[:, :, None] * normals[:, None])
+    fractions = place.new_zeros(len(faces), 3, 3)
+    fractions.index_add_(0, face, weight[:, :, None] * normals[:, None])
     like = place.new_zeros(len(vertices))
     diagonal = like.index_add(0, faces.flatten(), blocks.diagonal(dim1=1, dim2=2).flatten())
-    rhs = torch.zeros_like(vertices).index_add(0, faces.flatten(), shares.flatten(0, 1))
-    hold = (_HOLD * diagonal.mean()).clamp_min(1e-12).expand(len(vertices))
+    rhs = torch.zeros_like(vertices).index_add(0, faces.flatten(), fractions.flatten(0, 1))
+    damping = (_DAMPING * diagonal.mean()).clamp_min(1e-12).expand(len(vertices))
     own = vertex_normals(vertices, faces)
     everyone = torch.arange(len(vertices), device=faces.device)
     fitted = SparseCholesky(
         torch.cat([faces[:, :, None].expand(-1, -1, 3).flatten(), everyone]),
         torch.cat([faces[:, None].expand(-1, 3, -1).flatten(), everyone]),
-        torch.cat([blocks.flatten(), hold]),
+        torch.cat([blocks.flatten(), damping]),
         size=len(vertices),
         what="the coarse mesh's normals",
-    ).solve(rhs + hold[:, None] * own)
+    ).solve(rhs + damping[:, None] * own)
     facing = (fitted * own).sum(dim=1, keepdim=True) > 0
     return normalize(torch.where(facing, fitted, own), dim=1).to(mesh.vertices_world)
 
@@ -82,7 +82,7 @@ def with_points(
     was_point = (source < len(old)) & coarse.is_point[origin]
     stayed = (mesh.vertices_world == old[origin]).all(dim=1)
     if points is not None:
-        points = _carried(coarse, points, split, number)
+        points = _transferred(coarse, points, split, number)
     covariance = coarse.covariance_world
     if covariance is not None:
         (left,) = torch.nonzero(was_point & ~stayed, as_tuple=True)
@@ -108,7 +108,7 @@ def with_points(
     )
 
 
-def _carried(
+def _transferred(
     coarse: CoarseMesh, points: FacetPoints, split: Split, number: Int[Tensor, " child"]
 ) -> FacetPoints:
     """Give the points on facets to the parts they lie over, straight down on the old plane."""

@@ -18,7 +18,7 @@ from pimper_torch.records import Cameras, SparseScene
 
 def matched_cloud(
     scene: SparseScene,
-    trusted: Int[Tensor, " trusted"],
+    reliable: Int[Tensor, " reliable"],
     config: DensifyConfig,
     cell_px: float,
 ) -> tuple[OrientedPoints, DepthMaps, float]:
@@ -26,24 +26,24 @@ def matched_cloud(
 
     Args:
         scene: Photographs, cameras and cloud.
-        trusted: Points of the cloud, 4 at least.
+        reliable: Points of the cloud, 4 at least.
         config: Settings.
         cell_px: Of the cloud's finest grid, pixels of the finest depth maps.
 
     Returns:
         The cloud, the finest depth maps, and the size of their pixels there, scene units.
     """
-    maps = depth_maps(scene, trusted, config)
-    pixel = pixel_size(scene, trusted) * maps[-1].factor
+    maps = depth_maps(scene, reliable, config)
+    pixel = pixel_size(scene, reliable) * maps[-1].factor
     # The coarsest windows of three reach past contours: they only say where to look.
     dense = with_common_normals(thinned(oriented_points(maps[-2:]), cell_px * pixel))
-    cloud = joined_points(dense, sparse_oriented(scene, trusted, dense, 3 * pixel))
+    cloud = joined_points(dense, sparse_oriented(scene, reliable, dense, 3 * pixel))
     return cloud, maps[-1], pixel
 
 
-def pixel_size(scene: SparseScene, trusted: Int[Tensor, " trusted"]) -> float:
+def pixel_size(scene: SparseScene, reliable: Int[Tensor, " reliable"]) -> float:
     """Give the size of a photograph's pixel at the trusted observations; the median's."""
-    chosen = torch.isin(scene.observation_point, trusted)
+    chosen = torch.isin(scene.observation_point, reliable)
     view, point = scene.observation_view[chosen], scene.observation_point[chosen]
     frames = scene.cameras.cam_from_world[view]
     depth = (frames[:, 2, :3] * scene.points_world[point]).sum(dim=-1) + frames[:, 2, 3]

@@ -100,10 +100,10 @@ def pair(level: Level, view: int, sources: Int[Tensor, " source"]) -> Pairing:
     height, width = level.tone.shape[-2:]
     frames, intrinsics = cameras.cam_from_world.double(), cameras.intrinsics.double()
     relative = frames[sources] @ torch.linalg.inv(frames[view])
-    turn = intrinsics[sources] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[view])
-    pixels = pixel_centers(width, height, like=turn)
+    rotation = intrinsics[sources] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[view])
+    pixels = pixel_centers(width, height, like=rotation)
     u, v = pixels[0, :, 0], pixels[:, 0, 1]
-    across, down = turn[:, :, :1] * u, turn[:, :, 1:2] * v + turn[:, :, 2:]
+    across, down = rotation[:, :, :1] * u, rotation[:, :, 1:2] * v + rotation[:, :, 2:]
     return Pairing(
         view=view,
         sources=sources,
@@ -118,7 +118,7 @@ class Windows:
 
     Attributes:
         radius: Windows are squares of ``2 radius + 1`` pixels.
-        likeness: Difference of tone to the middle of the window at which a pixel's weight has
+        likeness: Difference of tone to the centre of the window at which a pixel's weight has
             fallen to 0.6: what looks different may well lie at another depth.
         contrast: Standard deviation of the tone in a window below which it says little.
         best: Sources that are believed: the best ones of each pixel.
@@ -258,6 +258,6 @@ def mean_of_largest(
     return total / count
 
 
-def _quantile(values: Float[Tensor, " value"], share: float) -> Float[Tensor, ""]:
-    rank = min(len(values), int(share * len(values)) + 1)
+def _quantile(values: Float[Tensor, " value"], fraction: float) -> Float[Tensor, ""]:
+    rank = min(len(values), int(fraction * len(values)) + 1)
     return values.kthvalue(rank).values

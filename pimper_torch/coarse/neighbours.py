@@ -10,7 +10,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, SparseScene
 
 # Angles between rays that match well: below about 5 degrees depth is poorly told, above
-# about 25 the windows look different. The middle and the widths of a bell round it.
+# about 25 the windows look different. The centre and the widths of a bell round it.
 _BEST_ANGLE_DEG = 12.0
 _BELOW_DEG = 4.0
 _ABOVE_DEG = 12.0

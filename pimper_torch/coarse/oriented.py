@@ -19,13 +19,13 @@ from pimper_torch.records import Record, SparseScene
 # Radius of the windows that planes are fitted in, pixels.
 _RADIUS = 2
 
-# Steps of inverse depth from the middle of a window at which a pixel's weight has fallen to
+# Steps of inverse depth from the centre of a window at which a pixel's weight has fallen to
 # 0.6: more is another surface, or one so steep that views hardly show it.
 _REACH_STEPS = 3.0
 
-# Share of a window that has to lie on the plane: where it is less, the pixel is beside the
+# Fraction of a window that has to lie on the plane: where it is less, the pixel is beside the
 # contour of what is in front, which windows that match make too large.
-_MIN_SHARE = 0.7
+_MIN_FRACTION = 0.7
 
 # How often planes are fitted, again with what lies off the last one left out; what is added to the
 # diagonal of their normal equations.
@@ -111,8 +111,8 @@ def _covered(
 ) -> Bool[Tensor, "height width"]:
     """Mark coarse pixels on or beside which a finer one is valid."""
     height, width = like.shape
-    share = adaptive_avg_pool2d(finer[None, None].float(), (height, width))
-    return max_pool2d(share, 3, 1, 1)[0, 0] > 0
+    fraction = adaptive_avg_pool2d(finer[None, None].float(), (height, width))
+    return max_pool2d(fraction, 3, 1, 1)[0, 0] > 0
 
 
 def _of_view(
@@ -167,8 +167,8 @@ def fitted_planes(
         fits = _compiled_fits(inverse_depth, valid, max(step, 1e-30))
     else:
         fits = _fits(inverse_depth, valid, max(step, 1e-30))
-    offset, across, down, variance, share = fits
-    fine = valid & (share >= _MIN_SHARE) & (offset.abs() < 1)
+    offset, across, down, variance, fraction = fits
+    fine = valid & (fraction >= _MIN_FRACTION) & (offset.abs() < 1)
     # Neighbouring windows overlap, so that their errors are alike: no gain from averaging.
     spread = step * variance.sqrt().clamp_min(0.05)
     return inverse_depth + step * offset, step * torch.stack([across, down], dim=-1), spread, fine
@@ -192,10 +192,10 @@ def _fits(
         fit = torch.linalg.solve(normal, torch.einsum("pk,ki,pk->pi", weight, basis, around))
         residual = around - fit @ basis.T
         weight = counted * torch.exp(-residual.square() / 2)
-    share = weight.sum(dim=-1) / len(basis)
+    fraction = weight.sum(dim=-1) / len(basis)
     variance = (weight * residual.square()).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1e-6)
     results = inverse_depth.new_zeros(5, *inverse_depth.shape)
-    results[:, valid] = torch.stack([*fit.unbind(dim=1), variance, share])
+    results[:, valid] = torch.stack([*fit.unbind(dim=1), variance, fraction])
     return results
 
 
@@ -255,7 +255,7 @@ def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[
 
 
 def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
-    """Average points that share a cell of a grid and face the same way.
+    """Average points that fraction a cell of a grid and face the same way.
 
     Noisy points share larger cells, up to eight times as wide: a surface through them is then
     as smooth as it can be known.
@@ -318,13 +318,13 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
 
     def common(some: Float[Tensor, "some 3"]) -> tuple[Tensor, Tensor]:
         around = torch.from_numpy(tree.query(some.numpy(), count)[1])
-        share = weight[around] / weight[around].sum(dim=1, keepdim=True)
-        mean = (share[..., None] * normals[around]).sum(dim=1)
+        fraction = weight[around] / weight[around].sum(dim=1, keepdim=True)
+        mean = (fraction[..., None] * normals[around]).sum(dim=1)
         alike = (normals[around] * mean[:, None]).sum(dim=-1) > 0
-        share = torch.where(alike, share, 0) / (share * alike).sum(dim=1, keepdim=True)
-        middle = (share[..., None] * places[around]).sum(dim=1, keepdim=True)
-        steps = places[around] - middle
-        width, axes = torch.linalg.eigh((share[..., None] * steps).mT @ steps)
+        fraction = torch.where(alike, fraction, 0) / (fraction * alike).sum(dim=1, keepdim=True)
+        centre = (fraction[..., None] * places[around]).sum(dim=1, keepdim=True)
+        steps = places[around] - centre
+        width, axes = torch.linalg.eigh((fraction[..., None] * steps).mT @ steps)
         across = axes[:, :, 0]
         across = across * (across * mean).sum(dim=-1, keepdim=True).sign()
         flat = width[:, 0] < _FLAT**2 * width[:, 1]

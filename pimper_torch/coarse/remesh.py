@@ -26,17 +26,18 @@ from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.silhouettes.hull import Hull
 from pimper_torch.stage import Stage
 
-# A lattice vertex lies on an edge when its coordinate opposite to it is below this: lattices
-# have far fewer than a million pieces.
+# A subdivided mesh vertex lies on an edge when its coordinate opposite to it is below this:
+# subdivided meshes have far fewer than a million pieces.
 _ON_EDGE = 1e-6
 
-# Share of a facet's lattice vertices that must lie within the distance it is said to depart by.
-_DEPARTURE_SHARE = 0.9
+# Fraction of a facet's subdivided mesh vertices that must lie within the distance it is said to
+# depart by.
+_DEPARTURE_FRACTION = 0.9
 
 # Views that a facet has to show in to stay, without silhouettes, whatever light tells of it.
 _SEEING = 2
 
-# A facet smaller than this share of what it was before its corners moved has collapsed.
+# A facet smaller than this fraction of what it was before its corners moved has collapsed.
 _MIN_AREA = 0.05
 
 # A facet that gets so many times longer has a corner that ran away.
@@ -51,15 +52,15 @@ class RemeshConfig:
     """Which facets are split, and which dropped.
 
     Attributes:
-        max_departure: Distance, in samples, that nine in ten of a facet's lattice vertices may
-            lie off its plane.
+        max_departure: Distance, in samples, that nine in ten of a facet's subdivided mesh vertices
+            may lie off its plane.
         max_spread_deg: Root mean square angle of the surface's normals within a facet.
         min_samples: A facet with fewer across (side of the equilateral triangle of its area) is
             never split.
         max_facets: The worst facets are split first, as long as there are no more than so many
             afterwards.
         max_hole: Facets without data stay when neighbours enclose them and they have no more
-            than this share of the mesh's area together.
+            than this fraction of the mesh's area together.
     """
 
     max_departure: float = 2.0
@@ -150,8 +151,8 @@ def remesh(
     stay on the old mesh.
 
     Args:
-        coarse: The facets that ``surface`` is the lattice of.
-        surface: Lattice vertices on shared edges shared.
+        coarse: The facets that ``surface`` is the subdivided mesh of.
+        surface: Subdivided mesh vertices on shared edges shared.
         spacing: Of the samples that the next templates will have, scene units: the unit of the
             settings.
         config: Settings.
@@ -167,17 +168,17 @@ def remesh(
         mesh without joining them: each part has its own.
 
     Raises:
-        InputError: The surface is not this mesh's lattice.
+        InputError: The surface is not this mesh's subdivided mesh.
 
     A surface without confidence anywhere drops no facet. Vertices and normals are differentiable in
     the surface's and the old mesh's; which facets are split, dropped or moved is constant.
     """
     config = config or RemeshConfig()
-    _require_lattice(coarse, surface)
+    _require_subdivision(coarse, surface)
     old = coarse.mesh.vertices_world
     faces = coarse.mesh.faces
     edges, face_edge = face_edges(faces)
-    corners, middles = _on_surface(old, faces, edges, face_edge, surface)
+    corners, centres = _on_surface(old, faces, edges, face_edge, surface)
     with torch.no_grad():
         kept = _with_data(old, faces, surface, seen, config.max_hole)
         if inside is not None and bool((kept & inside).any()):
@@ -188,7 +189,7 @@ def remesh(
         marked = _worst_first(old, faces, severity, small, kept, config.max_facets)
         split = split_edges(old, faces, marked)
     flat = torch.cat([old, old[edges[split.halved]].mean(dim=1)])
-    onto = torch.cat([corners, middles[split.halved]])
+    onto = torch.cat([corners, centres[split.halved]])
     split_kept = kept[split.parent]
     places = _without_folds(flat, onto, split.faces[split_kept])
     source, new_faces = vertex_fans(split.faces[split_kept])
@@ -199,7 +200,7 @@ def remesh(
     return with_points(coarse, mesh, split, number, source)
 
 
-def _require_lattice(coarse: CoarseMesh, surface: Surface) -> None:
+def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
     count = len(coarse.mesh.faces)
     found = int(surface.facet.max()) + 1 if len(surface.facet) else 0
     if found == 0 or found > count:
@@ -223,7 +224,7 @@ def _on_surface(
     face_edge: Int[Tensor, "face 3"],
     surface: Surface,
 ) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "edge 3"]]:
-    """Find where vertices and middles of edges came to lie, the latter between two cuts."""
+    """Find where vertices and centres of edges came to lie, the latter between two cuts."""
     zeros = surface.barycentric < _ON_EDGE
     count = zeros.sum(dim=1)
     (at,) = torch.nonzero(count == 2, as_tuple=True)
@@ -245,8 +246,8 @@ def _on_surface(
     first, last = below & (along == low[edge]), above & (along == high[edge])
     start[edge[first]], end[edge[last]] = cut[first], cut[last]
     gap = high - low
-    share = torch.where(gap > 0, (0.5 - low) / torch.where(gap > 0, gap, 1), 0)[:, None]
-    return places, (1 - share) * start + share * end
+    fraction = torch.where(gap > 0, (0.5 - low) / torch.where(gap > 0, gap, 1), 0)[:, None]
+    return places, (1 - fraction) * start + fraction * end
 
 
 def _with_data(
@@ -301,21 +302,21 @@ def _severity(
 def departures(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], surface: Surface
 ) -> Float[Tensor, " face"]:
-    """Give the distance from each facet's plane that nine in ten of its lattice vertices keep.
+    """Give the 90th percentile of the vertices' distances from each facet's plane.
 
     Args:
         vertices: The facets' corners, where their planes are to pass.
         faces: The facets.
-        surface: Their lattice.
+        surface: Their subdivided mesh.
     """
     normals = normalize(face_normals(vertices, faces), dim=1)
-    middle = vertices[faces].mean(dim=1)
-    offset = surface.vertices_world.to(vertices) - middle[surface.facet]
+    centre = vertices[faces].mean(dim=1)
+    offset = surface.vertices_world.to(vertices) - centre[surface.facet]
     away = (offset * normals[surface.facet]).sum(dim=1).abs()
     order = away.argsort()
     order = order[surface.facet[order].argsort(stable=True)]
     count = torch.bincount(surface.facet, minlength=len(faces))
-    last = (_DEPARTURE_SHARE * (count - 1).clamp_min(0)).ceil().long()
+    last = (_DEPARTURE_FRACTION * (count - 1).clamp_min(0)).ceil().long()
     place = (count.cumsum(dim=0) - count + last).clamp_max(len(order) - 1)
     return torch.where(count > 0, away[order[place]], 0)
 
@@ -364,8 +365,8 @@ def _worst_first(
     if facets(found) <= max_facets:
         return found
     while most - least > 1:
-        middle = (most + least) // 2
-        least, most = (middle, most) if facets(marks(middle)) <= max_facets else (least, middle)
+        centre = (most + least) // 2
+        least, most = (centre, most) if facets(marks(centre)) <= max_facets else (least, centre)
     return marks(least)
 
 

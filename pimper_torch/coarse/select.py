@@ -103,14 +103,14 @@ def neighbours_agree(
     neighbours along.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
-    for share in (0.9, 0.75, 0.6, 0.5):
+    for fraction in (0.9, 0.75, 0.6, 0.5):
         index = keep.nonzero()[:, 0]
         if len(index) <= neighbours:
             break
         nearest = nearest_in_image(pixels[index], neighbours)
         steep = _steepness(points_cam[index], nearest) > max_slope
         off = _deviation(points_cam[index], nearest) > max_deviation
-        keep[index[(steep.float().mean(dim=1) > share) | off]] = False
+        keep[index[(steep.float().mean(dim=1) > fraction) | off]] = False
     return keep
 
 
@@ -183,9 +183,9 @@ def spread_to_number(
         low, high = high, 2 * high
         chosen = spread(pixels, quality, high)
     for _ in range(20):
-        middle = (low + high) / 2
-        chosen = spread(pixels, quality, middle)
-        low, high = (middle, high) if len(chosen) > number else (low, middle)
+        centre = (low + high) / 2
+        chosen = spread(pixels, quality, centre)
+        low, high = (centre, high) if len(chosen) > number else (low, centre)
     return chosen
 
 

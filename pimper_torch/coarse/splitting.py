@@ -17,7 +17,7 @@ from torch import Tensor
 from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.records import Record
 
-# Barycentric coordinates of a face's corners, and of the middles of the opposite edges.
+# Barycentric coordinates of a face's corners, and of the centres of the opposite edges.
 _NODES = ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0))
 
 _RED = ((0, 5, 4), (5, 1, 3), (4, 3, 2), (3, 4, 5))
@@ -29,7 +29,7 @@ class Split(Record):
 
     Attributes:
         faces: Old vertices keep their numbers; the new ones follow, one for each of ``halved``.
-        halved: The edges in the middle of which they lie.
+        halved: The edges in the centre of which they lie.
         parent: The face that each face is a part of, ascending.
         corners: Barycentric coordinates of each face's corners in its parent, row by row.
     """
@@ -139,10 +139,10 @@ def _cases(
     ]
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
-        middle = 3 + a
+        centre = 3 + a
         one = (count == 1) & marked[:, a]
-        cases.append((one.nonzero()[:, 0], ((a, b, middle), (a, middle, c))))
-        p, q = 3 + c, 3 + b  # the middles of ab and ac, where bc is whole
+        cases.append((one.nonzero()[:, 0], ((a, b, centre), (a, centre, c))))
+        p, q = 3 + c, 3 + b  # the centres of ab and ac, where bc is whole
         two = (count == 2) & ~marked[:, a]
         # The shorter diagonal of the rest is the median to the longer edge: larger angles.
         from_b = (places[:, b] - places[:, q]).norm(dim=1)

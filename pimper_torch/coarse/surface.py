@@ -98,27 +98,27 @@ class CoarseSurface(Stage):
             reference = named_view(scene.views, config.reference)
         else:
             reference = frontal_view(scene)
-        trusted = self.trusted(scene)
+        reliable = self.reliable(scene)
         fine: FineSurface | None = None
         if mesh is not None:
             vertices, faces = checked(mesh, scene.cameras)
-            pixel = pixel_size(scene, trusted) if len(trusted) else float("inf")
+            pixel = pixel_size(scene, reliable) if len(reliable) else float("inf")
         else:
-            trusted = trusted[contours.hull.depth_of(scene.points_world[trusted]) > 0]
-            if len(trusted) < 4 and not contours.confine:
+            reliable = reliable[contours.hull.depth_of(scene.points_world[reliable]) > 0]
+            if len(reliable) < 4 and not contours.confine:
                 raise ReconstructionError(
-                    f"coarse mesh: {len(trusted)} of {len(scene.points_world)} sparse points can "
+                    f"coarse mesh: {len(reliable)} of {len(scene.points_world)} sparse points can "
                     f"be trusted ({_MIN_TRACK} views, {_MAX_ERROR_PX} px, {_MIN_ANGLE_DEG} "
                     "degrees), and at least 4 are needed. Take more photographs."
                 )
-            fine = fine_surface(scene, trusted, contours, self.densify, self.fine)
+            fine = fine_surface(scene, reliable, contours, self.densify, self.fine)
             vertices, faces, pixel = fine.vertices_world, fine.faces, fine.pixel
         if len(faces) > config.num_facets:
             vertices, faces = _few(vertices, faces, config.num_facets)
         if fine is not None:
             faces = two_faces_an_edge(vertices, faces)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
-            pieces = supported_pieces(vertices, faces, whole, self.fine.min_share)
+            pieces = supported_pieces(vertices, faces, whole, self.fine.min_fraction)
             vertices, faces = _used(vertices, faces[pieces])
         normals = smooth_over_mesh(vertex_normals(vertices, faces), faces, _SMOOTHING)
         return CoarseMesh(
@@ -126,35 +126,35 @@ class CoarseSurface(Stage):
             reference=reference,
             is_point=torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device),
             covariance_world=torch.zeros_like(vertices)[:, :, None].expand(-1, 3, 3),
-            points=_on_facets(scene, trusted, vertices, faces, pixel),
+            points=_on_facets(scene, reliable, vertices, faces, pixel),
             support=None if fine is None else fine.support_of(vertices[faces]),
         )
 
-    def trusted(self, scene: SparseScene) -> Int[Tensor, " trusted"]:
+    def reliable(self, scene: SparseScene) -> Int[Tensor, " reliable"]:
         """List the points of the cloud that enough views saw well enough."""
         observed = scene.observed
         angle = triangulation_angles(scene.points_world, observed, scene.cameras.centers_world)
-        trusted = (
+        reliable = (
             (observed.sum(dim=1) >= _MIN_TRACK)
             & (scene.reprojection_errors_px <= _MAX_ERROR_PX)
             & (angle >= torch.deg2rad(angle.new_tensor(_MIN_ANGLE_DEG)))
         )
-        return trusted.nonzero()[:, 0]
+        return reliable.nonzero()[:, 0]
 
 
 def _on_facets(
     scene: SparseScene,
-    trusted: Int[Tensor, " trusted"],
+    reliable: Int[Tensor, " reliable"],
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     pixel: float,
 ) -> FacetPoints:
     """List the points of the cloud that lie near a facet."""
     found = NearestSurface(Mesh(vertices_world=vertices, faces=faces)).query(
-        scene.points_world[trusted]
+        scene.points_world[reliable]
     )
     near = found.distance <= _NEAR_PX * pixel
-    chosen = trusted[near]
+    chosen = reliable[near]
     return FacetPoints(
         points_world=scene.points_world[chosen],
         covariance_world=point_covariances(scene, chosen),
@@ -180,11 +180,11 @@ def two_faces_an_edge(
 def _few(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], count: int
 ) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
-    middle = vertices.median(dim=0).values
+    centre = vertices.median(dim=0).values
     fewer, left = simplified(
-        vertices - middle, faces, num_faces=count, boundary_weight=_BORDER_WEIGHT
+        vertices - centre, faces, num_faces=count, boundary_weight=_BORDER_WEIGHT
     )
-    return _used(fewer.to(vertices) + middle, left.to(faces.device))
+    return _used(fewer.to(vertices) + centre, left.to(faces.device))
 
 
 def _used(

@@ -81,10 +81,10 @@ class TriangulateDetails:
             is dropped.
         min_tip_deg: A facet that alone reaches out to a vertex of the rim, with a smaller
             angle there, is a spike and dropped.
-        min_coverage: Share of a facet at the rim that must show the object.
-        dark_share: Radiance in the reference view, over the median at the mesh's vertices, at
+        min_coverage: Fraction of a facet at the rim that must show the object.
+        dark_fraction: Radiance in the reference view, over the median at the mesh's vertices, at
             or below which a pixel shows background.
-        smoothing_rounds: Of the vertex normals, over the mesh.
+        smoothing_iterations: Of the vertex normals, over the mesh.
     """
 
     facet_edge_px: float = 0.0
@@ -103,8 +103,8 @@ class TriangulateDetails:
     min_altitude: float = 0.08
     min_tip_deg: float = 45.0
     min_coverage: float = 0.6
-    dark_share: float = 0.12
-    smoothing_rounds: int = 1
+    dark_fraction: float = 0.12
+    smoothing_iterations: int = 1
 
 
 class Triangulate(Stage):
@@ -130,7 +130,7 @@ class Triangulate(Stage):
             reference = named_view(scene.views, config.reference)
         else:
             reference = frontal_view(scene)
-        index, quality = self._trusted(scene, reference)
+        index, quality = self._reliable(scene, reference)
         points = scene.points_world[index]
         pixels, _ = _project(points, cameras, reference)
         quality = torch.where(on_hull(pixels), quality + quality.amax(), quality)
@@ -160,14 +160,14 @@ class Triangulate(Stage):
         used, faces = torch.unique(faces, return_inverse=True)
         vertices = vertices[used]
         normals = smooth_over_mesh(
-            vertex_normals(vertices, faces), faces, self.details.smoothing_rounds
+            vertex_normals(vertices, faces), faces, self.details.smoothing_iterations
         )
         mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=normals)
         return with_cloud(scene, index, mesh, reference, source[used])
 
-    def _trusted(
+    def _reliable(
         self, scene: SparseScene, reference: int
-    ) -> tuple[Int[Tensor, " trusted"], Float[Tensor, " trusted"]]:
+    ) -> tuple[Int[Tensor, " reliable"], Float[Tensor, " reliable"]]:
         """List the points that pass every filter, and how good each is."""
         details, cameras, observed = self.details, scene.cameras, scene.observed
         length = observed.sum(dim=1)
@@ -263,7 +263,7 @@ class Triangulate(Stage):
         gray = views.images[reference].mean(dim=0)
         u, v = pixels.long().unbind(dim=1)
         at_vertices = gray[v.clamp(0, gray.shape[0] - 1), u.clamp(0, gray.shape[1] - 1)]
-        shows_object = gray > self.details.dark_share * at_vertices.median()
+        shows_object = gray > self.details.dark_fraction * at_vertices.median()
         if views.masks is not None:
             shows_object = shows_object & views.masks[reference]
         shown = _shown(pixels[faces], shows_object)
@@ -305,12 +305,12 @@ def largest_component(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
 
 
 def smooth_over_mesh(
-    normals: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], rounds: int
+    normals: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], iterations: int
 ) -> Float[Tensor, "vertex 3"]:
     """Average unit normals with those of neighbouring vertices, ``rounds`` times."""
     source = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1)
     target = faces[:, [1, 0, 2, 1, 0, 2]].reshape(-1)
-    for _ in range(rounds):
+    for _ in range(iterations):
         total = torch.zeros_like(normals).index_add(0, target, normals[source])
         normals = normalize(normals + normalize(total, dim=-1), dim=-1)
     return normals
@@ -323,7 +323,7 @@ def _project(
 
 
 def _edge_for(num_points: int, pixels: Float[Tensor, "point 2"]) -> float:
-    """Give the edge of the triangular lattice that puts ``num_points`` on the hull's area."""
+    """Give the edge of the triangular grid that puts ``num_points`` on the hull's area."""
     faces = delaunay(pixels)
     a, b, c = pixels[faces].unbind(dim=1)
     ab, ac = b - a, c - a
@@ -334,7 +334,7 @@ def _edge_for(num_points: int, pixels: Float[Tensor, "point 2"]) -> float:
 def _shown(
     corners_px: Float[Tensor, "face 3 2"], shows_object: Bool[Tensor, "height width"]
 ) -> Float[Tensor, " face"]:
-    """Give the share of each triangle's pixels that show the object."""
+    """Give the fraction of each triangle's pixels that show the object."""
     steps = [(a, b, 9 - a - b) for a in range(10) for b in range(10 - a)]
     weights = corners_px.new_tensor(steps) * (1 - 3 / 27) / 9 + 1 / 27  # a little inside
     height, width = shows_object.shape

@@ -34,7 +34,7 @@ _LIT_TONE = 0.06**0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Evidence(Record):
+class Terms(Record):
     """What the photographs say about faces.
 
     Attributes:
@@ -48,13 +48,13 @@ class Evidence(Record):
     denied: Int[Tensor, " face"]
 
 
-def evidence(
+def terms(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     level: Level,
     maps: DepthMaps | None,
-) -> Evidence:
-    """Ask every view about the middle of every face.
+) -> Terms:
+    """Ask every view about the centre of every face.
 
     Args:
         vertices: Of the surface.
@@ -63,16 +63,16 @@ def evidence(
         maps: What lies behind a face; without, nothing does.
     """
     cameras = level.cameras
-    middle = vertices[faces].mean(dim=1)
+    centre = vertices[faces].mean(dim=1)
     normals = normalize(face_normals(vertices, faces), dim=-1)
     side = side_lengths(vertices[faces]).amax(dim=1)
     caster = RayCaster(vertices, faces)
 
     def said(view: int) -> Int[Tensor, "kind face"]:
         seen, lit, denied = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
-        asked, column, row, depth = _shown(middle, cameras, view)
+        asked, column, row, depth = _shown(centre, cameras, view)
         center = cameras.centers_world[view]
-        towards = normalize(center - middle[asked], dim=-1)
+        towards = normalize(center - centre[asked], dim=-1)
         facing = (towards * normals[asked]).sum(dim=-1) > _FACING
         asked, column, row, depth = asked[facing], column[facing], row[facing], depth[facing]
         column = column.clamp_max(level.tone.shape[-1] - 1)
@@ -80,7 +80,7 @@ def evidence(
         if maps is not None:
             behind = maps.inverse_depth[view, row, column] + _DENIED_STEPS * maps.step[view]
             denied[asked] = (maps.valid[view, row, column] & (1 / depth > behind)).long()
-        open_ = ~caster.occluded(middle[asked], center, 0.5 * side[asked])
+        open_ = ~caster.occluded(centre[asked], center, 0.5 * side[asked])
         open_ &= level.usable[view, row, column]
         seen[asked] = open_.long()
         lit[asked] = (open_ & (level.tone[view, row, column] > _LIT_TONE)).long()
@@ -90,7 +90,7 @@ def evidence(
     for one in side_by_side(said, range(cameras.num_views), tracked=False):
         total += one
     seen, lit, denied = total
-    return Evidence(seen=seen, lit=lit, denied=denied)
+    return Terms(seen=seen, lit=lit, denied=denied)
 
 
 def _shown(
@@ -217,12 +217,12 @@ def supported_pieces(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     supported: Bool[Tensor, " face"],
-    share: float,
+    fraction: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark the faces of components that hold a share of all the area that is supported."""
+    """Mark the faces of components that hold a fraction of all the area that is supported."""
     everything = torch.zeros_like(faces[:, 0])
     own, total = (
         component_areas(vertices, faces, label, supported)
         for label in (face_components(faces), everything)
     )
-    return own >= share * total
+    return own >= fraction * total

@@ -1,1 +1,1 @@
-"""What patches say of the surface, brought together on the lattice of the coarse mesh."""
+"""What patches say of the surface, brought together on the subdivided mesh of the coarse mesh."""

@@ -13,36 +13,36 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.lattice import Lattice
+from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.linalg.systems import prepare
 
-# Weight that a corner is held to zero by, beside 1 for every vertex of the lattice: it decides
-# nothing.
-_HOLD = 1e-3
+# Weight that a corner is held to zero by, beside 1 for every vertex of the subdivided mesh: it
+# decides nothing.
+_DAMPING = 1e-3
 
 
 class CoarsePart:
     """Gives the continuous function linear on every facet that is nearest to values.
 
     Args:
-        lattice: The facets, subdivided.
+        subdivision: The facets, subdivided.
         facets: The coarse mesh's faces.
     """
 
-    def __init__(self, lattice: Lattice, facets: Int[Tensor, "facet 3"]) -> None:
-        self._lattice, self._facets = lattice, facets
+    def __init__(self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> None:
+        self._subdivision, self._facets = subdivision, facets
         self._size = int(facets.max()) + 1
-        share = lattice.barycentric.double()
+        fraction = subdivision.barycentric.double()
         rows, cols, entries = [], [], []
         for one in range(3):
             for other in range(3):
                 rows.append(facets[:, one])
                 cols.append(facets[:, other])
-                product = share[:, one] * share[:, other]
-                sums = product.new_zeros(len(facets)).index_add(0, lattice.facet, product)
+                product = fraction[:, one] * fraction[:, other]
+                sums = product.new_zeros(len(facets)).index_add(0, subdivision.facet, product)
                 entries.append(sums)
         each = torch.arange(self._size, device=facets.device)
-        held = torch.full_like(each, _HOLD, dtype=share.dtype)
+        held = torch.full_like(each, _DAMPING, dtype=fraction.dtype)
         self._normal = prepare(
             torch.cat([each, *rows]),
             torch.cat([each, *cols]),
@@ -52,11 +52,13 @@ class CoarsePart:
         )
 
     def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
-        """Give it at the lattice's vertices, in one column or several. Differentiable."""
+        """Give it at the subdivided mesh's vertices, in one column or several. Differentiable."""
         columns = values.double().reshape(len(values), -1)
         side = columns.new_zeros(self._size, columns.shape[1])
         for corner in range(3):
-            share = self._lattice.barycentric[:, corner, None].double()
-            side = side.index_add(0, self._facets[self._lattice.facet, corner], share * columns)
+            fraction = self._subdivision.barycentric[:, corner, None].double()
+            side = side.index_add(
+                0, self._facets[self._subdivision.facet, corner], fraction * columns
+            )
         at = self._normal.solve(side)
-        return self._lattice.interpolate(at, self._facets).to(values).reshape(values.shape)
+        return self._subdivision.interpolate(at, self._facets).to(values).reshape(values.shape)

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pimper_torch.fusion.evidence import MIN_FACING, Evidence
+from pimper_torch.fusion.terms import MIN_FACING, Terms
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import ContourPoints, FacetPoints, Record
 
@@ -39,8 +39,8 @@ class Ground(Record):
     """The surface that heights are counted from.
 
     Attributes:
-        places: Of the lattice's vertices now.
-        faces: Of the lattice.
+        places: Of the subdivided mesh's vertices now.
+        faces: Of the subdivided mesh.
         heights: Of the vertices now.
         directions: ``d``, unit.
         reach: Places further off are not of this surface.
@@ -90,7 +90,7 @@ def contour_tangents(contours: ContourPoints, ground: Ground) -> Contacts:
     )
 
 
-def passing(contacts: Sequence[Contacts], ground: Ground) -> list[Evidence]:
+def passing(contacts: Sequence[Contacts], ground: Ground) -> list[Terms]:
     """Say that the surface passes through places, kind by kind.
 
     Differentiable; which face is nearest is constant.
@@ -99,16 +99,16 @@ def passing(contacts: Sequence[Contacts], ground: Ground) -> list[Evidence]:
     return [_passing(each, ground, caster) for each in contacts if caster is not None]
 
 
-def _passing(contacts: Contacts, ground: Ground, caster: RayCaster) -> Evidence:
+def _passing(contacts: Contacts, ground: Ground, caster: RayCaster) -> Terms:
     line = contacts.lines
     hits = _above_or_below(caster, ground, contacts.places, line)
     lift = -hits.distance
     met = (hits.face >= 0) & (lift.abs() <= ground.reach)
-    corners, share, line = ground.faces[hits.face[met]], hits.barycentric[met], line[met]
-    vertex = corners.gather(1, share.argmax(dim=1, keepdim=True))
+    corners, fraction, line = ground.faces[hits.face[met]], hits.barycentric[met], line[met]
+    vertex = corners.gather(1, fraction.argmax(dim=1, keepdim=True))
     facing = (ground.directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(MIN_FACING)
     variance = contacts.variance[met]
-    return Evidence(
+    return Terms(
         unknowns=vertex,
         coefficients=torch.ones_like(facing)[:, None],
         targets=ground.heights[vertex[:, 0]] + lift[met] / facing,

@@ -17,8 +17,9 @@ from pimper_torch.geometry.components import vertex_components
 from pimper_torch.geometry.surfaces import boundary_vertices
 from pimper_torch.linalg.systems import solutions
 
-# The mean counts as much as this share of a neighbour at least, so that every vertex has a value.
-_MIN_HOLD = 1e-6
+# The mean counts as much as this fraction of a neighbour at least, so that every vertex has a
+# value.
+_MIN_DAMPING = 1e-6
 
 
 def continued(
@@ -26,7 +27,7 @@ def continued(
     known: Bool[Tensor, " vertex"],
     edges: Int[Tensor, "edge 2"],
     otherwise: Float[Tensor, "vertex channel"],
-    hold: Float[Tensor, " vertex"],
+    damping: Float[Tensor, " vertex"],
 ) -> Float[Tensor, "vertex channel"]:
     """Continue values smoothly from where they are known.
 
@@ -35,7 +36,7 @@ def continued(
         known: Where they are.
         edges: Between neighbours, each once.
         otherwise: What the others are taken for, far from what is known.
-        hold: How many neighbours that counts as, above 0.
+        damping: How many neighbours that counts as, above 0.
 
     Differentiable in the values that are known, and in the others' ``otherwise`` and ``hold``.
 
@@ -53,7 +54,7 @@ def continued(
     both = torch.cat([edges, edges.flip(1)])
     own, beside = both[~known[both[:, 0]]].unbind(dim=1)
     row, fixed = number[own], known[beside]
-    held = hold[unknown].double()
+    held = damping[unknown].double()
     side = held[:, None] * otherwise[unknown].double()
     side = side.index_add(0, row[fixed], values[beside[fixed]].double())
     around = torch.bincount(row, minlength=len(unknown)).to(held)
@@ -84,9 +85,9 @@ def about_mean(
     spread = (given - mean).double().square().sum(dim=1).mean()
     one, other = values.double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
     step = (one - other).square().sum() / max(len(one), 1)
-    hold = torch.where(spread > 0, step / torch.where(spread > 0, spread, 1), 0)
-    hold = hold.clamp_min(_MIN_HOLD).expand(len(values))
-    return continued(values, known, edges, mean.expand_as(values), hold)
+    damping = torch.where(spread > 0, step / torch.where(spread > 0, spread, 1), 0)
+    damping = damping.clamp_min(_MIN_DAMPING).expand(len(values))
+    return continued(values, known, edges, mean.expand_as(values), damping)
 
 
 def enclosed(

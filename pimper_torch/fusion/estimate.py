@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.fusion.terms import Terms
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
@@ -36,7 +36,7 @@ _JUDGES = 500_000
 # vanish, and would make it surer still.
 _MIN_FACTOR = 0.25
 
-# Evidence that seems to be used up whole still has this share left to judge it by.
+# Evidence that seems to be used up whole still has this fraction left to judge it by.
 _MIN_LEFT = 0.05
 
 
@@ -49,28 +49,30 @@ class Fused(Record):
         factors: What the variances that each kind claims were multiplied by.
         kinds: Of evidence.
         weights: Of every equation of each kind; outliers have less than 1.
-        hold: Information that vertices keep their start by.
+        damping: Information that vertices keep their start by.
     """
 
     heights: Float[Tensor, " vertex"]
     factors: tuple[float, ...]
-    kinds: tuple[Evidence, ...]
+    kinds: tuple[Terms, ...]
     weights: tuple[Float[Tensor, " _"], ...]
-    hold: Float[Tensor, " vertex"]
+    damping: Float[Tensor, " vertex"]
 
     def matrix(
         self,
     ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
         """Give rows, columns and values of the matrix that was solved last."""
-        factors = [self.hold.new_tensor(factor).double() for factor in self.factors]
-        return _system(self.kinds, self.weights, factors, torch.zeros_like(self.hold), self.hold)[0]
+        factors = [self.damping.new_tensor(factor).double() for factor in self.factors]
+        return _system(
+            self.kinds, self.weights, factors, torch.zeros_like(self.damping), self.damping
+        )[0]
 
 
-def fuse_evidence(
-    kinds: Sequence[Evidence],
+def fuse_terms(
+    kinds: Sequence[Terms],
     start: Float[Tensor, " vertex"],
-    hold: Float[Tensor, " vertex"],
-    rounds: int,
+    damping: Float[Tensor, " vertex"],
+    iterations: int,
     near: Float[Tensor, " vertex"] | None = None,
 ) -> Fused:
     """Solve, judge the noise, and solve again.
@@ -78,8 +80,8 @@ def fuse_evidence(
     Args:
         kinds: Of evidence; those without equations are passed over.
         start: Heights that vertices keep where nothing is known.
-        hold: Information that they keep them by.
-        rounds: Of solves.
+        damping: Information that they keep them by.
+        iterations: Of solves.
         near: Heights that iterations may begin at; they do not change the answer.
 
     Differentiable in targets, coefficients, information, hold and start, through the weights and
@@ -95,9 +97,9 @@ def fuse_evidence(
     probe = 2.0 * torch.randint(0, 2, (len(start),), generator=generator) - 1
     probe = probe.double().to(start.device)
     heights = near
-    for _ in range(rounds - 1):
+    for _ in range(iterations - 1):
         heights, answer = _solved(
-            kinds, weights, found, start, hold, probe, guess=heights, tolerance=_JUDGING
+            kinds, weights, found, start, damping, probe, guess=heights, tolerance=_JUDGING
         )
         for place, kind in enumerate(kinds):
             if not kind.judged or len(kind.targets) == 0:
@@ -107,36 +109,36 @@ def fuse_evidence(
             square = square / left.clamp_min(_MIN_LEFT)
             found[place] = noise_factor(square[:: max(1, len(square) // _JUDGES)])
             weights[place] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[place]))
-    (heights,) = _solved(kinds, weights, found, start, hold, guess=heights, tolerance=_ACCURATE)
+    (heights,) = _solved(kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE)
     return Fused(
         heights=heights,
         factors=tuple(float(factor.detach()) for factor in found),
         kinds=tuple(kinds),
         weights=tuple(weight.detach() for weight in weights),
-        hold=hold.detach(),
+        damping=damping.detach(),
     )
 
 
 def _solved(
-    kinds: Sequence[Evidence],
+    kinds: Sequence[Terms],
     weights: Sequence[Float[Tensor, " _"]],
     factors: Sequence[Float[Tensor, ""]],
     start: Float[Tensor, " vertex"],
-    hold: Float[Tensor, " vertex"],
+    damping: Float[Tensor, " vertex"],
     *more: Float[Tensor, " vertex"],
     guess: Float[Tensor, " vertex"] | None,
     tolerance: float,
 ) -> tuple[Float[Tensor, " vertex"], ...]:
     """Solve for the heights, and for more right-hand sides of the same matrix."""
     parts = [part for kind in kinds for part in (kind.coefficients, kind.targets, kind.information)]
-    if not compiled_for(start, hold, *parts, *weights, *factors):
-        entries, rhs = _system(kinds, weights, factors, start, hold)
+    if not compiled_for(start, damping, *parts, *weights, *factors):
+        entries, rhs = _system(kinds, weights, factors, start, damping)
         return solutions(*entries, rhs, *more, what="the fusion", tolerance=_EXACT)
     terms = [
         (kind.unknowns, kind.coefficients, kind.targets, weight * kind.information / factor)
         for kind, weight, factor in zip(kinds, weights, factors, strict=True)
     ]
-    matrix, rhs = compressed_equations(terms, hold, start)
+    matrix, rhs = compressed_equations(terms, damping, start)
     near = None
     if guess is not None:
         near = torch.stack([guess, *(torch.zeros_like(guess) for _ in more)], dim=1)
@@ -146,7 +148,7 @@ def _solved(
 
 
 def _judged(
-    kind: Evidence,
+    kind: Terms,
     weight: Float[Tensor, " equation"],
     heights: Float[Tensor, " vertex"],
     probe: Float[Tensor, " vertex"],
@@ -180,7 +182,7 @@ def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
     """Tell the variance of Gaussian noise from its squares, outliers apart. Differentiable.
 
     Args:
-        square: Of residuals, in units of the variance that is claimed, over the share of the
+        square: Of residuals, in units of the variance that is claimed, over the fraction of the
             equations that the solution leaves over.
 
     >>> noise = torch.randn(10000, generator=torch.Generator().manual_seed(1))
@@ -191,24 +193,24 @@ def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
     return robust_variance(square, everything).clamp_min(_MIN_FACTOR)
 
 
-def _sum(kind: Evidence, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
+def _sum(kind: Terms, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
     return (kind.coefficients * values[kind.unknowns]).sum(dim=1)
 
 
 def _system(
-    kinds: Sequence[Evidence],
+    kinds: Sequence[Terms],
     weights: Sequence[Float[Tensor, " _"]],
     factors: Sequence[Float[Tensor, ""]],
     start: Float[Tensor, " vertex"],
-    hold: Float[Tensor, " vertex"],
+    damping: Float[Tensor, " vertex"],
 ) -> tuple[
     tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]],
     Float[Tensor, " vertex"],
 ]:
     """Give rows, columns and values of the matrix, and the right-hand side."""
     everything = torch.arange(len(start), device=start.device)
-    rows, cols, values = [everything], [everything], [hold.double()]
-    rhs = hold.double() * start.double()
+    rows, cols, values = [everything], [everything], [damping.double()]
+    rhs = damping.double() * start.double()
     for kind, weight, factor in zip(kinds, weights, factors, strict=True):
         row, col, value, right = normal_equations(
             kind.unknowns,

@@ -24,8 +24,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.estimate import Fused
-from pimper_torch.fusion.evidence import Evidence
-from pimper_torch.geometry.lattice import Lattice
+from pimper_torch.fusion.terms import Terms
+from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.linalg.systems import prepare
 
@@ -44,7 +44,7 @@ _ACCURACY = 1e-2
 
 @torch.no_grad()
 def expected_error(
-    fine: Fused, coarse: Fused, lattice: Lattice, facets: Int[Tensor, "facet 3"], draws: int
+    fine: Fused, coarse: Fused, subdivision: Subdivision, facets: Int[Tensor, "facet 3"], draws: int
 ) -> Float[Tensor, " vertex"]:
     """Give the standard error of every height of the fused surface.
 
@@ -52,7 +52,7 @@ def expected_error(
         fine: The solve that detail is from.
         coarse: The solve that the coarse shape is from, with what neighbours err by together;
             the same record where there was only one solve.
-        lattice: The facets, subdivided.
+        subdivision: The facets, subdivided.
         facets: The coarse mesh's faces.
         draws: Of noise. The result is off by one over the square root of twice as many.
 
@@ -63,22 +63,22 @@ def expected_error(
         SingularSystemError: See :func:`~pimper_torch.linalg.systems.prepare`.
     """
     generator = torch.Generator().manual_seed(0)  # of noise: any will do
-    region = regions(lattice)
+    region = regions(subdivision)
     noises, held = [], []
     for _ in range(draws):
         noises.append(
             [
-                _noise(kind, weight, factor, lattice, region, generator)
+                _noise(kind, weight, factor, subdivision, region, generator)
                 for kind, weight, factor in zip(
                     coarse.kinds, coarse.weights, coarse.factors, strict=True
                 )
             ]
         )
-        held.append(_normal(generator, coarse.hold) / coarse.hold.double().sqrt())
+        held.append(_normal(generator, coarse.damping) / coarse.damping.double().sqrt())
     off = _answers(coarse, noises, held)
     if fine is not coarse:
         detail = _answers(fine, noises, held)
-        off = detail + CoarsePart(lattice, facets)(off - detail)
+        off = detail + CoarsePart(subdivision, facets)(off - detail)
     return off.square().mean(dim=1).sqrt()
 
 
@@ -95,37 +95,37 @@ def _answers(
     return system.solve(torch.stack(sides, dim=1))
 
 
-def regions(lattice: Lattice) -> Int[Tensor, " facet"]:
-    """Group the facets whose middles lie in one cell of a grid, a few facets wide."""
+def regions(subdivision: Subdivision) -> Int[Tensor, " facet"]:
+    """Group the facets whose centres lie in one cell of a grid, a few facets wide."""
     # A facet whose vertices all lie on its edges may be named by its faces alone.
-    num_facets = int(lattice.face_facet.max()) + 1
-    count = torch.bincount(lattice.facet, minlength=num_facets).clamp_min(1)[:, None]
-    points = lattice.points.double()
-    middle = points.new_zeros(num_facets, 3).index_add(0, lattice.facet, points) / count
-    areas = face_normals(points, lattice.faces).norm(dim=1) / 2
-    area = areas.new_zeros(num_facets).index_add(0, lattice.face_facet, areas)
+    num_facets = int(subdivision.face_facet.max()) + 1
+    count = torch.bincount(subdivision.facet, minlength=num_facets).clamp_min(1)[:, None]
+    points = subdivision.points.double()
+    centre = points.new_zeros(num_facets, 3).index_add(0, subdivision.facet, points) / count
+    areas = face_normals(points, subdivision.faces).norm(dim=1) / 2
+    area = areas.new_zeros(num_facets).index_add(0, subdivision.face_facet, areas)
     edge = (4 / math.sqrt(3) * area[area > 0].median()).sqrt()  # of an equilateral facet
-    _, label = torch.unique((middle / (_ALIKE * edge)).floor(), dim=0, return_inverse=True)
+    _, label = torch.unique((centre / (_ALIKE * edge)).floor(), dim=0, return_inverse=True)
     return label
 
 
 def _noise(
-    kind: Evidence,
+    kind: Terms,
     weight: Float[Tensor, " equation"],
     factor: float,
-    lattice: Lattice,
+    subdivision: Subdivision,
     region: Int[Tensor, " facet"],
     generator: torch.Generator,
 ) -> Float[Tensor, " equation"]:
     """Draw errors of targets: of each by itself, and of all in a region together.
 
-    The share of the variance that is drawn together makes a facet's sum vary as the information
+    The fraction of the variance that is drawn together makes a facet's sum vary as the information
     of its equations says. Edges of a region share a tilt, so that what they err by together
     depends on where they point.
     """
     claimed = 1 / (weight * kind.information.double() * kind.correlated.double())
     each = claimed * (max(factor, 1.0) if kind.judged else _UNMEASURED**2)
-    facet = lattice.facet[kind.unknowns[:, 0]]
+    facet = subdivision.facet[kind.unknowns[:, 0]]
     count = torch.bincount(facet, minlength=1)[facet].to(each)
     together = torch.ones_like(each)
     if kind.judged:
@@ -133,7 +133,7 @@ def _noise(
     num_regions = int(region.max()) + 1
     if kind.unknowns.shape[1] == 2:
         one, other = kind.unknowns.unbind(dim=1)
-        along = normalize((lattice.points[other] - lattice.points[one]).double(), dim=-1)
+        along = normalize((subdivision.points[other] - subdivision.points[one]).double(), dim=-1)
         tilt = _normal(generator, each.new_empty(num_regions, 3))
         shared = (tilt[region[facet]] * along).sum(dim=-1)
     else:
@@ -146,7 +146,7 @@ def _answerable(
     fused: Fused, noise: list[Float[Tensor, " _"]], held: Float[Tensor, " vertex"]
 ) -> Float[Tensor, " vertex"]:
     """Give the right-hand side that errors of the targets make."""
-    rhs = fused.hold.double() * held
+    rhs = fused.damping.double() * held
     for kind, weight, factor, off in zip(
         fused.kinds, fused.weights, fused.factors, noise, strict=True
     ):

@@ -10,13 +10,21 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.fusion.bands import CoarsePart
+from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.fusion.contacts import Contacts, Ground, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.continuation import about_mean, continued, enclosed
-from pimper_torch.fusion.drift import MEDIAN_OF_TILT, Drift, alike, common_variance, drift
-from pimper_torch.fusion.estimate import Fused, fuse_evidence
-from pimper_torch.fusion.evidence import (
+from pimper_torch.fusion.estimate import Fused, fuse_terms
+from pimper_torch.fusion.expected_error import expected_error
+from pimper_torch.fusion.normal_bias import (
+    MEDIAN_OF_TILT,
+    NormalBias,
+    alike,
+    common_variance,
+    normal_bias,
+)
+from pimper_torch.fusion.terms import (
     Common,
-    Evidence,
+    Terms,
     kept_slopes,
     kept_steps,
     slopes,
@@ -24,9 +32,7 @@ from pimper_torch.fusion.evidence import (
     upright,
     upright_heights,
 )
-from pimper_torch.fusion.expected_error import expected_error
-from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
-from pimper_torch.geometry.lattice import Lattice, subdivide, transferred
+from pimper_torch.geometry.subdivision import Subdivision, subdivide, transferred
 from pimper_torch.geometry.surfaces import face_edges, vertex_normals
 from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.records import (
@@ -43,13 +49,13 @@ from pimper_torch.stage import Stage
 
 # Information that every vertex holds to where it is by, in units of one over its spacing
 # squared: as if it were known to 100 spacings. It decides where nothing else does.
-_HOLD = 1e-4
+_DAMPING = 1e-4
 
 # Points of the cloud further off the surface than this, in its spacings, are not of it.
 _REACH = 20.0
 
-# What the evidence errs by is learnt on a lattice so many times as coarse. The noise factors of the
-# demo's last round are found within 15 % on one four times as coarse, too.
+# What the evidence errs by is learnt on a subdivided mesh so many times as coarse. The noise
+# factors of the demo's last round are found within 15 % on one four times as coarse, too.
 _COARSER = 2.0
 
 # A turn from vertex to vertex that is larger, in radians, is a fold's.
@@ -57,9 +63,9 @@ _FOLD = 0.25
 
 # Squared turn from vertex to vertex that even flat facets are said to have, radians; and the
 # least variance of the slopes that a surface has already.
-_MIN_TURN, _MIN_DOUBT = 1e-8, 1e-6
+_MIN_ROTATION, _MIN_DOUBT = 1e-8, 1e-6
 
-# Between its vertices the surface is flat: points tell no more than this share of a spacing.
+# Between its vertices the surface is flat: points tell no more than this fraction of a spacing.
 _FINEST = 0.03
 
 
@@ -78,12 +84,12 @@ class FuseConfig:
         heights: Whether swept heights do.
         points: Whether the cloud's points do.
         contours: Whether the rays through the silhouettes do.
-        drift_rounds: How often the tilt that all normals of a facet share, and the height that
+        bias_iterations: How often the tilt that all normals of a facet share, and the height that
             all swept heights of a facet are off by, are estimated, and the tilt taken out; 0
             trusts both at all wavelengths.
-        noise_rounds: Solves in which the noise of each kind of evidence is estimated and
+        noise_iterations: Solves in which the noise of each kind of evidence is estimated and
             outliers lose weight: for each estimate of the tilt and twice after them on a coarser
-            lattice, and twice at full size.
+            subdivided mesh, and twice at full size.
         error_draws: Of noise, for the expected error of every vertex; the more, the less it is
             off by chance: 8 by a quarter. 0 gives none.
     """
@@ -93,40 +99,44 @@ class FuseConfig:
     heights: bool = True
     points: bool = True
     contours: bool = True
-    drift_rounds: int = 2
-    noise_rounds: int = 3
+    bias_iterations: int = 2
+    noise_iterations: int = 3
     error_draws: int = 8
 
     def __post_init__(self) -> None:
         each = self.samples_per_vertex
         require(each > 0, "fuse.samples_per_vertex", each, "above 0")
-        require(self.drift_rounds >= 0, "fuse.drift_rounds", self.drift_rounds, "0 or more")
+        require(
+            self.bias_iterations >= 0, "fuse.bias_iterations", self.bias_iterations, "0 or more"
+        )
         require(self.error_draws >= 0, "fuse.error_draws", self.error_draws, "0 or more")
-        require(self.noise_rounds >= 1, "fuse.noise_rounds", self.noise_rounds, "1 or more")
+        require(
+            self.noise_iterations >= 1, "fuse.noise_iterations", self.noise_iterations, "1 or more"
+        )
         some = self.slopes or self.heights or self.points or self.contours
         require(some, "fuse.slopes", self.slopes, "true unless heights or points are")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Task(Record):
-    """The lattice, and what the patches together say at its vertices.
+    """The subdivided mesh, and what the patches together say at its vertices.
 
     Attributes:
-        lattice: The facets, subdivided.
+        subdivision: The facets, subdivided.
         facets: The coarse mesh's faces.
         directions: Along which heights count.
-        union: What the patches say.
+        blend: What the patches say.
         places: Of the vertices on what the templates carry.
         shape: The normals of that.
-        edges: Of the lattice.
+        edges: Of the subdivided mesh.
         spacing: Of its vertices, scene units.
         correlated: Vertices in a window of the sweep.
     """
 
-    lattice: Lattice
+    subdivision: Subdivision
     facets: Int[Tensor, "facet 3"]
     directions: Float[Tensor, "vertex 3"]
-    union: Union
+    blend: Blend
     places: Float[Tensor, "vertex 3"]
     shape: Float[Tensor, "vertex 3"]
     edges: Int[Tensor, "edge 2"]
@@ -136,7 +146,7 @@ class _Task(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Learnt(Record):
-    """What a coarser lattice tells about the evidence.
+    """What a coarser subdivided mesh tells about the evidence.
 
     Attributes:
         tilt: That the normals of each facet share; ``None`` if nothing tells.
@@ -146,7 +156,7 @@ class _Learnt(Record):
         coarse: The solve that knows what they err by together.
     """
 
-    tilt: Drift | None
+    tilt: NormalBias | None
     left: Float[Tensor, ""]
     height: Float[Tensor, ""] | None
     fine: Fused
@@ -154,10 +164,10 @@ class _Learnt(Record):
 
 
 class Fuse(Stage):
-    """Solve for the surface that all evidence suits best, over the whole connected lattice.
+    """Solve for the surface that all evidence suits best, over the whole connected subdivided mesh.
 
-    Unknown is the height of every lattice vertex along the coarse mesh's smoothed normal.
-    Evidence is linear in it: edges are at right angles to photometric normals, the sweep knows
+    Unknown is the height of every subdivided mesh vertex along the coarse mesh's smoothed normal.
+    Terms is linear in it: edges are at right angles to photometric normals, the sweep knows
     heights, the cloud's points lie on the surface, rays through the silhouettes touch it, and where
     no light tells anything the surface keeps the slopes it has, or continues those of lit ground
     that encloses it (:mod:`~pimper_torch.fusion.continuation`). Across contours and folds, as seen
@@ -167,7 +177,7 @@ class Fuse(Stage):
     alike, as they were found under one light: the tilt they share is estimated from the positions
     and taken out. So do swept heights: what they are off by together is estimated from the other
     kinds, and they count for no more than that lets them know
-    (:mod:`~pimper_torch.fusion.drift`). Detail is that of normals trusted singly, the coarse shape
+    (:mod:`~pimper_torch.fusion.normal_bias`). Detail is that of single normals, the coarse shape
     that of normals known to err alike (:mod:`~pimper_torch.fusion.bands`).
 
     The surface's normals are its own; its albedo is continued over what no light tells,
@@ -199,22 +209,22 @@ class Fuse(Stage):
         learnt = self._learnt(rough, contacts)
         task = self._task(swept, self.config.samples_per_vertex)
         solved, solves = self._solved(task, contacts, learnt)
-        lattice, directions, union = task.lattice, task.directions, task.union
-        heights = solved.to(union.heights)
-        vertices = lattice.points + heights[:, None] * directions
-        normals = vertex_normals(vertices, lattice.faces)
+        subdivision, directions, blend = task.subdivision, task.directions, task.blend
+        heights = solved.to(blend.heights)
+        vertices = subdivision.points + heights[:, None] * directions
+        normals = vertex_normals(vertices, subdivision.faces)
         error = None
         if expected and self.config.error_draws > 0:
             error = self._expected_error(rough, learnt, task, normals)
-        moved = (heights - union.heights).detach()
+        moved = (heights - blend.heights).detach()
         return Surface(
             vertices_world=vertices,
-            faces=lattice.faces,
-            facet=lattice.facet,
-            barycentric=lattice.barycentric,
+            faces=subdivision.faces,
+            facet=subdivision.facet,
+            barycentric=subdivision.barycentric,
             normals_world=normals,
-            albedo=about_mean(union.albedo, union.seen, task.edges),
-            confidence=union.confidence,
+            albedo=about_mean(blend.albedo, blend.seen, task.edges),
+            confidence=blend.confidence,
             expected_error=error,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=moved.device),
@@ -224,24 +234,30 @@ class Fuse(Stage):
         )
 
     def _task(self, swept: SweptPatches, samples_per_vertex: float) -> _Task:
-        """Lay a lattice over the facets, and read the patches there."""
+        """Lay a subdivided mesh over the facets, and read the patches there."""
         patches = swept.patches
         facets = patches.coarse.mesh.faces
         spacing = vertex_spacing(patches, samples_per_vertex)
-        lattice = subdivide(patches.coarse.mesh.vertices_world, facets, spacing)
-        directions = ray_directions(lattice, patches.coarse)
-        union = unite(carried_reliefs(swept), lattice, directions, _OUTLIER_SAMPLES, swept.buckets)
+        subdivision = subdivide(patches.coarse.mesh.vertices_world, facets, spacing)
+        directions = ray_directions(subdivision, patches.coarse)
+        blend = blend_patches(
+            transferred_height_fields(swept),
+            subdivision,
+            directions,
+            _OUTLIER_SAMPLES,
+            swept.buckets,
+        )
         # A vertex stands for so many samples, each of which has its own share.
         density = samples_per_vertex**2
-        places = lattice.points + union.heights[:, None] * directions
+        places = subdivision.points + blend.heights[:, None] * directions
         return _Task(
-            lattice=lattice,
+            subdivision=subdivision,
             facets=facets,
             directions=directions,
-            union=union.replace(information=density * union.information),
+            blend=blend.replace(information=density * blend.information),
             places=places,
-            shape=vertex_normals(places, lattice.faces),
-            edges=face_edges(lattice.faces)[0],
+            shape=vertex_normals(places, subdivision.faces),
+            edges=face_edges(subdivision.faces)[0],
             spacing=spacing.median(),
             correlated=max(1.0, swept.averaged / density),
         )
@@ -251,21 +267,21 @@ class Fuse(Stage):
     ) -> Float[Tensor, " vertex"]:
         """Give the expected error across the surface; heights count along directions."""
         along = expected_error(
-            learnt.fine, learnt.coarse, rough.lattice, rough.facets, self.config.error_draws
+            learnt.fine, learnt.coarse, rough.subdivision, rough.facets, self.config.error_draws
         )
-        along = transferred(along, rough.lattice, task.lattice).to(normals)
+        along = transferred(along, rough.subdivision, task.subdivision).to(normals)
         facing = (normals.detach() * task.directions.detach()).sum(dim=-1).abs()
         return torch.hypot(along * facing, _FINEST * task.spacing.detach())
 
-    def _heights(self, task: _Task, common: Float[Tensor, ""] | None) -> list[Evidence]:
+    def _heights(self, task: _Task, common: Float[Tensor, ""] | None) -> list[Terms]:
         """List what the sweep knows, given the variance of what a facet's heights share."""
         if not self.config.heights:
             return []
-        union = task.union
+        blend = task.blend
         facing = (task.shape * task.directions).sum(dim=-1)
-        told = union.heights, union.offsets, union.information, facing
-        upright = upright_heights(union.information, facing)
-        shared = None if common is None else alike(common, task.lattice.facet, upright)
+        told = blend.heights, blend.offsets, blend.information, facing
+        upright = upright_heights(blend.information, facing)
+        shared = None if common is None else alike(common, task.subdivision.facet, upright)
         return [swept_heights(*told, task.correlated, shared)]
 
     def _contacts(self, task: _Task, swept: SweptPatches, contours: Contours) -> list[Contacts]:
@@ -281,7 +297,7 @@ class Fuse(Stage):
 
     def _learnt(self, task: _Task, contacts: list[Contacts]) -> _Learnt:
         """Estimate the noise of each kind of evidence, and what facets err by together."""
-        config, lattice, union = self.config, task.lattice, task.union
+        config, subdivision, blend = self.config, task.subdivision, task.blend
         points = passing(contacts, _ground(task))
         heights = self._heights(task, None)
         known, lit = self._known(task)
@@ -289,55 +305,57 @@ class Fuse(Stage):
 
         def solve(
             normals: Float[Tensor, "vertex 3"],
-            positions: list[Evidence],
+            positions: list[Terms],
             common: Common | None = None,
         ) -> Fused:
             kinds = [*unlit, *positions, self._slopes(task, lit, normals, common)]
-            return fuse_evidence(kinds, union.heights, _hold(task), config.noise_rounds)
+            return fuse_terms(kinds, blend.heights, _damping(task), config.noise_iterations)
 
-        normals, shape, height = union.normals_world, task.shape, None
-        if config.drift_rounds == 0 or not bool(lit.any()) or not (heights or points):
+        normals, shape, height = blend.normals_world, task.shape, None
+        if config.bias_iterations == 0 or not bool(lit.any()) or not (heights or points):
             only = solve(normals, [*points, *heights])
-            nothing = only.hold.new_zeros(())
+            nothing = only.damping.new_zeros(())
             return _Learnt(tilt=None, left=nothing, height=None, fine=only, coarse=only)
         # Heights are judged by the others first, which they would draw along.
         positions = points or heights
-        for _ in range(config.drift_rounds):
-            apart = drift(lattice, task.facets, normals, shape, known)
-            fused = solve(normals, positions, alike(apart.variance(), lattice.facet, known))
+        for _ in range(config.bias_iterations):
+            apart = normal_bias(subdivision, task.facets, normals, shape, known)
+            fused = solve(normals, positions, alike(apart.variance(), subdivision.facet, known))
             moved = fused.heights.to(task.places)
-            shape = vertex_normals(lattice.points + moved[:, None] * task.directions, lattice.faces)
+            shape = vertex_normals(
+                subdivision.points + moved[:, None] * task.directions, subdivision.faces
+            )
             if points and heights:
-                held = lattice.facet[torch.cat([kind.unknowns[:, 0] for kind in points])]
-                height = common_variance(heights[0], fused.heights, lattice.facet, held)
+                held = subdivision.facet[torch.cat([kind.unknowns[:, 0] for kind in points])]
+                height = common_variance(heights[0], fused.heights, subdivision.facet, held)
                 positions = [*points, *self._heights(task, height)]
-        tilt = drift(lattice, task.facets, normals, shape, known)
-        normals = normalize(normals + tilt.at(lattice, task.facets), dim=-1)
-        left = drift(lattice, task.facets, normals, shape, known).variance()
+        tilt = normal_bias(subdivision, task.facets, normals, shape, known)
+        normals = normalize(normals + tilt.at(subdivision, task.facets), dim=-1)
+        left = normal_bias(subdivision, task.facets, normals, shape, known).variance()
         return _Learnt(
             tilt=tilt,
             left=left,
             height=height,
             fine=solve(normals, positions),
-            coarse=solve(normals, positions, alike(left, lattice.facet, known)),
+            coarse=solve(normals, positions, alike(left, subdivision.facet, known)),
         )
 
     def _solved(
         self, task: _Task, contacts: list[Contacts], learnt: _Learnt
     ) -> tuple[Float[Tensor, " vertex"], int]:
-        """Solve at full size, given what the coarser lattice tells; and count the solves.
+        """Solve at full size, given what the coarser subdivided mesh tells; and count the solves.
 
-        Noise is judged anew: what the coarser lattice finds noisier than claimed may be its own
-        coarseness.
+        Noise is judged anew: what the coarser subdivided mesh finds noisier than claimed may be its
+        own coarseness.
         """
-        lattice, union = task.lattice, task.union
+        subdivision, blend = task.subdivision, task.blend
         known, lit = self._known(task)
         kinds = [
             *self._unlit(task, known, lit),
             *passing(contacts, _ground(task)),
             *self._heights(task, learnt.height),
         ]
-        rounds = self.config.noise_rounds
+        iterations = self.config.noise_iterations
 
         def solve(
             normals: Float[Tensor, "vertex 3"],
@@ -345,24 +363,24 @@ class Fuse(Stage):
             near: Float[Tensor, " vertex"] | None = None,
         ) -> Float[Tensor, " vertex"]:
             told = [*kinds, self._slopes(task, lit, normals, common)]
-            return fuse_evidence(told, union.heights, _hold(task), rounds, near).heights
+            return fuse_terms(told, blend.heights, _damping(task), iterations, near).heights
 
         if learnt.tilt is None:
-            return solve(union.normals_world), rounds
-        tilt = learnt.tilt.at(lattice, task.facets)
-        normals = normalize(union.normals_world + tilt, dim=-1)
+            return solve(blend.normals_world), iterations
+        tilt = learnt.tilt.at(subdivision, task.facets)
+        normals = normalize(blend.normals_world + tilt, dim=-1)
         fine = solve(normals)
-        coarse = solve(normals, alike(learnt.left, lattice.facet, known), near=fine)
-        return fine + CoarsePart(lattice, task.facets)(coarse - fine), 2 * rounds
+        coarse = solve(normals, alike(learnt.left, subdivision.facet, known), near=fine)
+        return fine + CoarsePart(subdivision, task.facets)(coarse - fine), 2 * iterations
 
     def _known(self, task: _Task) -> tuple[Bool[Tensor, " vertex"], Bool[Tensor, " edge"]]:
         """Mark vertices that light tells normals of, and the edges between such."""
-        union = task.union
-        known = union.seen & (union.confidence > 0)
+        blend = task.blend
+        known = blend.seen & (blend.confidence > 0)
         if not self.config.slopes:
             known = torch.zeros_like(known)
         lit = known[task.edges].all(dim=1)
-        return known, lit & upright(task.edges, task.directions, union.normals_world)
+        return known, lit & upright(task.edges, task.directions, blend.normals_world)
 
     def _slopes(
         self,
@@ -370,29 +388,31 @@ class Fuse(Stage):
         lit: Bool[Tensor, " edge"],
         normals: Float[Tensor, "vertex 3"],
         common: Common | None = None,
-    ) -> Evidence:
+    ) -> Terms:
         """Give what the normals say, singly or knowing what they err by together."""
-        variance = _variance(task.union.confidence)
+        variance = _variance(task.blend.confidence)
         edges = task.edges[lit]
-        return slopes(edges, task.lattice.points, task.directions, normals, variance, common)
+        return slopes(edges, task.subdivision.points, task.directions, normals, variance, common)
 
     def _unlit(
         self, task: _Task, known: Bool[Tensor, " vertex"], lit: Bool[Tensor, " edge"]
-    ) -> list[Evidence]:
+    ) -> list[Terms]:
         """List the slopes where light tells nothing; no residual tells their variances.
 
         Where lit ground encloses it, its normals are continued: the shape there is what the
         facets started with, since no round knew it. Elsewhere the shape is kept. Continued normals
         of a facet are off alike: together they tell as much as one of them.
         """
-        flat, along, edges = task.lattice.points, task.directions, task.edges
-        carried, doubt = task.union.heights, self._doubt(task, known)
-        alike = doubt * torch.bincount(task.lattice.facet)[task.lattice.facet].to(task.shape)
-        island = enclosed(known, task.lattice.faces)
-        normals = task.union.normals_world
+        flat, along, edges = task.subdivision.points, task.directions, task.edges
+        transferred, doubt = task.blend.heights, self._doubt(task, known)
+        alike = doubt * torch.bincount(task.subdivision.facet)[task.subdivision.facet].to(
+            task.shape
+        )
+        island = enclosed(known, task.subdivision.faces)
+        normals = task.blend.normals_world
         if bool(island.any()):
-            hold = _turn(task.shape, edges[lit]) / alike
-            normals = normalize(continued(normals, ~island, edges, task.shape, hold), dim=-1)
+            damping = _rotation(task.shape, edges[lit]) / alike
+            normals = normalize(continued(normals, ~island, edges, task.shape, damping), dim=-1)
         over = island[edges].any(dim=1) & upright(edges, along, normals)
         stays = ~lit & ~over
         sloped = stays & upright(edges, along, task.shape)
@@ -400,15 +420,15 @@ class Fuse(Stage):
             slopes(edges[over], flat, along, normals, alike).replace(
                 correlated=(alike / doubt)[edges[over]].mean(dim=1), judged=False
             ),
-            kept_slopes(edges[sloped], flat, along, task.shape, carried, doubt),
-            kept_steps(edges[stays & ~sloped], flat, carried, doubt),
+            kept_slopes(edges[sloped], flat, along, task.shape, transferred, doubt),
+            kept_steps(edges[stays & ~sloped], flat, transferred, doubt),
         ]
 
     def _doubt(self, task: _Task, known: Bool[Tensor, " vertex"]) -> Float[Tensor, ""]:
         """Estimate the variance of the slopes that the surface has already, from the others."""
         if not bool(known.any()):
             return task.shape.new_tensor(math.radians(HALF_CONFIDENCE_DEG) ** 2)
-        apart = (task.union.normals_world - task.shape)[known].square().sum(dim=-1)
+        apart = (task.blend.normals_world - task.shape)[known].square().sum(dim=-1)
         return (apart.median() / MEDIAN_OF_TILT).clamp_min(_MIN_DOUBT)
 
 
@@ -416,20 +436,20 @@ def _ground(task: _Task) -> Ground:
     """Give the surface that the vertices lie on now."""
     return Ground(
         places=task.places,
-        faces=task.lattice.faces,
-        heights=task.union.heights,
+        faces=task.subdivision.faces,
+        heights=task.blend.heights,
         directions=task.directions,
         reach=float(_REACH * task.spacing.detach()),
         finest=_FINEST * task.spacing,
     )
 
 
-def _hold(task: _Task) -> Float[Tensor, " vertex"]:
-    return (_HOLD / task.spacing**2).expand_as(task.union.heights)
+def _damping(task: _Task) -> Float[Tensor, " vertex"]:
+    return (_DAMPING / task.spacing**2).expand_as(task.blend.heights)
 
 
-def carried_reliefs(swept: SweptPatches) -> DepthPatches:
-    """Take what the templates carry as their relief."""
+def transferred_height_fields(swept: SweptPatches) -> DepthPatches:
+    """Take what the templates carry as their height field."""
     return DepthPatches(
         photometric=swept.photometric,
         buckets=tuple(
@@ -443,11 +463,13 @@ def carried_reliefs(swept: SweptPatches) -> DepthPatches:
     )
 
 
-def _turn(normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]) -> Float[Tensor, ""]:
+def _rotation(
+    normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]
+) -> Float[Tensor, ""]:
     """Give the mean squared turn of normals along edges, folds cut; squared radians."""
     one, other = normals[edges].unbind(dim=1)
     square = (one - other).square().sum(dim=1).clamp_max(_FOLD**2)
-    return (square.sum() / max(len(edges), 1)).clamp_min(_MIN_TURN)
+    return (square.sum() / max(len(edges), 1)).clamp_min(_MIN_ROTATION)
 
 
 def _variance(confidence: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:

@@ -46,7 +46,7 @@ def vertex_fans(
 
     Returns:
         The old vertex each new one is a copy of, ascending, and the faces in new vertices.
-        Vertices without faces are gone; one in the middle of two fans, which is no place of
+        Vertices without faces are gone; one in the centre of two fans, which is no place of
         a surface, has become two; faces that met at an edge of three or more have parted.
 
     >>> bow_tie = torch.tensor([[0, 1, 2], [2, 3, 4]])

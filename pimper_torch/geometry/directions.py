@@ -16,23 +16,23 @@ def even_directions(count: int) -> Float[Tensor, "direction 3"]:
     step = torch.arange(count, dtype=torch.float64)
     height = 1 - (2 * step + 1) / count
     radius = (1 - height**2).sqrt()
-    turn = _GOLDEN_ANGLE * step
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=1)
+    rotation = _GOLDEN_ANGLE * step
+    return torch.stack([radius * rotation.cos(), radius * rotation.sin(), height], dim=1)
 
 
 def cosine_fan(
-    normals: Float[Tensor, "normal 3"], turns: Float[Tensor, " normal"], num_rays: int
+    normals: Float[Tensor, "normal 3"], rotations: Float[Tensor, " normal"], num_rays: int
 ) -> Float[Tensor, "normal ray 3"]:
     """Spread rays round normals as densely as a matte surface weighs light.
 
     Args:
         normals: Unit.
-        turns: Of each fan about its normal, in radians: neighbours' fans then differ.
+        rotations: Of each fan about its normal, in radians: neighbours' fans then differ.
         num_rays: Of each fan.
     """
     step = torch.arange(num_rays)
     across = ((step + 0.5) / num_rays).sqrt()  # even over the disc below the hemisphere
-    angle = 2 * torch.pi * torch.remainder(step * _GOLDEN_RATIO, 1) + turns[:, None]
+    angle = 2 * torch.pi * torch.remainder(step * _GOLDEN_RATIO, 1) + rotations[:, None]
     # Duff et al., JCGT 6(1), 2017: a frame round each normal, without a branch.
     x, y, z = normals.unbind(dim=-1)
     sign = torch.where(z < 0, -1.0, 1.0)

@@ -25,11 +25,11 @@ def fill_smoothly(
 
     Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.4.
     """
-    share = weight[:, None]
-    return _pull(torch.where(share > 0, values, 0) * share, share)
+    fraction = weight[:, None]
+    return _regularization(torch.where(fraction > 0, values, 0) * fraction, fraction)
 
 
-def _pull(
+def _regularization(
     weighted: Float[Tensor, "patch channel height width"],
     weight: Float[Tensor, "patch 1 height width"],
 ) -> Float[Tensor, "patch channel height width"]:
@@ -43,7 +43,7 @@ def _pull(
     # evidence would fade on its way up, and the mean of the whole patch would win.
     full = (4 * coarse_weight).clamp_max(1)
     gain = full / torch.where(coarse_weight > 0, coarse_weight, 1)
-    coarse = _pull(coarse_weighted * gain, full)
+    coarse = _regularization(coarse_weighted * gain, full)
     around = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
     return weight * known + (1 - weight) * around
 

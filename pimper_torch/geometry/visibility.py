@@ -21,7 +21,7 @@ from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.surfaces import face_normals, side_lengths
 from pimper_torch.records import Cameras, Mesh, Record
 
-# How far above its face a ray starts, in shares of the face's longest side.
+# How far above its face a ray starts, in fractions of the face's longest side.
 _CLEARANCE = 1e-3
 
 
@@ -186,7 +186,7 @@ def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
 def ambient_occlusion(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], num_rays: int = 128
 ) -> Float[Tensor, " face"]:
-    """Give the share of the light from everywhere that the mesh itself keeps from each face.
+    """Give the fraction of the light from everywhere that the mesh itself keeps from each face.
 
     Directions weigh as much as a matte surface weighs their light: 0 on a convex mesh, 1 - a / b
     on the inside of an open sphere of area b of which a is missing. Constant to autograd.
@@ -194,7 +194,7 @@ def ambient_occlusion(
     Args:
         vertices: Of the mesh.
         faces: Of it, counter-clockwise from outside.
-        num_rays: From each face's middle; the share is a multiple of one over them.
+        num_rays: From each face's centre; the fraction is a multiple of one over them.
     """
     corners = vertices.detach()[faces]
     normals = normalize(face_normals(vertices.detach(), faces), dim=1)

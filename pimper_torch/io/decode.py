@@ -103,7 +103,7 @@ def decode(path: Path) -> Decoded:
     """
     header = read_header(path)
     if header.deep:
-        array = turned(_read_deep(path), header.orientation)
+        array = rotated(_read_deep(path), header.orientation)
     else:
         array = _with_image(path, _read_shallow)
     if array.dtype not in (np.uint8, np.uint16):
@@ -155,7 +155,7 @@ def focal_from_exif(tags: Mapping[int, object], width: int, height: int) -> floa
     return focal_mm * resolution / unit_mm * resized
 
 
-def turned(array: np.ndarray, orientation: int) -> np.ndarray:
+def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
     """Turn rows and columns so that an image of this EXIF orientation stands upright."""
     if orientation >= 5:
         array = array.swapaxes(0, 1)

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.io.accounts import common_lights
 from pimper_torch.io.meshes import read_mesh
+from pimper_torch.io.reports import common_lights
 from pimper_torch.records import Cameras, Estimate, Reconstruction
 from pimper_torch.sfm.colmap import pinhole_of, read_model
 
@@ -20,7 +20,7 @@ def estimate_of(result: Reconstruction) -> Estimate:
     """Take what a run of ours says about the object.
 
     A view's light is that of the patches that determine it, taken together, NaN where none
-    does; see :func:`pimper_torch.io.accounts.common_lights`.
+    does; see :func:`pimper_torch.io.reports.common_lights`.
     """
     lights, counts = common_lights(result)
     names = result.scene.views.names
@@ -90,8 +90,8 @@ def _read_lights(path: Path, names: tuple[str, ...]) -> Float[Tensor, "view 4"] 
     if not path.is_file() or not names:
         return None
     try:
-        account = json.loads(path.read_text(encoding="utf-8"))
-        known = {view["name"]: view["light"] for view in account["views"]}
+        report = json.loads(path.read_text(encoding="utf-8"))
+        known = {view["name"]: view["light"] for view in report["views"]}
         rows = [known.get(name) or [float("nan")] * 4 for name in names]
         lights = torch.tensor(rows, dtype=torch.float64).reshape(len(names), 4)
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:

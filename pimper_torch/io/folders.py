@@ -70,7 +70,7 @@ def written_whole(
         overwrite: Replace a former result.
 
     Raises:
-        OutputError: As :func:`prepare_output`, or the disk refuses in the middle; then
+        OutputError: As :func:`prepare_output`, or the disk refuses in the centre; then
             nothing stays behind.
     """
     prepare_output(folder, contents, overwrite)

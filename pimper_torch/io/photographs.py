@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header, turned
+from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header, rotated
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.radiometry import SATURATED, SRGB, Encoding
 from pimper_torch.records import Views
@@ -19,7 +19,7 @@ from pimper_torch.records import Views
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
 # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
 _BLACK = 1e-3
-_LIT_SHARE = 1e-3  # more than hot pixels
+_LIT_FRACTION = 1e-3  # more than hot pixels
 # Less of the object than this is left of a photograph that is mostly saturated.
 _MIN_USABLE = 0.1
 # Masks are turned round where more than the rest of it is bright at the border, and less inside.
@@ -43,7 +43,7 @@ def load_views(
     is told, or at which values pile up, or full scale. Photographs of unlike sizes are padded.
 
     Masks are images of the photographs' sizes, zero off the object (JPEG: below half). Where all
-    of them together are bright along the border and dark in the middle, they are turned round,
+    of them together are bright along the border and dark in the centre, they are turned round,
     and a warning says so.
     Without a folder of masks, alpha channels that are somewhere transparent are the masks,
     and a photograph without one shows the object everywhere.
@@ -207,20 +207,20 @@ def _is_dark(
     """Tell whether masks show the object dark, by all of them together."""
     if mask_object != "auto":
         return mask_object == "dark"
-    border, middle = [], []
+    border, centre = [], []
     for opacity in opacities:
         high, wide = opacity.shape
         border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
         border.append(opacity[:, -1].mean())
         inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
-        middle.append(inner.mean())
-    shares = float(torch.stack(border).mean()), float(torch.stack(middle).mean())
-    # An object that fills its photographs is bright in the middle, too.
-    dark = shares[0] > 1 - _TELLING and shares[1] < 1 - _TELLING
+        centre.append(inner.mean())
+    fractions = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
+    # An object that fills its photographs is bright in the centre, too.
+    dark = fractions[0] > 1 - _TELLING and fractions[1] < 1 - _TELLING
     if dark:
         warnings.warn(
-            f"{folder}: the masks are bright along {shares[0]:.0%} of the border and "
-            f"{shares[1]:.0%} of the middle, so the object is taken to be dark in them. "
+            f"{folder}: the masks are bright along {fractions[0]:.0%} of the border and "
+            f"{fractions[1]:.0%} of the centre, so the object is taken to be dark in them. "
             "`--mask-object bright` says that it is not.",
             PimperWarning,
             stacklevel=3,
@@ -242,7 +242,7 @@ def _read_mask(path: Path, photograph: Path, header: Header) -> Float[Tensor, "h
     lying = drawn.shape == (header.width, header.height)
     if header.orientation >= 5 and lying and header.width != header.height:
         # Drawn on the file's pixels by a program that does not know EXIF.
-        drawn = torch.from_numpy(turned(drawn.numpy(), header.orientation))
+        drawn = torch.from_numpy(rotated(drawn.numpy(), header.orientation))
     size = (drawn.shape[1], drawn.shape[0])
     if size != (header.width, header.height):
         raise InputError(
@@ -263,7 +263,7 @@ def _on_object(decoded: Decoded) -> Float[Tensor, "height width"]:
 def _refuse_black(
     images: Float[Tensor, "view channel height width"], names: tuple[str, ...], folder: Path
 ) -> None:
-    lit = [float((image > _BLACK).float().mean()) > _LIT_SHARE for image in images]
+    lit = [float((image > _BLACK).float().mean()) > _LIT_FRACTION for image in images]
     black = [name for name, one in zip(names, lit, strict=True) if not one]
     if black:
         raise InputError(
@@ -283,7 +283,9 @@ def _judge_saturation(
         float((image.amax(dim=0)[mask] < SATURATED).float().mean())
         for image, mask in zip(images, drawn, strict=True)
     ]
-    blind = [name for name, share in zip(names, usable, strict=True) if share <= _LIT_SHARE]
+    blind = [
+        name for name, fraction in zip(names, usable, strict=True) if fraction <= _LIT_FRACTION
+    ]
     what = "Expose less, or tell the level of saturation by `photographs.saturation`"
     if blind:
         raise InputError(
@@ -291,9 +293,9 @@ def _judge_saturation(
             f"Take them out of the folder. {what}."
         )
     scant = [
-        f"{name} ({share:.1%} left)"
-        for name, share in zip(names, usable, strict=True)
-        if share < _MIN_USABLE
+        f"{name} ({fraction:.1%} left)"
+        for name, fraction in zip(names, usable, strict=True)
+        if fraction < _MIN_USABLE
     ]
     if scant:
         warnings.warn(

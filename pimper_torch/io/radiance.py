@@ -19,7 +19,7 @@ from pimper_torch.radiometry.saturation import PIXELS
 from pimper_torch.records import Record
 
 OPAQUE = 0.5
-# Saturated light in a pixel's footprint counts from this share on; below is the rounding of the
+# Saturated light in a pixel's footprint counts from this fraction on; below is the rounding of the
 # filter's weights.
 _TOUCHED = 1e-3
 
@@ -38,7 +38,7 @@ class Pictures(Record):
     opaque: tuple[Bool[Tensor, "height width"] | None, ...]
 
 
-# Levels of saturation by the bits of the file, shares of full scale, one a colour.
+# Levels of saturation by the bits of the file, fractions of full scale, one a colour.
 _Whites = Mapping[int, Float[Tensor, " channel"]]
 
 
@@ -86,8 +86,8 @@ def radiance_of(
     Args:
         decoded: Of a file.
         response: Its response.
-        black: Share of full scale.
-        white: Shares of full scale, one a colour.
+        black: Fraction of full scale.
+        white: Fractions of full scale, one a colour.
     """
     levels = white[:, None, None]
     dark = response.linear_from_encoded(black.expand_as(levels))
@@ -217,7 +217,7 @@ def _tell(folder: Path, whites: _Whites) -> None:
 def _levels(
     encoding: Encoding, decoded: Decoded, path: Path, whites: _Whites
 ) -> tuple[Float[Tensor, ""], Float[Tensor, " channel"]]:
-    """Give black and white of a file as shares of its full scale.
+    """Give black and white of a file as fractions of its full scale.
 
     Raises:
         InputError: Levels above full scale, ones for other colours, or no span between them.
@@ -234,7 +234,7 @@ def _levels(
     if highest > full:
         raise InputError(
             f"{path}: holds {decoded.bits} bits, levels 0 to {full}, but a level of {highest:g} is "
-            "given for saturation or black; needed: a level that the files have, or a share of "
+            "given for saturation or black; needed: a level that the files have, or a fraction of "
             "full scale up to 1."
         )
     if len(white) != channels:
@@ -259,7 +259,7 @@ def _require_fit(response: Response, decoded: Decoded, path: Path) -> None:
         raise InputError(
             f"{path}: holds {decoded.bits} bits, levels 0 to {2**decoded.bits - 1}, but the "
             f"response curve ends at level {last:g}, for files of {response.bits} bits; needed: a "
-            "curve over the levels of these files, or over shares of full scale from 0 to 1."
+            "curve over the levels of these files, or over fractions of full scale from 0 to 1."
         )
     if len(response.radiance) not in (1, decoded.samples.shape[0]):
         raise InputError(

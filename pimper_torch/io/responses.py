@@ -105,13 +105,13 @@ def _read_csv(path: Path) -> np.ndarray:
 
 
 def _read_json(path: Path) -> np.ndarray:
-    account = json.loads(path.read_text(encoding="utf-8"))
-    if not isinstance(account, dict):
+    report = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(report, dict):
         raise ValueError("it is no object with `radiance`")
-    radiance = np.array(account["radiance"], dtype=np.float64)
+    radiance = np.array(report["radiance"], dtype=np.float64)
     rows = radiance[None] if radiance.ndim == 1 else radiance
-    if "levels" in account:
-        rows = np.concatenate([np.array(account["levels"], dtype=np.float64)[None], rows])
+    if "levels" in report:
+        rows = np.concatenate([np.array(report["levels"], dtype=np.float64)[None], rows])
     return rows.T
 
 

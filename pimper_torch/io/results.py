@@ -11,9 +11,9 @@ from PIL import Image
 from torch import Tensor
 
 from pimper_torch.config import to_yaml
-from pimper_torch.io.accounts import lights_account, summary_account
 from pimper_torch.io.folders import written_whole
 from pimper_torch.io.meshes import write_glb, write_ply, written_channels
+from pimper_torch.io.reports import lights_report, summary_report
 from pimper_torch.meshing.simplify import simplify
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
@@ -90,7 +90,7 @@ def write_result(
     folder = Path(folder)
     with written_whole(folder, RESULT_NAMES, overwrite=overwrite) as staging:
         whole = result.to("cpu")
-        summary = summary_account(whole, about or {})
+        summary = summary_report(whole, about or {})
         if not full_mesh:
             with part(0, _PARTS):
                 found = simplify(whole.mesh, told=written_channels(whole.mesh))
@@ -116,7 +116,7 @@ def _write_all(
             _write_masks(result.silhouettes, result.scene, folder / "masks")
     with part(2, _PARTS):
         _write_maps(result, folder)
-    _write_json(lights_account(result), folder / "lights.json")
+    _write_json(lights_report(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     _write_json(summary, folder / "summary.json", indent=2)
     with part(3, _PARTS):
@@ -161,8 +161,8 @@ def _write_png(picture: Float[Tensor, "height width channel"] | Tensor, path: Pa
     Image.fromarray(array[..., 0] if array.shape[-1] == 1 else array).save(path)
 
 
-def _write_json(account: Mapping[str, object], path: Path, indent: int | None = None) -> None:
-    text = json.dumps(account, indent=indent, allow_nan=False, ensure_ascii=False)
+def _write_json(report: Mapping[str, object], path: Path, indent: int | None = None) -> None:
+    text = json.dumps(report, indent=indent, allow_nan=False, ensure_ascii=False)
     path.write_text(text + "\n", encoding="utf-8")
 
 

@@ -284,9 +284,9 @@ def spread(
                 names[at], values[at] = label[column], 0.0
                 count += 1
             values[at] += tie
-        share = damping / total if total > 0 else 0.0
+        fraction = damping / total if total > 0 else 0.0
         for at in range(begin, count):
-            values[at] *= share * units[row]
+            values[at] *= fraction * units[row]
         if label[row] >= 0:
             values[begin] += (1 - damping) * units[row]
         counts[row - first] = count - begin

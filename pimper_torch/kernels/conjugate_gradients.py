@@ -54,7 +54,7 @@ def moved(
 
 
 @compiled(*(f"void({_WIDE}, {real}, float64[::1], int64, int64)" for real in _REALS))
-def turned(direction: Array, better: Array, growth: Array, first: int, last: int) -> None:
+def rotated(direction: Array, better: Array, growth: Array, first: int, last: int) -> None:
     """Make the directions ``better + growth * direction``."""
     for row in range(first, last):
         for side in range(len(growth)):

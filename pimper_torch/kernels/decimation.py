@@ -223,7 +223,7 @@ def decimate(
     told: Floats,
     bound: float,
     cosine: float,
-    rounds: int,
+    iterations: int,
     faces: Numbers,
     head: Numbers,
     following: Numbers,
@@ -248,7 +248,7 @@ def decimate(
         told: Of every vertex, in units of what it may be off.
         bound: Distance.
         cosine: Of the angle between normals.
-        rounds: At most.
+        iterations: At most.
         faces: Written in place: faces taken out have -1 in their first corner.
         head: Chains of corners, from :func:`link_corners`; written in place.
         following: The same.
@@ -271,7 +271,7 @@ def decimate(
     normal, mean, found = np.empty(3), np.empty(3), np.empty(4)
     touched = np.full(len(head), -1, np.int8)
     total = 0
-    for sweep in range(rounds):
+    for sweep in range(iterations):
         removed = 0
         for vertex in range(len(head)):
             if not fresh[vertex] or part[vertex] != mine or touched[vertex] == sweep:

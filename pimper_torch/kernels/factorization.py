@@ -47,7 +47,7 @@ class Patch(NamedTuple):
         prior: Packed entry by sample.
         equations: The samples' normal equations: ten packed entries and the right-hand side.
         anchor: View by 4.
-        pull: Of each view.
+        regularization: Of each view.
         slack: Sum of the pulls on the views that are left out, times 4.
         num_views: Those too.
         told: So many samples, the first, tell the spread.
@@ -62,7 +62,7 @@ class Patch(NamedTuple):
     prior: Floats
     equations: Floats
     anchor: Floats
-    pull: Floats
+    regularization: Floats
     slack: float
     num_views: int
     told: int
@@ -71,12 +71,14 @@ class Patch(NamedTuple):
 
 
 @compiled()
-def _views_that_count(given: Floats, anchor: Floats, pull: Floats, lights: Floats) -> Integers:
+def _views_that_count(
+    given: Floats, anchor: Floats, regularization: Floats, lights: Floats
+) -> Integers:
     """List the views that show something, or whose light is not where it is pulled to."""
     found = np.empty(len(given), np.int64)
     count = 0
     for f in range(len(given)):
-        settled = pull[f] > 0
+        settled = regularization[f] > 0
         for i in range(4):
             settled = settled and lights[f, i] == anchor[f, i]
         if not settled or np.any(given[f] > 0):
@@ -112,7 +114,7 @@ def _packed(
     radiance: Floats,
     given: Floats,
     anchor: Floats,
-    pull: Floats,
+    regularization: Floats,
     prior: Floats,
     views: Integers,
     samples: Integers,
@@ -123,18 +125,21 @@ def _packed(
     padded = TILE * (-(-num_samples // TILE))
     shape = (num_views, padded)
     left, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    own_anchor, own_pull = np.empty((num_views, 4), np.float32), np.empty(num_views, np.float32)
+    own_anchor, own_regularization = (
+        np.empty((num_views, 4), np.float32),
+        np.empty(num_views, np.float32),
+    )
     size, count, slack = 0.0, 0.0, 0.0
-    for f in range(len(pull)):
-        slack += 4 * pull[f]
+    for f in range(len(regularization)):
+        slack += 4 * regularization[f]
     for f in range(num_views):
         source, heavy = radiance[views[f]], given[views[f]]
         for k in range(num_samples):
             left[f, k], weight[f, k] = source[samples[k]], heavy[samples[k]]
             size += abs(left[f, k])
             count += weight[f, k]
-        own_anchor[f], own_pull[f] = anchor[views[f]], pull[views[f]]
-        slack -= 4 * own_pull[f]
+        own_anchor[f], own_regularization[f] = anchor[views[f]], regularization[views[f]]
+        slack -= 4 * own_regularization[f]
     known = np.zeros((10, padded), np.float32)
     for i in range(10):
         for k in range(num_samples):
@@ -150,9 +155,9 @@ def _packed(
         prior=known,
         equations=np.empty((14, padded), np.float32),
         anchor=own_anchor,
-        pull=own_pull,
+        regularization=own_regularization,
         slack=max(slack, 0.0),
-        num_views=len(pull),
+        num_views=len(regularization),
         told=told,
         level=_SMALLEST_SPREAD * size / max(count, 1.0),
         scale=scale,
@@ -307,8 +312,8 @@ def _evaluate(patch: Patch, lights: Floats, shading: Floats, slope: Doubles) -> 
         slope[f, 0], slope[f, 1], slope[f, 2], slope[f, 3] = on_s, on_x, on_y, on_z
         for i in range(4):
             apart = float(light[i]) - float(patch.anchor[f, i])
-            total += patch.pull[f] * apart * apart
-            slope[f, i] -= patch.pull[f] * apart
+            total += patch.regularization[f] * apart * apart
+            slope[f, i] -= patch.regularization[f] * apart
     return total + _bent(patch.prior, s, x, y, z)
 
 
@@ -329,7 +334,7 @@ def _keep_scale(patch: Patch, before: Floats, lights: Floats, shading: Floats) -
     """Hold the size of lights that nothing else holds, and shrink shading by as much."""
     was, size = 0.0, 0.0
     for f in range(len(lights)):
-        if patch.pull[f] > 0:
+        if patch.regularization[f] > 0:
             return
         for i in range(4):
             was += before[f, i] ** 2
@@ -373,7 +378,7 @@ def _curvature(
             _block(white, f, g, heavy, pairs, float(stride), curvature)
             heavy[:] = 0
         for i in range(4):
-            curvature[4 * f + i, 4 * f + i] += patch.pull[f]
+            curvature[4 * f + i, 4 * f + i] += patch.regularization[f]
 
 
 @compiled(fast=True)
@@ -394,17 +399,17 @@ def _block(
     zero = np.float32(0)
     sa = sb = sc = sd = se = si = sj = sh = sm = sn = zero
     for k in range(len(heavy)):
-        share = heavy[k] - (u[k] * x[k] + v[k] * y[k] + w[k] * z[k])
-        sa += share * a[k]
-        sb += share * b[k]
-        sc += share * c[k]
-        sd += share * d[k]
-        se += share * e[k]
-        si += share * i[k]
-        sj += share * j[k]
-        sh += share * h[k]
-        sm += share * m[k]
-        sn += share * n[k]
+        fraction = heavy[k] - (u[k] * x[k] + v[k] * y[k] + w[k] * z[k])
+        sa += fraction * a[k]
+        sb += fraction * b[k]
+        sc += fraction * c[k]
+        sd += fraction * d[k]
+        se += fraction * e[k]
+        si += fraction * i[k]
+        sj += fraction * j[k]
+        sh += fraction * h[k]
+        sm += fraction * m[k]
+        sn += fraction * n[k]
     sums = (sa, sb, sc, sd, se, si, sj, sh, sm, sn)
     for place in range(10):
         row, column = _ROWS[place], _COLUMNS[place]
@@ -434,7 +439,7 @@ def solve_on_cone(
     radiance: Floats,
     given: Floats,
     anchor: Floats,
-    pull: Floats,
+    regularization: Floats,
     prior: Floats,
     scale: float,
     stride: int,
@@ -455,7 +460,7 @@ def solve_on_cone(
         radiance: Patch, view, sample; zero where missing.
         given: The weights; 0 where missing.
         anchor: What lights are pulled to.
-        pull: How strongly.
+        regularization: How strongly.
         prior: Patch, packed, sample.
         scale: Of Cauchy's loss, in standard deviations; 0 for squares.
         stride: The spread is taken over every so many samples.
@@ -472,10 +477,18 @@ def solve_on_cone(
     """
     limits = (max_iterations, tolerance, small_steps, curvature_samples)
     for p in range(len(radiance)):
-        views = _views_that_count(given[p], anchor[p], pull[p], lights[p])
+        views = _views_that_count(given[p], anchor[p], regularization[p], lights[p])
         samples, told = _samples_that_count(given[p], stride)
         patch = _packed(
-            radiance[p], given[p], anchor[p], pull[p], prior[p], views, samples, told, scale
+            radiance[p],
+            given[p],
+            anchor[p],
+            regularization[p],
+            prior[p],
+            views,
+            samples,
+            told,
+            scale,
         )
         light = np.empty((len(views), 4), np.float32)
         shade = np.zeros((4, patch.radiance.shape[1]), np.float32)

@@ -26,7 +26,7 @@ _FLOOR, _LARGE = 1e-9, 1e100
 
 @compiled(fast=True)
 def _shade(known: Doubles, lights: Doubles, shading: Doubles) -> None:
-    """Give the radiance of albedo 1: soft light has four numbers a view, a lamp five."""
+    """Give the radiance of albedo 1: soft light has four numbers a view, a point light five."""
     for v in range(len(lights)):
         light, row = lights[v], shading[v]
         a, b, c, d = known[0], known[1], known[2], known[3]
@@ -183,14 +183,14 @@ def _tile(
     slopes: Doubles,
     cross: Doubles,
     own: Doubles,
-    pull: Doubles,
+    regularization: Doubles,
     matrix: Doubles,
     downhill: Doubles,
 ) -> None:
     """Add a tile's part of the lights' own equations, and set up its albedos'."""
     num_views, size = lights.shape
     some = slice(first, first + TILE)
-    square, push, rho = own[some], pull[some], albedo[some]
+    square, push, rho = own[some], regularization[some], albedo[some]
     square[:] = 0
     push[:] = 0
     by = np.empty(TILE)
@@ -275,12 +275,12 @@ def _step(
     count, num_samples = num_views * size, len(albedo)
     padded = 4 * (-(-count // 4))
     matrix, downhill = np.zeros((padded, padded)), np.zeros(padded)
-    own, pull = np.empty(num_samples), np.empty(num_samples)
+    own, regularization = np.empty(num_samples), np.empty(num_samples)
     slopes = np.empty(size * TILE)
     for first in range(0, num_samples, TILE):
         _tile(
             known, lights, shading, residual, weight, albedo, first,
-            slopes, cross, own, pull, matrix, downhill,
+            slopes, cross, own, regularization, matrix, downhill,
         )  # fmt: skip
     for v in range(num_views):
         total = 0.0
@@ -303,7 +303,7 @@ def _step(
         row = cross[at]
         total = 0.0
         for i in range(num_samples):
-            total += row[i] * own[i] * pull[i]
+            total += row[i] * own[i] * regularization[i]
         side[at] = downhill[at] - total
         if moved[v, p] == lights[v, p]:
             # A parameter that would only be pushed over its bound stays out of the others' way.
@@ -318,9 +318,9 @@ def _step(
         moved[at // size, at % size] = lights[at // size, at % size] + side[at]
         row, by = cross[at], side[at]
         for i in range(num_samples):
-            pull[i] -= by * row[i]
+            regularization[i] -= by * row[i]
     for i in range(num_samples):
-        changed[i] = albedo[i] + own[i] * pull[i]
+        changed[i] = albedo[i] + own[i] * regularization[i]
     _admit(moved, closest)
     return True
 
@@ -343,14 +343,14 @@ def fit(
     """Step on lights and albedo together; both hold the start, and then the answer.
 
     Args:
-        known: Rows of the samples: of soft light the four harmonics; of a lamp the normal's
+        known: Rows of the samples: of soft light the four harmonics; of a point light the normal's
             coordinates and the place's.
         radiance: View by sample; zero where not seen.
         seen: 1 or 0.
         level: Brightness of each view.
-        closest: A lamp's closeness at most.
+        closest: A point light's closeness at most.
         limit: Steps at most.
-        min_gain: Share of the loss that the last step gains at most.
+        min_gain: Fraction of the loss that the last step gains at most.
         lights: View by number.
         albedo: Of each sample.
     """

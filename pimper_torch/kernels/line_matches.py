@@ -49,11 +49,11 @@ def most_alike(
     count, length = len(second), second_descriptors.shape[1]
     x, y = np.empty(count, np.float32), np.empty(count, np.float32)
     slope, near = np.zeros(count, np.float32), np.empty(count, np.int64)
-    # From the middle of all on, single precision tells a hundredth of a pixel.
-    middle_x, middle_y = second[:, 0].mean(), second[:, 1].mean()
+    # From the centre of all on, single precision tells a hundredth of a pixel.
+    centre_x, centre_y = second[:, 0].mean(), second[:, 1].mean()
     for j in range(count):
         u, v = second[j, 0], second[j, 1]
-        x[j], y[j] = u - middle_x, v - middle_y
+        x[j], y[j] = u - centre_x, v - centre_y
         if not planar:
             back_u = u * matrix[0, 0] + v * matrix[1, 0] + matrix[2, 0]
             back_v = u * matrix[0, 1] + v * matrix[1, 1] + matrix[2, 1]
@@ -66,13 +66,13 @@ def most_alike(
         c = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
         found = 0
         if planar:
-            at_x, at_y = np.float32(a / c - middle_x), np.float32(b / c - middle_y)
+            at_x, at_y = np.float32(a / c - centre_x), np.float32(b / c - centre_y)
             for j in range(count):
                 near[found] = j
                 found += (x[j] - at_x) ** 2 + (y[j] - at_y) ** 2 <= limit
         else:
             line_x, line_y = np.float32(a), np.float32(b)
-            offset = np.float32(a * middle_x + b * middle_y + c)
+            offset = np.float32(a * centre_x + b * centre_y + c)
             own = np.float32(max_error_px**2 * (a * a + b * b))
             for j in range(count):
                 near[found] = j

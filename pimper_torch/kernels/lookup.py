@@ -69,9 +69,9 @@ def bilinear(
 
 @compiled("float64[:,::1](int64[:,::1])")
 def shrinkage(levels: Array) -> Array:
-    """Give each level's height and width as shares of the finest one's."""
-    shares = np.empty((len(levels), 2), np.float64)
+    """Give each level's height and width as fractions of the finest one's."""
+    fractions = np.empty((len(levels), 2), np.float64)
     for level in range(len(levels)):
         for axis in range(2):
-            shares[level, axis] = levels[level, axis] / levels[0, axis]
-    return shares
+            fractions[level, axis] = levels[level, axis] / levels[0, axis]
+    return fractions

@@ -1,6 +1,6 @@
 """Patches of a view aligned with templates, one after the other.
 
-The compiled twin of the iterations in :func:`pimper_torch.sfm.sightings._iterated`.
+The compiled twin of the iterations in :func:`pimper_torch.sfm.track observations._iterated`.
 """
 
 import numpy as np
@@ -94,24 +94,24 @@ def align(
                 lower += right * (log[row + 1, column + 1] - lower)
                 patch[s] = (upper + down * (lower - upper)) * root[s]
             for way in range(ways):
-                share = np.float32(0)
+                fraction = np.float32(0)
                 for s in range(samples):
-                    share += patch[s] * light[s, way]
+                    fraction += patch[s] * light[s, way]
                 for s in range(samples):
-                    patch[s] -= share * light[s, way]
+                    patch[s] -= fraction * light[s, way]
             common, norm = np.float32(0), np.float32(0)
             for s in range(samples):
                 common += patch[s] * template[s]
                 norm += patch[s] * patch[s]
             contrast = min(max(common / power, np.float32(least)), np.float32(most))
-            pull_x, pull_y, left = np.float32(0), np.float32(0), np.float32(0)
+            regularization_x, regularization_y, left = np.float32(0), np.float32(0), np.float32(0)
             for s in range(samples):
                 residual = patch[s] / contrast - template[s]
-                pull_x += slope[s, 0] * residual
-                pull_y += slope[s, 1] * residual
+                regularization_x += slope[s, 0] * residual
+                regularization_y += slope[s, 1] * residual
                 left += residual * residual
-            step_x = -(inverse[t, 0, 0] * pull_x + inverse[t, 0, 1] * pull_y)
-            step_y = -(inverse[t, 1, 0] * pull_x + inverse[t, 1, 1] * pull_y)
+            step_x = -(inverse[t, 0, 0] * regularization_x + inverse[t, 0, 1] * regularization_y)
+            step_y = -(inverse[t, 1, 0] * regularization_x + inverse[t, 1, 1] * regularization_y)
             length = np.sqrt(float(step_x) ** 2 + float(step_y) ** 2)
             scale = longest / max(length, longest)
             along += step_x * scale

@@ -19,7 +19,7 @@ def plane_fits(
     radius: int,
     reach: float,
     ridge: float,
-    rounds: int,
+    iterations: int,
     fits: NDArray[np.float32],
 ) -> None:
     """Fit planes by reweighted least squares, in steps of inverse depth.
@@ -29,9 +29,9 @@ def plane_fits(
         valid: Which pixels count; only these get planes.
         step: Unit of the planes, inverse depth.
         radius: Of the windows, pixels.
-        reach: Steps from the middle at which a pixel's first weight has fallen to 0.6.
+        reach: Steps from the centre at which a pixel's first weight has fallen to 0.6.
         ridge: Added to the diagonal of the normal equations.
-        rounds: Of fitting; from the second on a pixel's weight falls with its residual.
+        iterations: Of fitting; from the second on a pixel's weight falls with its residual.
         fits: Filled in, ``5 height width``: the plane's offset from the pixel and its slopes,
             the variance round it, and the mean weight in the window. Elsewhere it stays.
     """
@@ -46,17 +46,17 @@ def plane_fits(
         for x in range(width):
             if not valid[y, x]:
                 continue
-            middle = inverse_depth[y, x]
+            centre = inverse_depth[y, x]
             for place in range(count):
                 row, column = y + down_by[place], x + across_by[place]
                 weight[place] = 0
                 around[place] = 0
                 if 0 <= row < height and 0 <= column < width and valid[row, column]:
-                    away = (inverse_depth[row, column] - middle) / step
+                    away = (inverse_depth[row, column] - centre) / step
                     around[place] = away
                     weight[place] = math.exp(-((away / reach) ** 2) / 2)
             offset = across = down = 0.0
-            for _ in range(rounds):
+            for _ in range(iterations):
                 # Upper triangle of the normal equations for (1, u, v), and their right side.
                 n, nu, nv, uu, uv, vv = ridge, 0.0, 0.0, ridge, 0.0, ridge
                 b, bu, bv = 0.0, 0.0, 0.0

@@ -46,7 +46,7 @@ def register(
     Args:
         finest: Images, a row a view.
         coarser: Their further levels, one after another.
-        unusable_finest: Share of every pixel that is unusable, in 255ths.
+        unusable_finest: Fraction of every pixel that is unusable, in 255ths.
         unusable_coarser: Of further levels.
         levels: Height, width and where its planes start in a row of ``coarser``, counted in
             planes' pixels: that of one channel.
@@ -66,7 +66,7 @@ def register(
     patches, views, channels, height, width = radiance.shape
     fine_plane = levels[0, 0] * levels[0, 1]
     count = len(levels)
-    shares = shrinkage(levels)
+    fractions = shrinkage(levels)
     pixels = np.empty((height, width, 2), np.float64)
     wanted = np.empty((height, width), np.bool_)
     found = np.empty(channels, np.float32)
@@ -135,7 +135,10 @@ def register(
                                 here = level + step
                                 tall, wide = levels[here, 0], levels[here, 1]
                                 at, aside, down, p, q = corners(
-                                    tall, wide, u * shares[here, 1] - 0.5, v * shares[here, 0] - 0.5
+                                    tall,
+                                    wide,
+                                    u * fractions[here, 1] - 0.5,
+                                    v * fractions[here, 0] - 0.5,
                                 )
                                 if here == 0:
                                     lost += weight * bilinear(

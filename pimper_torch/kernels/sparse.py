@@ -71,12 +71,12 @@ def product(
 
 @compiled(*_types("void(D, V, V, float64, int64, int64)"))
 def scaled(
-    inverse_diagonal: Array, residual: Array, step: Array, share: float, first: int, last: int
+    inverse_diagonal: Array, residual: Array, step: Array, fraction: float, first: int, last: int
 ) -> None:
     """Write ``share * D^-1 residual`` to ``step``."""
     for row in range(first, last):
         for side in range(residual.shape[1]):
-            step[row, side] = share * inverse_diagonal[row] * residual[row, side]
+            step[row, side] = fraction * inverse_diagonal[row] * residual[row, side]
 
 
 @compiled(*_types("void(M, D, V, V, V, V, float64, float64, int64, int64)"))

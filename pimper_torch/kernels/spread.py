@@ -36,25 +36,25 @@ def robust_variance(squares: Floats, guess: float) -> tuple[float, float]:
         return 0.0, 0.0
     scale = guess if guess > 0 else total / len(squares)
     for _ in range(_SCALE_STEPS):
-        share, slope = _shares(squares, np.float32(1 / scale))
-        gain = (share - half) / max(slope, 1e-7)
+        fraction, slope = _fractions(squares, np.float32(1 / scale))
+        gain = (fraction - half) / max(slope, 1e-7)
         scale *= math.exp(min(max(gain, -_LONGEST_GAIN), _LONGEST_GAIN))
         if abs(gain) < _CLOSE:
             break
-    share, slope = _shares(squares, np.float32(1 / scale))
-    off = (share - half) / slope if slope > 0 else 0.0
+    fraction, slope = _fractions(squares, np.float32(1 / scale))
+    off = (fraction - half) / slope if slope > 0 else 0.0
     return max(scale * (1 + off), 0.0) / _OF_GAUSSIAN**2, scale
 
 
 @compiled(fast=True)
-def _shares(squares: Floats, inverse: np.float32) -> tuple[float, float]:
+def _fractions(squares: Floats, inverse: np.float32) -> tuple[float, float]:
     """Sum ``r^4 / (r^4 + t^4)``, and its derivative by the logarithm of ``t^2``, negated."""
     one, most = np.float32(1), np.float32(1e9)
-    share, square = np.float32(0), np.float32(0)
+    fraction, square = np.float32(0), np.float32(0)
     for i in range(len(squares)):
         ratio = min(squares[i] * inverse, most)
         ratio *= ratio
         part = ratio / (one + ratio)
-        share += part
+        fraction += part
         square += part * part
-    return float(share), 2 * (float(share) - float(square))
+    return float(fraction), 2 * (float(fraction) - float(square))

@@ -15,7 +15,7 @@ from pimper_torch.kernels.switch import compiled
 Array = NDArray[Any]
 
 # As often the albedo that suits all views is found anew.
-ALBEDO_ROUNDS = 2
+ALBEDO_ITERATIONS = 2
 
 # So many are multiplied before a logarithm is taken: no overflow up to residuals of 1e19 scales.
 _FACTORS = 8
@@ -29,7 +29,7 @@ def _gray(
     finest: Array,
     coarser: Array,
     levels: Array,
-    shares: Array,
+    fractions: Array,
     view: int,
     level: int,
     rest: float,
@@ -38,7 +38,7 @@ def _gray(
 ) -> float:
     """Blend the two levels that a sample lies between."""
     tall, wide = levels[level, 0], levels[level, 1]
-    place = corners(tall, wide, u * shares[level, 1] - 0.5, v * shares[level, 0] - 0.5)
+    place = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
     at, right, below, across, down = place
     if level == 0:
         value = bilinear(finest, view, at, right, below, across, down)
@@ -47,7 +47,7 @@ def _gray(
     if rest > 0:
         level += 1
         tall, wide = levels[level, 0], levels[level, 1]
-        place = corners(tall, wide, u * shares[level, 1] - 0.5, v * shares[level, 0] - 0.5)
+        place = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
         at, right, below, across, down = place
         other = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
         value += rest * (other - value)
@@ -56,7 +56,7 @@ def _gray(
 
 @compiled("float32(float32[::1], int64[::1], int64)")
 def _lower_median(values: Array, order: Array, count: int) -> float:
-    """Give the middle one of the first few values, or the lower of two.
+    """Give the centre one of the first few values, or the lower of two.
 
     ``order`` comes to sort them; if it nearly does already, that takes as many steps as values.
     """
@@ -90,7 +90,7 @@ def _inconsistency(
         said[view] = radiance[step, view] * per_shading[view]
     albedo = np.float32(_lower_median(said, order, count))
     one = np.float32(1)
-    for _ in range(ALBEDO_ROUNDS):
+    for _ in range(ALBEDO_ITERATIONS):
         square, product = np.float32(0), np.float32(0)
         for view in range(count):
             residual = (radiance[step, view] - albedo * shading[view]) * per_scale
@@ -175,7 +175,7 @@ def costs(
     per_lit = np.empty(limit, np.float32)
     said = np.empty(limit, np.float32)
     order = np.empty(limit, np.int64)
-    shares = shrinkage(levels)
+    fractions = shrinkage(levels)
     radiance = np.empty((heights, limit), np.float32)
     tiny = np.finfo(np.float32).eps
     for patch in range(patches):
@@ -252,7 +252,7 @@ def costs(
                             finest,
                             coarser,
                             levels,
-                            shares,
+                            fractions,
                             view,
                             level,
                             rest,

@@ -32,7 +32,7 @@ def window_weights(
         tone: Of the view, ``height width``.
         here: Where it says something; elsewhere 0 is filled in.
         spatial: Weight of every place of a window, row by row.
-        likeness: Difference of tone to the middle at which a weight has fallen to 0.6.
+        likeness: Difference of tone to the centre at which a weight has fallen to 0.6.
         weight: Filled in, ``place height width``; adds up to 1.
         deviation: Filled in: weight times the difference of the tone to the window's mean.
         power: Filled in: variance of the tone in the window.
@@ -40,7 +40,7 @@ def window_weights(
     height, width = tone.shape
     num_places = len(spatial)
     side = int(math.sqrt(num_places) + 0.5)
-    around, share = np.empty(num_places), np.empty(num_places)
+    around, fraction = np.empty(num_places), np.empty(num_places)
     rows, columns = np.empty(num_places, dtype=np.int64), np.empty(num_places, dtype=np.int64)
     for place in range(num_places):
         rows[place], columns[place] = place // side - side // 2, place % side - side // 2
@@ -57,12 +57,12 @@ def window_weights(
                 column = min(max(x + columns[place], 0), width - 1)
                 around[place] = tone[row, column]
                 away = (around[place] - tone[y, x]) / likeness
-                share[place] = spatial[place] * math.exp(-away * away / 2) * here[row, column]
-                total += share[place]
-                mean += share[place] * around[place]
+                fraction[place] = spatial[place] * math.exp(-away * away / 2) * here[row, column]
+                total += fraction[place]
+                mean += fraction[place] * around[place]
             mean /= total
             for place in range(num_places):
-                weighed = share[place] / total
+                weighed = fraction[place] / total
                 off = weighed * (around[place] - mean)
                 weight[place, y, x], deviation[place, y, x] = weighed, off
                 variance += off * (around[place] - mean)

@@ -30,11 +30,11 @@ from scipy.sparse import csr_array, diags_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.parallel import over_rows
 
-# An entry is strong if it is at least this share of the largest of a row; compared by
+# An entry is strong if it is at least this fraction of the largest of a row; compared by
 # iterations on weights that vary over 0 to 10 orders, where 0.1 takes up to 1.6 times as many.
 _STRONG = 0.25
 
-# An unknown whose neighbours make up less than this share of its diagonal is determined by its
+# An unknown whose neighbours make up less than this fraction of its diagonal is determined by its
 # own anchor: smoothing alone solves for it.
 _TIED = 0.05
 
@@ -178,8 +178,8 @@ def _averaged(matrix: csr_array) -> csr_array:
     kept = ties > np.maximum(_STRONG * largest[rows], 0)
     near = _selected(matrix, rows, kept, ties)
     total = near.sum(axis=1) + np.maximum(matrix.sum(axis=1), 0)
-    share = np.divide(_DAMPING, total, out=np.zeros(size), where=total > 0)
-    near.data *= np.repeat(share, np.diff(near.indptr))
+    fraction = np.divide(_DAMPING, total, out=np.zeros(size), where=total > 0)
+    near.data *= np.repeat(fraction, np.diff(near.indptr))
     smoothed: csr_array = (near @ aggregate) + (1 - _DAMPING) * aggregate
     return smoothed.tocsr()
 
@@ -228,9 +228,9 @@ def _founded(graph: csr_array) -> Int[np.ndarray, " unknown"]:
     label[root] = np.arange(int(root.sum()))
     rows = np.repeat(np.arange(size, dtype=graph.indices.dtype), np.diff(graph.indptr))
     for _ in range(2):
-        pull = np.where(label[graph.indices] >= 0, graph.data, 0)
-        most = _over_rows(graph.indptr, pull, np.maximum)
-        joins = (pull > 0) & (pull == most[rows]) & (label[rows] < 0)
+        regularization = np.where(label[graph.indices] >= 0, graph.data, 0)
+        most = _over_rows(graph.indptr, regularization, np.maximum)
+        joins = (regularization > 0) & (regularization == most[rows]) & (label[rows] < 0)
         label[rows[joins]] = label[graph.indices[joins]]
     return label
 

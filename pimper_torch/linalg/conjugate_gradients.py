@@ -134,6 +134,6 @@ def compressed_gradients(
         better = precondition(rounded)
         previous, decrease = decrease, inner(residual, better)
         growth = torch.where(previous > 0, decrease / previous, 0).numpy()
-        over_rows(kernels.turned, count, as_array(direction), as_array(better), growth)
+        over_rows(kernels.rotated, count, as_array(direction), as_array(better), growth)
         steps += 1
     return found, steps, bool((decrease.abs() <= goal).all())

@@ -52,7 +52,7 @@ Terms = tuple[Int[Tensor, "_ _"], Float[Tensor, "_ _"], Float[Tensor, " _"], Flo
 
 
 def compressed_equations(
-    kinds: Sequence[Terms], hold: Float[Tensor, " unknown"], start: Float[Tensor, " unknown"]
+    kinds: Sequence[Terms], damping: Float[Tensor, " unknown"], start: Float[Tensor, " unknown"]
 ) -> tuple[csr_array, Float[Tensor, " unknown"]]:
     """Give the same for several sets of equations by compiled kernels, in float64 on the CPU.
 
@@ -61,7 +61,7 @@ def compressed_equations(
     Args:
         kinds: Unknowns, coefficients, targets and weights of each set, as in
             :func:`normal_equations`.
-        hold: Weight with which every unknown is held to its start; above 0.
+        damping: Weight with which every unknown is held to its start; above 0.
         start: That.
 
     Returns:
@@ -69,9 +69,9 @@ def compressed_equations(
     """
     from pimper_torch.kernels import equations as kernels
 
-    size = len(hold)
+    size = len(damping)
     each = torch.arange(size)[:, None]
-    held = (each, torch.ones(size, 1, dtype=start.dtype), start, hold)
+    held = (each, torch.ones(size, 1, dtype=start.dtype), start, damping)
     sets = [_arrays(*kind) for kind in (held, *kinds) if len(kind[0])]
     counts, side = np.zeros(size, np.int32), np.zeros(size)
     for unknowns, coefficients, targets, weights in sets:

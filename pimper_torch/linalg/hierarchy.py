@@ -32,7 +32,7 @@ Product = Callable[[Tensor], Tensor]
 # So few unknowns are solved for by a dense inverse.
 _DENSE = 400
 
-# Coarsening that leaves more than this share of the unknowns is not worth its cycle.
+# Coarsening that leaves more than this fraction of the unknowns is not worth its cycle.
 _WORTHWHILE = 0.8
 
 # Smoothing leaves alone what Chebyshev's polynomial expects of the coarse unknowns: the part

@@ -16,7 +16,7 @@ _TOLERANCE = 1e-10
 _RESTARTS, _STEPS = 5, 60
 
 # Newton's method doubles the digits at every step once it is near; before that its steps are
-# halved until they help, down to this share.
+# halved until they help, down to this fraction.
 _NEWTON_STEPS, _MIN_STEP = 8, 0.05
 
 Vector = Float[Tensor, " unknown"]
@@ -81,7 +81,7 @@ def newton_solution(
     A constant to autograd.
     """
     at, left = start.detach(), equations(start.detach())
-    share, close = 1.0, _TOLERANCE * left.norm()
+    fraction, close = 1.0, _TOLERANCE * left.norm()
     for _ in range(_NEWTON_STEPS):
         if bool(left.norm() <= close):
             break
@@ -91,15 +91,15 @@ def newton_solution(
             return found.cpu().double().numpy()
 
         step = _solve(product, precondition, left)
-        while share > _MIN_STEP:
-            there = at - share * step
+        while fraction > _MIN_STEP:
+            there = at - fraction * step
             after = equations(there)
             if bool(after.norm() < left.norm()):
                 break
-            share /= 2
+            fraction /= 2
         else:
             return at
-        at, left, share = there, after, min(1.0, 2 * share)
+        at, left, fraction = there, after, min(1.0, 2 * fraction)
     return at
 
 

@@ -25,14 +25,14 @@ class Elements:
 
     Attributes:
         faces: Vertices of each face.
-        turned: Of each corner, the gradient of the function that is 1 there and 0 at the
+        rotated: Of each corner, the gradient of the function that is 1 there and 0 at the
             other two, times twice the area: the opposite edge, turned into the face.
         area: Of each face.
         count: Vertices of the mesh.
     """
 
     faces: Int[Tensor, "face 3"]
-    turned: Float[Tensor, "face 3 3"]
+    rotated: Float[Tensor, "face 3 3"]
     area: Float[Tensor, " face"]
     count: int
 
@@ -45,7 +45,7 @@ def elements(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) 
     normal = normalize(doubled, dim=-1)[:, None].expand_as(opposite)
     return Elements(
         faces=faces,
-        turned=torch.linalg.cross(normal, opposite),
+        rotated=torch.linalg.cross(normal, opposite),
         area=doubled.norm(dim=-1) / 2,
         count=len(vertices),
     )
@@ -59,7 +59,7 @@ def cotangent_laplacian(
     Args:
         mesh: Its faces.
         weight: Of each face.
-        min_shape: A needle's area is taken as at least this share of its longest edge
+        min_shape: A needle's area is taken as at least this fraction of its longest edge
             squared: its cotangents would otherwise spoil the condition of the whole matrix.
 
     Returns:
@@ -67,9 +67,9 @@ def cotangent_laplacian(
         of a component are free. Differentiable in the weights and, through the elements, in
         the vertices.
     """
-    longest = mesh.turned.square().sum(-1).amax(dim=1)
+    longest = mesh.rotated.square().sum(-1).amax(dim=1)
     shape = torch.maximum(mesh.area, min_shape * longest)
-    blocks = (weight / (4 * shape))[:, None, None] * (mesh.turned @ mesh.turned.mT)
+    blocks = (weight / (4 * shape))[:, None, None] * (mesh.rotated @ mesh.rotated.mT)
     rows = mesh.faces[:, :, None].expand_as(blocks)
     cols = mesh.faces[:, None, :].expand_as(blocks)
     return rows.flatten(), cols.flatten(), blocks.flatten()
@@ -77,5 +77,5 @@ def cotangent_laplacian(
 
 def lumped_mass(mesh: Elements, density: Float[Tensor, " face"]) -> Float[Tensor, " vertex"]:
     """Give each vertex a third of the mass of every face round it."""
-    share = (mesh.area * density / 3)[:, None].expand(-1, 3)
-    return share.new_zeros(mesh.count).index_add(0, mesh.faces.flatten(), share.flatten())
+    fraction = (mesh.area * density / 3)[:, None].expand(-1, 3)
+    return fraction.new_zeros(mesh.count).index_add(0, mesh.faces.flatten(), fraction.flatten())

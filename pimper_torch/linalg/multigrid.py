@@ -146,17 +146,17 @@ def _checked(
     scale = diagonal.rsqrt().reshape(-1, *[1] * (rhs.ndim - 1))
     size = (scale * rhs).norm(dim=0)
     misfit = (scale * residual).norm(dim=0)
-    share = float((misfit / torch.where(size > 0, size, 1)).max())
+    fraction = float((misfit / torch.where(size > 0, size, 1)).max())
     worst = max(_WORST_MISFIT, _MISFIT_TOLERANCES * tolerance)
-    if not (share < worst and converged):
+    if not (fraction < worst and converged):
         raise SingularSystemError(
             f"{what} ({len(rhs)} unknowns) did not converge: after {cycles} iterations of "
-            f"multigrid its residual is {share:.1e} of the right-hand side; "
+            f"multigrid its residual is {fraction:.1e} of the right-hand side; "
             f"{worst:.0e} and a relative error of {tolerance:.0e} are needed. Some "
             "unknowns are determined by (nearly) no equation, or the matrix is not positive "
             "definite: anchor them, raise the weight of the prior, or solve by Cholesky."
         )
-    return Iterate(values=found, iterations=cycles, residual=share)
+    return Iterate(values=found, iterations=cycles, residual=fraction)
 
 
 class Multigrid:

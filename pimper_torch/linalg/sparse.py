@@ -125,11 +125,11 @@ class SparseCholesky:
         scaled = columns * self._scale[:, None]
         answer = self._substitute(scaled)
         misfit = (scaled - self._scaled @ answer).norm(dim=0)
-        share = misfit / scaled.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
-        if share.numel() and not bool((share < 1e-6).all()):
+        fraction = misfit / scaled.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
+        if fraction.numel() and not bool((fraction < 1e-6).all()):
             raise SingularSystemError(
                 f"the solution of {self._what} ({len(columns)} unknowns) misses its right-hand "
-                f"side by {float(share.max()):.1e} of its size; 1e-06 is needed. The matrix is "
+                f"side by {float(fraction.max()):.1e} of its size; 1e-06 is needed. The matrix is "
                 "nearly singular or not symmetric, or the right-hand side is not finite: anchor "
                 "the unknowns, and look for invalid samples in the input."
             )

@@ -23,8 +23,8 @@ _CHOLESKY_UNKNOWNS = 50_000
 # and 137,000 unknowns, takes 6.1 s in place of 7.3.
 _COMPILED_CHOLESKY_UNKNOWNS = 10_000
 
-# Multigrid is made for matrices whose entries off the diagonal are negative but for this share.
-_POSITIVE_SHARE = 0.1
+# Multigrid is made for matrices whose entries off the diagonal are negative but for this fraction.
+_POSITIVE_FRACTION = 0.1
 
 
 def prepare(
@@ -126,7 +126,7 @@ def solve_compressed(
     if len(sides) > _COMPILED_CHOLESKY_UNKNOWNS:
         parts = over_rows(kernels.off_diagonal, len(sides), *parts_of(matrix))
         positive, total = (sum(part) for part in zip(*parts, strict=True))
-        if positive <= _POSITIVE_SHARE * total:
+        if positive <= _POSITIVE_FRACTION * total:
             refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
             with suppress(SingularSystemError):
                 return solve_by_cycles(matrix, diagonal, sides, tolerance, what, start).values
@@ -140,4 +140,4 @@ def _like_a_laplacian(
 ) -> bool:
     off = values.detach()[rows != cols]
     positive = float(torch.where(off > 0, off, 0).sum())
-    return positive <= _POSITIVE_SHARE * float(off.abs().sum())
+    return positive <= _POSITIVE_FRACTION * float(off.abs().sum())

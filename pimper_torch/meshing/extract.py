@@ -23,16 +23,16 @@ class ExtractConfig:
     Attributes:
         min_confidence: Vertices with no more than this have no support of their own.
         max_expected_error: Faces with a vertex that is expected to be further off are cut out;
-            a share of the surface's extent (diagonal of its bounding box). Infinite keeps all.
+            a fraction of the surface's extent (diagonal of its bounding box). Infinite keeps all.
         max_hole: Connected vertices without support stay, as a filled hole, when they
-            extend over no more than this share of the surface's extent (both diagonals
+            extend over no more than this fraction of the surface's extent (both diagonals
             of bounding boxes).
         max_stretch: Longest edge of a face, in multiples of the surface's median edge;
             longer ones are spikes or cliffs. Infinite keeps all.
         overturned: Which of the faces turned more than 90 degrees from the mean of their facet
             are left out: those that a fold bounds, as the others are on facets that bend far;
             all; or none.
-        min_piece: Share of the largest connected piece's area that another one needs to be
+        min_piece: Fraction of the largest connected piece's area that another one needs to be
             kept; 1 keeps the largest only.
     """
 
@@ -96,7 +96,7 @@ class Extract(Stage):
                 f"{len(faces)} of those are no spikes; at least one is needed. Lower "
                 f"`extract.min_confidence` (now {self.config.min_confidence}), raise "
                 f"`extract.max_expected_error` (now {bound}) or "
-                f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the share "
+                f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the fraction "
                 "of missing data that the report gives."
             )
         faces = faces[large_pieces(vertices, faces, self.config.min_piece)]
@@ -120,14 +120,14 @@ class Extract(Stage):
 
 
 def large_pieces(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], share: float
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], fraction: float
 ) -> Bool[Tensor, " face"]:
-    """Mark the faces of pieces with at least a share of the largest one's area.
+    """Mark the faces of pieces with at least a fraction of the largest one's area.
 
     Pieces hang together by edges. With share 1 one piece is marked, the first of the largest.
     """
     label = face_components(faces)
     areas = component_areas(vertices, faces, label)
-    if share == 1:
+    if fraction == 1:
         return label == label[areas.argmax()]
-    return areas >= share * areas.amax()
+    return areas >= fraction * areas.amax()

@@ -51,7 +51,7 @@ class Faults:
         faces: Of the surface.
         along: The way each was meant to look.
         longest: Side that a face may have, scene units.
-        pairs: Faces that share an edge.
+        pairs: Faces that fraction an edge.
     """
 
     faces: Int[Tensor, "face 3"]
@@ -65,7 +65,7 @@ class Faults:
 
     def worst(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
         """Mark faces drawn out, or overturned where a fold bounds them."""
-        return self._drawn(vertices) | self._folded(vertices) & self._turned(vertices)
+        return self._drawn(vertices) | self._folded(vertices) & self._rotated(vertices)
 
     def part(self, chosen: Bool[Tensor, " face"]) -> tuple["Faults", Int[Tensor, " used"]]:
         """Look at some of the faces alone; their vertices, which have new numbers, come with it."""
@@ -78,7 +78,7 @@ class Faults:
     def _drawn(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
         return side_lengths(vertices[self.faces]).amax(dim=1) > self.longest
 
-    def _turned(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+    def _rotated(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
         return (face_normals(vertices, self.faces) * self.along).sum(dim=1) < 0
 
     def _folded(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
@@ -87,10 +87,10 @@ class Faults:
         fold = (normals[one] * normals[other]).sum(dim=1) < math.cos(math.radians(_FOLD_DEG))
         found = torch.zeros_like(normals[:, 0], dtype=torch.bool)
         found[self.pairs[fold].flatten()] = True
-        turned = self._turned(vertices)
-        (places,) = torch.nonzero(turned, as_tuple=True)
-        rank = turned.cumsum(dim=0) - 1
-        group = graph_components(rank[self.pairs[turned[self.pairs].all(dim=1)]], len(places))
+        rotated = self._rotated(vertices)
+        (places,) = torch.nonzero(rotated, as_tuple=True)
+        rank = rotated.cumsum(dim=0) - 1
+        group = graph_components(rank[self.pairs[rotated[self.pairs].all(dim=1)]], len(places))
         bounded = torch.zeros_like(places, dtype=torch.bool)
         bounded[group[found[places]]] = True
         found[places[bounded[group]]] = True

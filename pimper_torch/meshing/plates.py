@@ -37,18 +37,20 @@ def least_bent(
     edges, _ = face_edges(faces[ring[faces].any(dim=1)])
     links = torch.cat([edges, edges.flip(1)])
     here, there = links[ring[links[:, 0]]].unbind(dim=1)
-    (middle,) = torch.nonzero(ring, as_tuple=True)
+    (centre,) = torch.nonzero(ring, as_tuple=True)
     degree = torch.bincount(here, minlength=len(vertices)).to(known)
-    row = (ring.cumsum(dim=0) - 1)[torch.cat([middle, here])]
-    col = torch.cat([middle, there])
-    share = torch.cat([torch.ones_like(degree[middle]), -1 / degree[here]])
+    row = (ring.cumsum(dim=0) - 1)[torch.cat([centre, here])]
+    col = torch.cat([centre, there])
+    fraction = torch.cat([torch.ones_like(degree[centre]), -1 / degree[here]])
     unknown = free[col]
-    fixed = share[~unknown, None] * known[col[~unknown]]
-    target = -known.new_zeros(len(middle), 3).index_add(0, row[~unknown], fixed)
-    row, col, share = row[unknown], (free.cumsum(dim=0) - 1)[col[unknown]], share[unknown]
-    side = known.new_zeros(int(free.sum()), 3).index_add(0, col, share[:, None] * target[row])
-    shape = (len(middle), len(side))
-    bending = coo_array((share.cpu().numpy(), (row.cpu().numpy(), col.cpu().numpy())), shape=shape)
+    fixed = fraction[~unknown, None] * known[col[~unknown]]
+    target = -known.new_zeros(len(centre), 3).index_add(0, row[~unknown], fixed)
+    row, col, fraction = row[unknown], (free.cumsum(dim=0) - 1)[col[unknown]], fraction[unknown]
+    side = known.new_zeros(int(free.sum()), 3).index_add(0, col, fraction[:, None] * target[row])
+    shape = (len(centre), len(side))
+    bending = coo_array(
+        (fraction.cpu().numpy(), (row.cpu().numpy(), col.cpu().numpy())), shape=shape
+    )
     energy = (bending.T @ bending).tocoo()
     rows, cols, values = (
         torch.from_numpy(part).to(side.device) for part in (*energy.coords, energy.data)

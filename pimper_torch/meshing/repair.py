@@ -28,7 +28,7 @@ class RepairConfig:
     """What of a surface is broken, and how far a broken place may extend to be repaired.
 
     Attributes:
-        max_extent: Diagonal of a repaired place's bounding box, as a share of the surface's; 0
+        max_extent: Diagonal of a repaired place's bounding box, as a fraction of the surface's; 0
             repairs nothing.
         max_stretch: Longest edge of a face, in multiples of the surface's median edge; longer
             ones are spikes.

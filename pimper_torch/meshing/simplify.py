@@ -16,7 +16,7 @@ from pimper_torch.records import Mesh, Record
 _SLICES = 4
 _DOUBLINGS = 5
 _EDGES = 100_000  # tell their median to a few thousandths
-_ROUNDS = 30  # few vertices go after the first ten
+_ITERATIONS = 30  # few vertices go after the first ten
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,8 +32,8 @@ class Bounds:
     angle_deg: float
 
 
-# A twentieth of a sample's spacing and 1.5 degrees. With a tenth, the finest relief of the demo's
-# skull is lost where its shape is shaded without the vertices' normals.
+# A twentieth of a sample's spacing and 1.5 degrees. With a tenth, the finest height field of the
+# demo's skull is lost where its shape is shaded without the vertices' normals.
 FAITHFUL = Bounds(spacings=0.05, angle_deg=1.5)
 
 
@@ -107,7 +107,7 @@ def simplify(
             channels,
             bounds.spacings * spacing,
             float(np.cos(np.radians(bounds.angle_deg))),
-            _ROUNDS,
+            _ITERATIONS,
             faces,
             head,
             following,

@@ -1,4 +1,4 @@
-"""Integration: normals of every patch become its relief."""
+"""Integration: normals of every patch become its height field."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 from pimper_torch.config import require
 from pimper_torch.geometry.filling import fill_smoothly
 from pimper_torch.geometry.frames import transform
-from pimper_torch.geometry.reliefs import sample_raster
+from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.geometry.surfaces import slopes_from_normals
 from pimper_torch.linalg.poisson import integrate_weighted
 from pimper_torch.progress import track
@@ -53,7 +53,7 @@ class Integrate(Stage):
     Frankot and Chellappa's projection in the cosine basis, bucket by bucket. Samples without
     normals, and the raster outside the enlarged triangle, get slopes filled in smoothly from
     the samples around them; a patch without any normals stays its facet's plane. The free
-    constant is chosen so that the relief passes, on average, through the facet's corners.
+    constant is chosen so that the height field passes, on average, through the facet's corners.
 
     Differentiable in normals and confidence.
 
@@ -66,12 +66,12 @@ class Integrate(Stage):
         self.config = config or IntegrateConfig()
 
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
-        """Give every patch its relief; ``valid`` inside enlarged triangles that have data."""
+        """Give every patch its height field; ``valid`` inside enlarged triangles that have data."""
         steepest = math.tan(math.radians(_MAX_TILT_DEG))
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
         buckets = []
         for templates, photometry in track(pairs):
-            relief = integrate_normals(
+            height_field = integrate_normals(
                 photometry.normals_patch,
                 photometry.valid,
                 photometry.confidence,
@@ -79,7 +79,7 @@ class Integrate(Stage):
                 steepest,
                 self.config.iterations,
             )
-            depth = through_corners(relief, templates, photometric.patches.coarse)
+            depth = through_corners(height_field, templates, photometric.patches.coarse)
             buckets.append(_depths(depth, templates, photometry))
         return DepthPatches(photometric=photometric, buckets=tuple(buckets))
 
@@ -92,7 +92,7 @@ def integrate_normals(
     steepest: float,
     iterations: int,
 ) -> Float[Tensor, "patch height width"]:
-    """Find the relief, of mean zero over its raster, whose slopes are the normals'.
+    """Find the height field, of mean zero over its raster, whose slopes are the normals'.
 
     Args:
         normals: Unit, ``n_z < 0``; anything where not valid.
@@ -108,14 +108,14 @@ def integrate_normals(
     right = (slopes[:, 0, :, 1:] + slopes[:, 0, :, :-1]) / 2
     down = (slopes[:, 1, 1:] + slopes[:, 1, :-1]) / 2
     weight = torch.where(valid, confidence.double().clamp(_MIN_CONFIDENCE, 1), _FILLED_WEIGHT)
-    relief = integrate_weighted(
+    height_field = integrate_weighted(
         right,
         down,
         torch.minimum(weight[:, :, 1:], weight[:, :, :-1]),
         torch.minimum(weight[:, 1:], weight[:, :-1]),
         iterations,
     )
-    return relief.to(normals)
+    return height_field.to(normals)
 
 
 def _slopes(
@@ -130,14 +130,16 @@ def _slopes(
 
 
 def through_corners(
-    relief: Float[Tensor, "patch height width"], templates: Templates, coarse: CoarseMesh
+    height_field: Float[Tensor, "patch height width"], templates: Templates, coarse: CoarseMesh
 ) -> Float[Tensor, "patch height width"]:
-    """Shift reliefs along z so that they pass, on average, through their facets' corners."""
+    """Shift height fields along z so that they pass, on average, through their facets' corners."""
     vertices = coarse.mesh.vertices_world[coarse.mesh.faces[templates.facet]]
     corners = transform(templates.patch_from_world, vertices)
-    found = sample_raster(relief[:, None], corners[..., :2], templates.origin, templates.spacing)
+    found = sample_raster(
+        height_field[:, None], corners[..., :2], templates.origin, templates.spacing
+    )
     offset = (found[:, 0] - corners[..., 2]).mean(dim=1)
-    return relief - offset[:, None, None]
+    return height_field - offset[:, None, None]
 
 
 def _depths(

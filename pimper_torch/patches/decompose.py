@@ -13,7 +13,7 @@ from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
-from pimper_torch.patches.carry import carry
+from pimper_torch.patches.transfer import transfer
 from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
 from pimper_torch.stage import Stage
 
@@ -98,7 +98,7 @@ class Decompose(Stage):
             for facets, raster in group_by_size(sides, max(1, samples))
         )
         patches = PatchSet(coarse=coarse, buckets=buckets)
-        return patches if surface is None else carry(patches, surface.mesh)
+        return patches if surface is None else transfer(patches, surface.mesh)
 
 
 def facet_frames(
@@ -134,10 +134,10 @@ def sample_spacing(
 def views_facing(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], cameras: Cameras
 ) -> Int[Tensor, " face"]:
-    """Count, for each facet, the views that it faces and that have its middle in their frame."""
-    middle, normals = vertices[faces].mean(dim=1), face_normals(vertices, faces)
-    pixels, depth = project(middle[None], cameras.cam_from_world, cameras.intrinsics)
-    towards = cameras.centers_world[:, None] - middle
+    """Count, for each facet, the views that it faces and that have its centre in their frame."""
+    centre, normals = vertices[faces].mean(dim=1), face_normals(vertices, faces)
+    pixels, depth = project(centre[None], cameras.cam_from_world, cameras.intrinsics)
+    towards = cameras.centers_world[:, None] - centre
     framed = ((pixels >= 0) & (pixels <= cameras.sizes_px[:, None])).all(dim=-1) & (depth > 0)
     return (framed & ((towards * normals).sum(dim=-1) > 0)).sum(dim=0)
 

@@ -81,7 +81,7 @@ def hide(
     columns = as_array(_answering(width, templates.depth.shape[2]))
     rays = resample.sites(as_array(registered.valid), rows, columns, as_array(asked))
     starts, directions, reach = torch.empty(rays, 3), torch.empty(rays, 3), torch.empty(rays)
-    # An enlarged triangle dips under its neighbours by the overlap's share of their slope.
+    # An enlarged triangle dips under its neighbours by the overlap's fraction of their slope.
     tolerance = 4 * stride * templates.spacing
     resample.sight_lines(
         as_array(asked),

@@ -68,7 +68,7 @@ class Sources(Record):
 
     Attributes:
         images: Linear radiance; zero where it is no number.
-        unusable: Share of every pixel that is unusable, in 255ths: outside the undistorted frame
+        unusable: Fraction of every pixel that is unusable, in 255ths: outside the undistorted frame
             or the mask, not finite, or saturated in any channel.
         gray: Mean over the channels.
         caster: The surface that hides what is behind it; ``None`` while there is none.
@@ -137,16 +137,16 @@ def _one(
     if views.masks is not None:
         unusable = unusable | ~views.masks[view]
     lost = unusable[None, None].to(image)
-    coloured, shares = [image], [lost]
+    coloured, fractions = [image], [lost]
     for _ in range(levels - 1):
         coloured.append(halve(coloured[-1]))
-        shares.append(halve(shares[-1]))
+        fractions.append(halve(fractions[-1]))
     gray = [level[0].mean(dim=0) for level in coloured]
 
     def row(parts: list[Tensor]) -> Tensor:
         return torch.cat([part.reshape(-1) for part in parts[1:]] or [image.new_empty(0)])
 
-    in_255ths = (255 * row(shares)).round().to(torch.uint8)
+    in_255ths = (255 * row(fractions)).round().to(torch.uint8)
     finest = 255 * unusable[None].to(torch.uint8)
     return row(coloured), gray[0][None], row(gray), finest, in_255ths
 

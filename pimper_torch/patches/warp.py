@@ -124,8 +124,8 @@ class Warp(Stage):
         points_world = points.reshape(num, height, width, 3)
         outward = -world_from_patch[:, None, None, :3, 2].expand_as(points_world)
         if templates.normals_patch is not None:
-            carried = templates.normals_patch.detach().reshape(num, -1, 3)
-            outward = rotate(world_from_patch, carried).reshape(points_world.shape)
+            transferred = templates.normals_patch.detach().reshape(num, -1, 3)
+            outward = rotate(world_from_patch, transferred).reshape(points_world.shape)
         seen = [
             self._seen_by(view, templates, points_world, outward, cameras, sources)
             for view in range(cameras.num_views)
@@ -162,8 +162,8 @@ class Warp(Stage):
         within = ((pixels >= margin) & (pixels <= size - margin)).all(dim=-1)
         wanted = wanted & within
         found = look_up(sources.images.levels(view), pixels[wanted], level[wanted])
-        shares = [share.to(found) for share in sources.unusable.levels(view)]
-        lost = look_up(shares, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
+        fractions = [fraction.to(found) for fraction in sources.unusable.levels(view)]
+        lost = look_up(fractions, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
         usable = (lost < 0.1) & (found.mean(dim=1) > self.config.dark_level)
         radiance = found.new_zeros(*wanted.shape, found.shape[1])
         radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
@@ -184,15 +184,15 @@ class Warp(Stage):
         sparse = points_world[:, stride // 2 :: stride, stride // 2 :: stride]
         if not asked.any() or sparse.numel() == 0:
             return torch.zeros_like(asked)
-        # An enlarged triangle dips under its neighbours by the overlap's share of their slope.
+        # An enlarged triangle dips under its neighbours by the overlap's fraction of their slope.
         own = 4 * stride * templates.spacing[:, None, None]
         hidden = caster.occluded(sparse, center, own)
         dense = interpolate(hidden[:, None].float(), size=asked.shape[-2:], mode="nearest-exact")
         return dense[:, 0] > 0
 
 
-def missing_share(seen: PatchViews) -> float:
-    """Give the share of the enlarged triangles' samples, over all views, that is missing."""
+def missing_fraction(seen: PatchViews) -> float:
+    """Give the fraction of the enlarged triangles' samples, over all views, that is missing."""
     pairs = list(zip(seen.patches.buckets, seen.buckets, strict=True))
     samples = sum(int(t.inside.sum()) * r.valid.shape[1] for t, r in pairs)
     return 1 - sum(int(registered.valid.sum()) for _, registered in pairs) / samples

@@ -36,7 +36,7 @@ from pimper_torch.photometry.quadratics import diagonal, solve_packed
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record, StopCause
 
-# The penalty starts at this share of what the data knows about a sample, per unknown; it
+# The penalty starts at this fraction of what the data knows about a sample, per unknown; it
 # grows by the factor below each step up to the cap. A stiff penalty ties lights and shading
 # to each other, and both crawl: of 0.01 to 0.3, this start needed the fewest steps to a
 # residual of 1e-8 with 60 % of the entries missing.
@@ -61,7 +61,7 @@ def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Fact
         max_iterations: Steps at most.
         tolerance: A patch is done, and leaves the batch, when in one step neither its
             shading vectors nor their distance from the manifold changed or remained by more
-            than this share of their length.
+            than this fraction of their length.
 
     Returns:
         Factors with ``N`` exactly on the manifold. Without ``pull`` the scale between albedo
@@ -95,8 +95,8 @@ def _step(problem: Bilinear, state: _State, step: int) -> tuple[_State, Float[Te
     # What the data alone knows of a sample: the trace of L^T W L.
     trace = (weight * state.lights.square().sum(dim=2, keepdim=True)).sum(dim=1)
     seen = trace > 0
-    share = min(PENALTY_START * PENALTY_GROWTH**step, PENALTY_CAP)
-    penalty = share * trace.sum(dim=1) / (rank * seen.sum(dim=1)).clamp_min(1)
+    fraction = min(PENALTY_START * PENALTY_GROWTH**step, PENALTY_CAP)
+    penalty = fraction * trace.sum(dim=1) / (rank * seen.sum(dim=1)).clamp_min(1)
     penalty = penalty.clamp_min(torch.finfo(A.dtype).tiny ** 0.5)[:, None, None]
     A[:, diagonal(rank)] += penalty
     free = solve_packed(A, b + penalty * (state.shading - state.multiplier))

@@ -35,7 +35,7 @@ from pimper_torch.photometry.quadratics import (
 from pimper_torch.photometry.robust import Loss, Squares, spread
 from pimper_torch.records import Convergence, Record, StopCause
 
-# The spread of residuals is never taken to be less than this share of a patch's brightness:
+# The spread of residuals is never taken to be less than this fraction of a patch's brightness:
 # on exact data all residuals are rounding, and none is an outlier.
 SMALLEST_SPREAD = 1e-4
 
@@ -43,7 +43,7 @@ SMALLEST_SPREAD = 1e-4
 # medians cost as much as a step.
 REWEIGH_EVERY = 3
 
-# A step along a curved manifold longer than this share of albedo, about radians of the normal,
+# A step along a curved manifold longer than this fraction of albedo, about radians of the normal,
 # leaves the place where its quadratic model holds.
 LONGEST_STEP = 0.3
 
@@ -58,7 +58,7 @@ class Bilinear(Record):
         lights: Where the lights start.
         anchor: What the lights are pulled to.
         shading: Where ``N`` starts, columns on the manifold.
-        pull: ``c_f`` per view.
+        regularization: ``c_f`` per view.
         prior: ``P``, packed: what else is known of the shading vectors, such as normals they
             should not bend away from (:meth:`Cone.bend
             <pimper_torch.photometry.manifolds.Cone.bend>`); ``None`` for nothing.
@@ -72,7 +72,7 @@ class Bilinear(Record):
     lights: Float[Tensor, "patch view rank"]
     anchor: Float[Tensor, "patch view rank"]
     shading: Float[Tensor, "patch rank sample"]
-    pull: Float[Tensor, "patch view"]
+    regularization: Float[Tensor, "patch view"]
     prior: Float[Tensor, "patch packed sample"] | None = None
     manifold: Manifold = Cone()  # noqa: RUF009 - frozen
     loss: Loss = Squares()  # noqa: RUF009 - frozen
@@ -81,7 +81,7 @@ class Bilinear(Record):
     @property
     def requires_grad(self) -> bool:
         """Whether the solution is to carry gradients."""
-        data = (self.radiance, self.anchor, self.pull, self.prior)
+        data = (self.radiance, self.anchor, self.regularization, self.prior)
         return any(part is not None and part.requires_grad for part in data)
 
 
@@ -137,8 +137,10 @@ def equations_of_views(
 ) -> tuple[Float[Tensor, "patch packed view"], Float[Tensor, "patch rank view"]]:
     """Assemble the normal equations for every view's light, pull included."""
     packed = (weight @ outer(shading).mT).mT.clone()
-    packed[:, diagonal(shading.shape[1])] += problem.pull[:, None, :]
-    rhs = (weight * problem.radiance) @ shading.mT + problem.pull[..., None] * problem.anchor
+    packed[:, diagonal(shading.shape[1])] += problem.regularization[:, None, :]
+    rhs = (weight * problem.radiance) @ shading.mT + problem.regularization[
+        ..., None
+    ] * problem.anchor
     return packed, rhs.mT
 
 
@@ -176,11 +178,11 @@ def evaluate(
     heavy = weight * residual
     cost = torch.linalg.vecdot(heavy.flatten(1), residual.flatten(1))
     apart = lights - problem.anchor
-    cost = cost + (problem.pull * apart.square().sum(dim=2)).sum(dim=1)
+    cost = cost + (problem.regularization * apart.square().sum(dim=2)).sum(dim=1)
     if problem.prior is not None:
         bent = shading * apply_packed(problem.prior, shading)
         cost = cost + bent.sum(dim=(1, 2))
-    return cost, heavy @ shading.mT - problem.pull[..., None] * apart
+    return cost, heavy @ shading.mT - problem.regularization[..., None] * apart
 
 
 def follow(
@@ -253,7 +255,7 @@ def keep_scale(
 ) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch rank sample"]]:
     """Hold the size of the lights where nothing else does, and shrink shading by as much."""
     was, size = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
-    loose = (problem.pull.amax(dim=1) == 0) & (size > 0) & (was > 0)
+    loose = (problem.regularization.amax(dim=1) == 0) & (size > 0) & (was > 0)
     factor = torch.where(loose, (was / torch.where(size > 0, size, 1)).sqrt(), 1)[:, None, None]
     return lights * factor, shading / factor
 

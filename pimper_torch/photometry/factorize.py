@@ -14,13 +14,13 @@ from pimper_torch.config import require
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import side_by_side
-from pimper_torch.patches.carry import carried_normals
+from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold, start_from_mesh
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.implicit import differentiable
-from pimper_torch.photometry.light_field import LightField, faces_lamp
+from pimper_torch.photometry.light_field import LightField, faces_light
 from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
@@ -42,8 +42,8 @@ from pimper_torch.stage import Stage
 # The pull on a light counts as if so many samples more were seen than there are.
 BORROWED_SAMPLES = 16.0
 
-# Free lights still need a hold where a view has next to no samples: this share of its data.
-MIN_PULL = 1e-6
+# Free lights still need a hold where a view has next to no samples: this fraction of its data.
+MIN_REGULARIZATION = 1e-6
 
 # The Gauss-Newton matrix of a patch's lights is summed over about this many samples.
 CURVATURE_SAMPLES = 256
@@ -84,17 +84,17 @@ class FactorizeConfig:
 
     Attributes:
         light: What is fitted to the coarse mesh: ``"soft"``, one first-order light a view all
-            over the scene; ``"lamp"``, an ambient term and a lamp at some place, with attached
-            shadows; ``"auto"``, the one of them that explains the photographs better.
+            over the scene; ``"point light"``, an ambient term and a point light at some place, with
+            attached shadows; ``"auto"``, the one of them that explains the photographs better.
         solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
             eliminated; ``"balm"``, augmented Lagrangian.
-        light_pull: How strongly each patch's lights hold to those fitted to the mesh, in units
+        light_prior: How strongly each patch's lights hold to those fitted to the mesh, in units
             of the patch's own data; 0 leaves them free, 1e6 fixes them.
         geometry_weight: How strongly normals hold to the coarse ones, in units of one view.
         loss: How highlights and shadows lose weight: ``"cauchy"``, or ``"squares"``, not at
             all.
-        shadows: Whether samples that the lamp cannot reach past the surface are missing. Needs
-            a surface that is nearly right.
+        shadows: Whether samples that the point light cannot reach past the surface are missing.
+            Needs a surface that is nearly right.
         loss_scale: Of the loss, in standard deviations of the patch's residuals; Cauchy's
             weight there is a half.
         min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
@@ -106,9 +106,9 @@ class FactorizeConfig:
             projection, of its shading vectors with BALM.
     """
 
-    light: Literal["auto", "soft", "lamp"] = "auto"
+    light: Literal["auto", "soft", "point_light"] = "auto"
     solver: Literal["variable-projection", "balm"] = "variable-projection"
-    light_pull: float = 1.0
+    light_prior: float = 1.0
     geometry_weight: float = 0.1
     loss: Literal["squares", "cauchy"] = "cauchy"
     loss_scale: float = 2.385  # 95 % efficient on Gaussian noise
@@ -119,11 +119,11 @@ class FactorizeConfig:
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        models = ("auto", "soft", "lamp")
-        require(self.light in models, "factorize.light", self.light, "auto, soft or lamp")
+        models = ("auto", "soft", "point_light")
+        require(self.light in models, "factorize.light", self.light, "auto, soft or point light")
         require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
         require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
-        for name in ("light_pull", "geometry_weight"):
+        for name in ("light_prior", "geometry_weight"):
             value = getattr(self, name)
             require(value >= 0, f"factorize.{name}", value, "0 or more")
         require(self.loss_scale > 0, "factorize.loss_scale", self.loss_scale, "above 0")
@@ -170,8 +170,8 @@ class Factorize(Stage):
     r"""Separate albedo, normals and light: ``J = L N`` with ``N`` on the photometric cone.
 
     First the light field of every view is fitted to the smoothed normals of the coarse mesh:
-    soft light, or a lamp at some place. Then every patch is factorized, its lights held to
-    what the field has there by ``light_pull``; samples that face away from the lamp are
+    soft light, or a point light at some place. Then every patch is factorized, its lights held to
+    what the field has there by ``light_prior``; samples that face away from the point light are
     missing. The last step of each sample is exact, and albedo is fitted to every channel.
 
     In parts, for patches that are never all there at once: :meth:`light` from thinned templates,
@@ -214,9 +214,9 @@ class Factorize(Stage):
             seen: Of all patches; views on templates that are
                 :func:`~pimper_torch.photometry.lights.thinned` are enough.
         """
-        coarse = [carried_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
+        coarse = [transferred_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
         field = light_of_mesh(seen, coarse, self.config.min_views, self.config.light)
-        if not self.config.shadows or not bool(field.lamp.any()):
+        if not self.config.shadows or not bool(field.point_light.any()):
             return Illumination(field=field, caster=None)
         mesh = seen.patches.surface or seen.patches.coarse.mesh
         return Illumination(field=field, caster=RayCaster(mesh.vertices_world, mesh.faces))
@@ -229,7 +229,7 @@ class Factorize(Stage):
         """
         buckets = []
         for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
-            normals = carried_normals(seen.patches.coarse, templates)
+            normals = transferred_normals(seen.patches.coarse, templates)
             bucket = _Bucket(templates=templates, registered=registered, normals=normals)
             lit = bucket.replace(registered=_lit(bucket, light))
             posed = self._pose(lit, light.field)
@@ -245,13 +245,13 @@ class Factorize(Stage):
     def _pose(self, bucket: _Bucket, field: LightField) -> _Posed:
         config = self.config
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
-        middle = invert_rigid(patch_from_world)[:, :3, 3]
-        anchor = rotate_lights(patch_from_world, field.lights_at(middle))
-        lamp = rotate(patch_from_world, field.lamp_at(middle))
+        centre = invert_rigid(patch_from_world)[:, :3, 3]
+        anchor = rotate_lights(patch_from_world, field.lights_at(centre))
+        point_light = rotate(patch_from_world, field.point_light_at(centre))
         rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
         shown = bucket.registered.valid & bucket.templates.inside[:, None]
         finite = rows.seen.flatten(1).any(dim=1)
-        rows = rows.replace(seen=rows.seen & faces_lamp(lamp, rows.normals))
+        rows = rows.replace(seen=rows.seen & faces_light(point_light, rows.normals))
         status = judge_data(
             shown.flatten(1).any(dim=1),
             finite,
@@ -303,7 +303,9 @@ class Factorize(Stage):
         count = (square > 0).sum(dim=1).clamp_min(1)
         seen_square = (weight @ square[..., None])[..., 0]
         borrowed = BORROWED_SAMPLES * square.sum(dim=1) / count
-        pull = max(config.light_pull, MIN_PULL) * (seen_square + borrowed[:, None])
+        regularization = max(config.light_prior, MIN_REGULARIZATION) * (
+            seen_square + borrowed[:, None]
+        )
         views = rows.seen.any(dim=2).sum(dim=1).clamp_min(1)
         level = (anchor**2).sum(dim=(1, 2)) / views
         prior = None
@@ -316,7 +318,7 @@ class Factorize(Stage):
             lights=anchor,
             anchor=anchor,
             shading=shading,
-            pull=pull,
+            regularization=regularization,
             prior=prior,
             manifold=cone,
             loss=LOSSES[config.loss](config.loss_scale),

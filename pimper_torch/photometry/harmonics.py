@@ -29,5 +29,5 @@ def rotate_lights(
     Shading is the same in every frame: ``l . (1, n)`` with both in the source frame equals
     it with both in the target frame. Only the rotation of the rigid transform matters.
     """
-    turned = lights[..., 1:] @ target_from_source[..., :3, :3].mT
-    return torch.cat([lights[..., :1].expand_as(turned[..., :1]), turned], dim=-1)
+    rotated = lights[..., 1:] @ target_from_source[..., :3, :3].mT
+    return torch.cat([lights[..., :1].expand_as(rotated[..., :1]), rotated], dim=-1)

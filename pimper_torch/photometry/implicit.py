@@ -35,11 +35,11 @@ from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record
 
 # Directions that nothing determines, such as Lorentz transformations of free lights, are held by
-# this share of the mean curvature: the answer moves along none of them.
+# this fraction of the mean curvature: the answer moves along none of them.
 _RIDGE = 1e-10
 
 # Newton's method doubles the digits of a solution at every step, once it is near; before that its
-# steps are halved until they help, down to this share.
+# steps are halved until they help, down to this fraction.
 _NEWTON_STEPS, _MIN_STEP = 30, 1e-3
 
 # Entries of the mixed part of the Hessian that are held at once.
@@ -67,7 +67,7 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     L, N = factors.lights.detach().double(), factors.shading.detach().double()
     hessian = _hessian(problem, L, N)
     step = _newton_step(problem, hessian)
-    moved = combination(hessian.columns, step.turn)
+    moved = combination(hessian.columns, step.rotation)
     lights = factors.lights.detach() + (step.lights - step.lights.detach()).to(factors.lights)
     shading = factors.shading.detach() + (moved - moved.detach()).to(factors.shading)
     convergence = factors.convergence
@@ -84,13 +84,13 @@ class Step(Record):
     """A change of all unknowns: of the lights, and of the samples along their tangents."""
 
     lights: Float[Tensor, "patch view rank"]
-    turn: Float[Tensor, "patch tangent sample"]
+    rotation: Float[Tensor, "patch tangent sample"]
 
     def moved(self, factor: Float[Tensor, " patch"], other: "Step") -> "Step":
         """Add so many times another step."""
         return Step(
             lights=self.lights + factor[:, None, None] * other.lights,
-            turn=self.turn + factor[:, None, None] * other.turn,
+            rotation=self.rotation + factor[:, None, None] * other.rotation,
         )
 
 
@@ -122,22 +122,22 @@ def _polished(problem: Bilinear, factors: Factors) -> Factors:
     """Take Newton steps, patch by patch, as long as they bring the slopes nearer to zero."""
     hessian = _hessian(problem, factors.lights.double(), factors.shading.double())
     size = _slope_size(problem, hessian)
-    share = torch.ones_like(size)
+    fraction = torch.ones_like(size)
     for _ in range(_NEWTON_STEPS):
         step = _newton_step(problem, hessian)
-        L = hessian.lights + share[:, None, None] * step.lights
-        turn = combination(hessian.columns, share[:, None, None] * step.turn)
-        N = problem.manifold.retract((hessian.shading + turn).mT).mT
+        L = hessian.lights + fraction[:, None, None] * step.lights
+        rotation = combination(hessian.columns, fraction[:, None, None] * step.rotation)
+        N = problem.manifold.retract((hessian.shading + rotation).mT).mT
         there = _hessian(problem, L, N)
         after = _slope_size(problem, there)
         better = after < size
-        share = torch.where(better, (2 * share).clamp_max(1), share / 2)
+        fraction = torch.where(better, (2 * fraction).clamp_max(1), fraction / 2)
         if bool(better.any()):
             keep = better[:, None, None]
             L, N = torch.where(keep, L, hessian.lights), torch.where(keep, N, hessian.shading)
             size = torch.where(better, after, size)
             hessian = _hessian(problem, L, N)
-        elif bool((share < _MIN_STEP).all()):
+        elif bool((fraction < _MIN_STEP).all()):
             break
     return factors.replace(
         lights=hessian.lights.to(factors.lights), shading=hessian.shading.to(factors.shading)
@@ -176,7 +176,7 @@ def _solved(
     slope = on_lights - _mix(hessian, inner)
     flat = slope.reshape(len(slope), -1, 1)
     lights = torch.linalg.solve(hessian.schur, flat).reshape(slope.shape)
-    return Step(lights=lights, turn=inner - _apply(hessian.inverse, _mix_back(hessian, lights)))
+    return Step(lights=lights, rotation=inner - _apply(hessian.inverse, _mix_back(hessian, lights)))
 
 
 def _by_deviation(
@@ -207,7 +207,7 @@ def _change_of(
 ) -> Float[Tensor, " patch"]:
     """Give how much a step changes the deviation."""
     shown = step.lights @ hessian.shading
-    shown = shown + hessian.lights @ combination(hessian.columns, step.turn)
+    shown = shown + hessian.lights @ combination(hessian.columns, step.rotation)
     return -(told * shown).sum(dim=(1, 2))
 
 
@@ -248,8 +248,8 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
     L, N = hessian.lights, hessian.shading
     batch, views, rank = L.shape
     total = curvature_of_views(N, hessian.bent)
-    pull = problem.pull.double()[..., None].expand(-1, -1, rank).flatten(1)
-    total = total + torch.diag_embed(pull)
+    regularization = problem.regularization.double()[..., None].expand(-1, -1, rank).flatten(1)
+    total = total + torch.diag_embed(regularization)
     mean = total.diagonal(dim1=1, dim2=2).mean(dim=1)
     size = max(1, _CHUNK_ENTRIES // (batch * views * rank * len(hessian.columns)))
     for first in range(0, N.shape[2], size):
@@ -279,7 +279,7 @@ def _slopes(
     deviation = deviation_of(problem, residual)[:, None, None]
     pulled = problem.weight.double() * problem.loss.weights(residual, deviation) * residual
     apart = L - problem.anchor.double()
-    on_lights = pulled @ N.mT - problem.pull.double()[..., None] * apart
+    on_lights = pulled @ N.mT - problem.regularization.double()[..., None] * apart
     ambient = L.mT @ pulled
     if problem.prior is not None:
         ambient = ambient - apply_packed(problem.prior.double(), N)
@@ -287,10 +287,10 @@ def _slopes(
 
 
 def _mix(
-    hessian: Hessian, turn: Float[Tensor, "patch tangent sample"]
+    hessian: Hessian, rotation: Float[Tensor, "patch tangent sample"]
 ) -> Float[Tensor, "patch view rank"]:
     """Apply the mixed part to changes of the samples."""
-    moved = combination(hessian.columns, turn)
+    moved = combination(hessian.columns, rotation)
     return (
         hessian.bent * (hessian.lights @ moved)
     ) @ hessian.shading.mT - hessian.pulled @ moved.mT

@@ -16,8 +16,8 @@ State = TypeVar("State", bound=Record)
 # What a step answers for a patch that is to go on.
 RUNNING = -1
 
-# Patches that are done leave the batch when they are this share of it.
-_COMPACT_SHARE = 0.25
+# Patches that are done leave the batch when they are this fraction of it.
+_COMPACT_FRACTION = 0.25
 
 
 def iterate(
@@ -53,7 +53,7 @@ def iterate(
         running = running & ~ended
         if not bool(running.any()):
             return final, taken, causes
-        if float((~running).double().mean()) >= _COMPACT_SHARE:
+        if float((~running).double().mean()) >= _COMPACT_FRACTION:
             keep = running.nonzero()[:, 0]
             state, problem, patches = state.take(keep), problem.take(keep), patches[keep]
             running = running[keep]

@@ -1,4 +1,4 @@
-"""Light that varies over the scene: a lamp at some place for every view, and soft light."""
+"""Light that varies over the scene: a point light at some place for every view, and soft light."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pimper_torch.records import Record
 
-# Cosine of the angle between normal and lamp that a sample needs to be lit beyond doubt.
+# Cosine of the angle between normal and point light that a sample needs to be lit beyond doubt.
 _MIN_COSINE = 0.05
 
 
@@ -21,41 +21,41 @@ class LightField(Record):
     .. math:: s \cdot (1, n) + \max(0, E(x) \cdot n), \qquad
               E(x) = |e| \frac{e/|e| - c (x - o)}{|e/|e| - c (x - o)|^3}:
 
-    soft light ``s``, and a lamp in the direction of ``e``, ``1 / c`` away from the origin
+    soft light ``s``, and a point light in the direction of ``e``, ``1 / c`` away from the origin
     ``o``, whose irradiance there is ``|e|`` and falls off with the square of the distance.
 
     Attributes:
         origin: World.
         soft: First-order harmonics, world.
-        lamp: ``e``; zero for none.
-        closeness: ``c``; zero for a lamp far away.
+        point_light: ``e``; zero for none.
+        closeness: ``c``; zero for a point light far away.
     """
 
     origin: Float[Tensor, " 3"]
     soft: Float[Tensor, "view 4"]
-    lamp: Float[Tensor, "view 3"]
+    point_light: Float[Tensor, "view 3"]
     closeness: Float[Tensor, " view"]
 
-    def lamp_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 3"]:
-        """Give ``E``: towards the lamp, as long as its irradiance."""
-        strength = self.lamp.norm(dim=1)
-        direction = self.lamp / torch.where(strength > 0, strength, 1)[:, None]
+    def point_light_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 3"]:
+        """Give ``E``: towards the point light, as long as its irradiance."""
+        strength = self.point_light.norm(dim=1)
+        direction = self.point_light / torch.where(strength > 0, strength, 1)[:, None]
         away = direction - self.closeness[:, None] * (points - self.origin)[:, None]
         distance = away.norm(dim=-1, keepdim=True)
         return strength[:, None] * away / torch.where(strength[:, None] > 0, distance, 1) ** 3
 
     def lights_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 4"]:
-        """Give the first-order light at places that the lamp faces, world frame."""
-        lamp = self.lamp_at(points)
+        """Give the first-order light at places that the point light faces, world frame."""
+        point_light = self.point_light_at(points)
         soft = self.soft.expand(len(points), -1, -1)
-        return torch.cat([soft[..., :1], soft[..., 1:] + lamp], dim=-1)
+        return torch.cat([soft[..., :1], soft[..., 1:] + point_light], dim=-1)
 
 
-def faces_lamp(
-    lamp: Float[Tensor, "patch view 3"], normals: Float[Tensor, "patch sample 3"]
+def faces_light(
+    point_light: Float[Tensor, "patch view 3"], normals: Float[Tensor, "patch sample 3"]
 ) -> Bool[Tensor, "patch view sample"]:
-    """Tell where the lamp stands before the surface; everywhere where there is no lamp.
+    """Tell where the surface faces the point light; everywhere without a point light.
 
     What faces away lies in attached shadow, which no light that is linear in ``(1, n)`` casts.
     """
-    return lamp @ normals.mT >= _MIN_COSINE * lamp.norm(dim=2, keepdim=True)
+    return point_light @ normals.mT >= _MIN_COSINE * point_light.norm(dim=2, keepdim=True)

@@ -16,18 +16,18 @@ from pimper_torch.linalg.implicit import implicit_solution, newton_solution
 from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
 from pimper_torch.photometry.shown import Shown
 
-# A fit is done when a step lowers its cost by less than this share; and iterations and share where
-# gradients are asked for, from which Newton's method goes on.
+# A fit is done when a step lowers its cost by less than this fraction; and iterations and share
+# where gradients are asked for, from which Newton's method goes on.
 _MIN_GAIN, _AT_REST = 1e-7, (300, 1e-13)
 
-# Share of the diagonal that is added to the normal equations where they precondition others: that
-# light and albedo share a factor makes them singular.
+# Fraction of the diagonal that is added to the normal equations where they precondition others:
+# that light and albedo share a factor makes them singular.
 _CLOSE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightFit:
-    """A fit, and its median residual as a share of the view's brightness."""
+    """A fit, and its median residual as a fraction of the view's brightness."""
 
     model: LightModel
     lights: Float[Tensor, "view parameter"]
@@ -41,7 +41,7 @@ def fit_lights(model: LightModel, shown: Shown, iterations: int) -> LightFit:
     Where gradients are asked for, the fit goes on to rest: see :func:`with_gradients`.
 
     Args:
-        model: Soft light or a lamp, on the samples.
+        model: Soft light or a point light, on the samples.
         shown: What they are to explain.
         iterations: At most, where no gradients are asked for.
     """
@@ -114,12 +114,12 @@ def _descend(
         weight = shown.weights(residual, scale)
         cost = shown.cost(residual, scale)
         slopes = albedo[:, None, None] * model.slopes(lights)
-        pull = weight * residual
-        downhill = (pull[..., None] * slopes).sum(dim=0)
+        regularization = weight * residual
+        downhill = (regularization[..., None] * slopes).sum(dim=0)
         # A parameter that would only be pushed over its bound stays out of the others' way.
         held = model.admit(lights + downhill) == lights
         normal = _normal_equations(shading, torch.where(held, 0, slopes), weight, damping)
-        steps = normal.solve(torch.where(held, 0, downhill), (pull * shading).sum(dim=1))
+        steps = normal.solve(torch.where(held, 0, downhill), (regularization * shading).sum(dim=1))
         moved = model.admit(lights + steps[0])
         under = model.shade(moved)
         changed = _best_albedo(shown, under, albedo + steps[1], weight, scale)
@@ -151,9 +151,9 @@ def with_gradients(found: LightFit, shown: Shown) -> LightFit:
         lights, albedo = at[:count].reshape(found.lights.shape), at[count:]
         shading = model.shade(lights)
         residual = shown.residual(albedo, shading)
-        pull = shown.weights(residual, shown.scale(residual)) * residual
-        by_lights = torch.einsum("sv,s,svp->vp", pull, albedo, model.slopes(lights))
-        return torch.cat([by_lights.flatten(), (pull * shading).sum(dim=1)])
+        regularization = shown.weights(residual, shown.scale(residual)) * residual
+        by_lights = torch.einsum("sv,s,svp->vp", regularization, albedo, model.slopes(lights))
+        return torch.cat([by_lights.flatten(), (regularization * shading).sum(dim=1)])
 
     with torch.no_grad():
         shading = model.shade(found.lights)
@@ -237,7 +237,7 @@ def _normal_equations(
         shading: What albedo 1 shows: the derivatives by the albedos.
         slopes: The derivatives by the parameters of the lights.
         weight: Of each residual.
-        damping: Share of the diagonal that is added to it.
+        damping: Fraction of the diagonal that is added to it.
     """
     _, num_views, size = slopes.shape
     heavy = weight[..., None] * slopes

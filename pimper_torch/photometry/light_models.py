@@ -1,4 +1,4 @@
-"""Models of one view's light, as functions of a few parameters: soft light, and a lamp."""
+"""Models of one view's light, as functions of a few parameters: soft light, and a point light."""
 
 from dataclasses import dataclass
 
@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.lamp_search import search_lamps
+from pimper_torch.photometry.point_light_search import search_point_lights
 from pimper_torch.photometry.shown import Shown
 
-# A lamp starts this far away, in mean distances of the samples from their middle, and comes no
-# nearer than the second: inside the scene its light has a pole.
+# A point light starts this far away, in mean distances of the samples from their centre, and comes
+# no nearer than the second: inside the scene its light has a pole.
 _FIRST_DISTANCE, MIN_DISTANCE = 10.0, 1.3
 
 
@@ -52,11 +52,11 @@ class SoftLight:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Lamp:
-    """Ambient light, the lamp's irradiance vector ``e`` at the middle, and its closeness."""
+class PointLight:
+    """Ambient light, the point light's irradiance vector ``e`` at the centre, and its closeness."""
 
     normals: Float[Tensor, "sample 3"]
-    points: Float[Tensor, "sample 3"]  # about the middle, in units of the scene's size
+    points: Float[Tensor, "sample 3"]  # about the centre, in units of the scene's size
 
     def known(self) -> tuple[Tensor, ...]:
         """List what the model is made from."""
@@ -68,12 +68,12 @@ class Lamp:
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:4]) > 0, inner], dim=1)
 
     def start(self, shown: Shown) -> tuple[Float[Tensor, "view 5"], Float[Tensor, " sample"]]:
-        """Search distant lamps; see :func:`~pimper_torch.photometry.lamp_search.search_lamps`.
+        """Search distant point lights, as in :mod:`~pimper_torch.photometry.point_light_search`.
 
         Returns:
             The lights, and the albedo that goes with them.
         """
-        lights, albedo = search_lamps(shown, self.normals)
+        lights, albedo = search_point_lights(shown, self.normals)
         near = torch.full_like(lights[:, :1], 1 / _FIRST_DISTANCE)
         return torch.cat([lights, near], dim=1), albedo
 
@@ -93,14 +93,16 @@ class Lamp:
             self.normals[:, None] - 3 * (facing / distance**2)[..., None] * away
         )
         along = (by_away * direction).sum(dim=-1, keepdim=True)
-        by_lamp = (facing * fall)[..., None] * direction + by_away - along * direction
+        by_point_light = (facing * fall)[..., None] * direction + by_away - along * direction
         by_closeness = -strength * (by_away * self.points[:, None]).sum(dim=-1)
         lit = (facing > 0).to(facing)
         ones = torch.ones_like(facing)[..., None]
-        return torch.cat([ones, lit[..., None] * by_lamp, (lit * by_closeness)[..., None]], dim=-1)
+        return torch.cat(
+            [ones, lit[..., None] * by_point_light, (lit * by_closeness)[..., None]], dim=-1
+        )
 
     def admit(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "view 5"]:
-        """Give the nearest parameters that make sense: lamps outside the scene."""
+        """Give the nearest parameters that make sense: point lights outside the scene."""
         ambient = lights[:, :1].clamp_min(0)
         closeness = lights[:, 4:].clamp(0, 1 / MIN_DISTANCE)
         return torch.cat([ambient, lights[:, 1:4], closeness], dim=1)
@@ -119,4 +121,4 @@ class Lamp:
         return strength, direction, away, away.norm(dim=-1).clamp_min(1e-6)
 
 
-LightModel = SoftLight | Lamp
+LightModel = SoftLight | PointLight

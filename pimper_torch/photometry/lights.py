@@ -4,9 +4,9 @@ The coarse mesh knows the shape to a few degrees; that is enough to calibrate li
 lights that are calibrated leave no ambiguity for the factorization.
 
 Two models are fitted, and the one that explains the photographs better is taken: soft light,
-the same first-order harmonics all over the scene; and a lamp at some place, whose light
+the same first-order harmonics all over the scene; and a point light at some place, whose light
 falls off, with attached shadows and an ambient term. One light for all, linear in
-:math:`(1, n)`, is no model for a lamp: its falling off and its shadows are taken for shape.
+:math:`(1, n)`, is no model for a point light: its falling off and its shadows are taken for shape.
 """
 
 import math
@@ -20,12 +20,13 @@ from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.photometry.light_field import LightField
 from pimper_torch.photometry.light_fit import fit_lights, with_gradients
-from pimper_torch.photometry.light_models import Lamp, SoftLight
+from pimper_torch.photometry.light_models import PointLight, SoftLight
 from pimper_torch.photometry.shown import Shown
 from pimper_torch.records import PatchSet, PatchViews, Templates
 
-# A lamp has one number more than soft light, and must leave smaller residuals than this share.
-_LAMP_GAIN = 0.95
+# A point light has one number more than soft light, and must leave smaller residuals than this
+# fraction.
+_POINT_LIGHT_GAIN = 0.95
 
 # Light is fitted to this many samples at most; more would only repeat them.
 LIGHT_SAMPLES = 10_000
@@ -54,7 +55,7 @@ def light_of_mesh(
     seen: PatchViews,
     coarse: list[Float[Tensor, "_ _ _ 3"]],
     min_views: int,
-    model: Literal["auto", "soft", "lamp"],
+    model: Literal["auto", "soft", "point_light"],
 ) -> LightField:
     """Fit the light field to samples spread evenly over the facets themselves.
 
@@ -98,10 +99,10 @@ def fit_light_field(
     seen: Bool[Tensor, "sample view"],
     normals: Float[Tensor, "sample 3"],
     points: Float[Tensor, "sample 3"] | None = None,
-    model: Literal["auto", "soft", "lamp"] = "auto",
+    model: Literal["auto", "soft", "point_light"] = "auto",
     iterations: int = 60,
 ) -> LightField:
-    r"""Fit soft light or lamps, or both, and take what leaves the smaller residuals.
+    r"""Fit soft light or point lights, or both, and take what leaves the smaller residuals.
 
     Minimised is :math:`\sum_{ig} \phi(x_{gi} - \rho_i\, s_g(i))`, :math:`\phi` being Cauchy's
     loss with a scale of 2.385 spreads of the view's residuals (wider at first).
@@ -110,20 +111,21 @@ def fit_light_field(
         radiance: Gray, linear. Entries that are not seen do not matter.
         seen: False where missing.
         normals: Unit, world.
-        points: World; without, lamps are far away.
+        points: World; without, point lights are far away.
         model: Which to fit; ``auto`` is both.
         iterations: At most, for each model.
 
     Returns:
         The scale between light and albedo is free; here the median of ``|l|`` over the views,
-        at the middle of the points, is 1. A view without data has zero.
+        at the centre of the points, is 1. A view without data has zero.
 
     Fails where the normals span too little (a plane shows one number of each soft light): the
     answer is then the smallest change from lights that shine along the mean normal, and
     lights that differ are found parallel. Computed in float64. Differentiable by the implicit
     function; which model is taken, and what is held at a bound, is constant.
 
-    Source: of the lamp, Queau et al., LED-based photometric stereo, JMIV 60, 2018; that it is
+    Source: of the point light, Queau et al., LED-based photometric stereo, JMIV 60, 2018; that it
+        is
     calibrated by the coarse shape is ours.
     """
     views = radiance.shape[1]
@@ -131,7 +133,7 @@ def fit_light_field(
         return LightField(
             origin=radiance.new_zeros(3),
             soft=radiance.new_zeros(views, 4),
-            lamp=radiance.new_zeros(views, 3),
+            point_light=radiance.new_zeros(views, 3),
             closeness=radiance.new_zeros(views),
         )
     some = seen.any(dim=1)
@@ -141,32 +143,36 @@ def fit_light_field(
     places = torch.zeros_like(known) if points is None else points[some].double()
     origin = places.mean(dim=0)
     size = _extent(places - origin)
-    soft = lamp = None
-    if model != "lamp":
+    soft = point_light = None
+    if model != "point_light":
         soft = fit_lights(SoftLight(basis=harmonics(known)), shown, iterations)
     if model != "soft":
-        lamp = fit_lights(Lamp(normals=known, points=(places - origin) / size), shown, iterations)
+        point_light = fit_lights(
+            PointLight(normals=known, points=(places - origin) / size), shown, iterations
+        )
     lights = torch.zeros(views, 4).to(shown.radiance)
-    lamps, closeness = torch.zeros_like(lights[:, 1:]), torch.zeros_like(lights[:, 0])
-    if lamp is None or (soft is not None and lamp.misfit >= _LAMP_GAIN * soft.misfit):
+    point_lights, closeness = torch.zeros_like(lights[:, 1:]), torch.zeros_like(lights[:, 0])
+    if point_light is None or (
+        soft is not None and point_light.misfit >= _POINT_LIGHT_GAIN * soft.misfit
+    ):
         assert soft is not None
         lights = with_gradients(soft, shown).lights
     else:
-        told = with_gradients(lamp, shown).lights
+        told = with_gradients(point_light, shown).lights
         lights = torch.cat([told[:, :1], lights[:, 1:]], dim=1)
-        lamps = told[:, 1:4]
+        point_lights = told[:, 1:4]
         closeness = torch.zeros_like(closeness) if points is None else told[:, 4] / size
-    factor = _typical(lights.square().sum(dim=1) + lamps.square().sum(dim=1))
+    factor = _typical(lights.square().sum(dim=1) + point_lights.square().sum(dim=1))
     return LightField(
         origin=origin.to(radiance),
         soft=(lights / factor).to(radiance),
-        lamp=(lamps / factor).to(radiance),
+        point_light=(point_lights / factor).to(radiance),
         closeness=closeness.to(radiance),
     )
 
 
 def _extent(places: Float[Tensor, "sample 3"]) -> Float[Tensor, ""]:
-    """Give the mean distance of places from their middle, 1 if all are one."""
+    """Give the mean distance of places from their centre, 1 if all are one."""
     apart = places[(places != 0).any(dim=1)]
     return apart.norm(dim=1).sum() / len(places) if len(apart) else places.new_ones(())
 

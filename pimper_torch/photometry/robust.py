@@ -121,9 +121,9 @@ def robust_variance(
     half = seen.sum(dim=-1).to(square) / 2
     some = (square.detach() > 0).sum(dim=-1) > half
     scale = _scale_of_squares(square.detach(), torch.where(some, half, 1))[..., None]
-    share = _soft_step(square, scale)
-    slope = 2 * (share * (1 - share)).detach().sum(dim=-1)
-    off = (share.sum(dim=-1) - half) / torch.where(slope > 0, slope, 1)
+    fraction = _soft_step(square, scale)
+    slope = 2 * (fraction * (1 - fraction)).detach().sum(dim=-1)
+    off = (fraction.sum(dim=-1) - half) / torch.where(slope > 0, slope, 1)
     # One more of Newton's steps, next to nothing: the derivative is the implicit function's.
     variance = (scale[..., 0] * (1 + off)).clamp_min(0)
     return torch.where(some, variance / _OF_GAUSSIAN**2, 0)
@@ -138,9 +138,9 @@ def _scale_of_squares(
     scale = torch.where(scale > 0, scale, 1)
     close = torch.finfo(square.dtype).eps ** 0.75
     for _ in range(_SCALE_STEPS):
-        share = _soft_step(square, scale[..., None])
-        slope = 2 * (share.sum(dim=-1) - share.square().sum(dim=-1))
-        gain = (share.sum(dim=-1) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
+        fraction = _soft_step(square, scale[..., None])
+        slope = 2 * (fraction.sum(dim=-1) - fraction.square().sum(dim=-1))
+        gain = (fraction.sum(dim=-1) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
         scale = scale * gain.clamp(-_LONGEST_GAIN, _LONGEST_GAIN).exp()
         if bool((gain.abs() < close).all()):
             break

@@ -1,4 +1,4 @@
-"""Cast shadows: what the lamp of each view reaches, from the fitted light and the surface."""
+"""Cast shadows: what the point light of a view reaches, from light and surface."""
 
 import math
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ _RAYS_AT_ONCE = 1_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Shadows(Record):
-    """What lamps reach.
+    """What point lights reach.
 
     Attributes:
-        lit: True where nothing stands between the lamp and the surface, which faces it;
-            true everywhere in a view without a lamp.
+        lit: True where nothing stands between the point light and the surface, which faces it;
+            true everywhere in a view without a point light.
         sure: True where no edge of a cast shadow is nearer than the guard.
     """
 
@@ -42,25 +42,25 @@ def cast_shadows(
     guard: float | Float[Tensor, "*#batch"] = 0.0,
     asked: Bool[Tensor, "*batch view"] | None = None,
 ) -> Shadows:
-    """Cast a ray from every sample to the lamp of every view.
+    """Cast a ray from every sample to the point light of every view.
 
     Args:
-        field: Lamps.
+        field: Point lights.
         caster: The surface that casts the shadows.
         points: World; on that surface or near it.
         normals: Unit, outward.
         tolerance: How far points may lie off the surface, scene units: rays start so far
-            along the normal, and as far again towards the lamp. A body thinner than that casts
-            no shadow on what it touches.
+            along the normal, and as far again towards the point light. A body thinner than that
+            casts no shadow on what it touches.
         guard: How far, along the surface, the edge of a cast shadow may lie from where it is
             predicted; scene units. Above 0, six rays more are cast round each lit or shadowed
-            sample that faces the lamp, and one that disagrees makes it unsure: no straight
+            sample that faces the point light, and one that disagrees makes it unsure: no straight
             edge that near is missed.
         asked: Where an answer is wanted; elsewhere everything is lit and sure.
 
     Returns:
-        A sample that can be trusted to be lit is ``lit & sure``. What faces away from the lamp
-        lies in attached shadow: not lit, and sure.
+        A sample that can be trusted to be lit is ``lit & sure``. What faces away from the point
+        light lies in attached shadow: not lit, and sure.
 
     A constant to autograd. Ray casting is float32 on the CPU.
     """
@@ -69,15 +69,15 @@ def cast_shadows(
     slack = torch.as_tensor(tolerance).to(like).expand(shape).reshape(-1)
     margin = torch.as_tensor(guard).to(like).expand(shape).reshape(-1)
     ring = _ring(up, margin) if bool((margin > 0).any()) else None
-    views = len(field.lamp)
+    views = len(field.point_light)
     lit = torch.ones(len(flat), views, dtype=torch.bool, device=like.device)
     sure = torch.ones_like(lit)
-    shines = field.lamp.norm(dim=1) > 0
+    shines = field.point_light.norm(dim=1) > 0
     wanted = lit & shines if asked is None else asked.reshape(-1, views) & shines
     at_once = max(1, _RAYS_AT_ONCE // (1 if ring is None else 1 + _RING))
     for some in torch.split(wanted.mT.nonzero(), at_once):
         view, sample = some.unbind(dim=1)
-        towards, _ = _way_to_lamp(field, view, flat[sample])
+        towards, _ = _direction_to_light(field, view, flat[sample])
         facing = (towards * up[sample]).sum(dim=-1) > 0
         lit[sample, view] = facing
         view, sample = view[facing], sample[facing]
@@ -110,7 +110,7 @@ def cast_shadows_on_rasters(
     one that was; with a guard, the way between the two is added to it.
 
     Args:
-        field: Lamps.
+        field: Point lights.
         caster: The surface that casts the shadows.
         points: World, of every sample.
         normals: World, unit, outward.
@@ -159,11 +159,11 @@ def _ray_places(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tenso
     return (first + stride // 2).clamp_max(size - 1)
 
 
-def _way_to_lamp(
+def _direction_to_light(
     field: LightField, view: Int[Tensor, "*#batch"], points: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
-    """Give the unit direction to the lamp and its distance, infinite for one far away."""
-    direction = normalize(field.lamp, dim=1).to(points)[view]
+    """Give the unit direction to the point light and its distance, infinite for one far away."""
+    direction = normalize(field.point_light, dim=1).to(points)[view]
     closeness = field.closeness.to(points)[view]
     away = direction - closeness[..., None] * (points - field.origin.to(points))
     length = away.norm(dim=-1)
@@ -180,7 +180,7 @@ def _free(
     slack: Float[Tensor, "*#batch"],
 ) -> Bool[Tensor, "*batch"]:
     lifted = points + slack[..., None] * normals
-    towards, reach = _way_to_lamp(field, view, lifted)
+    towards, reach = _direction_to_light(field, view, lifted)
     return ~caster.blocked(lifted + slack[..., None] * towards, towards, reach - slack)
 
 
@@ -192,6 +192,8 @@ def _ring(
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
     one = normalize(torch.linalg.cross(axis, normals), dim=1)
     other = torch.linalg.cross(normals, one)
-    turn = 2 * math.pi * torch.arange(_RING).to(normals) / _RING
+    rotation = 2 * math.pi * torch.arange(_RING).to(normals) / _RING
     reach = radius[:, None, None] / math.cos(math.pi / _RING)
-    return reach * (turn.cos()[:, None] * one[:, None] + turn.sin()[:, None] * other[:, None])
+    return reach * (
+        rotation.cos()[:, None] * one[:, None] + rotation.sin()[:, None] * other[:, None]
+    )

@@ -24,7 +24,7 @@ def judge_data(
     Args:
         shown: Whether a view has a sample there at all.
         finite: Whether one of them is finite.
-        seen: Samples that are finite, and face the lamp.
+        seen: Samples that are finite, and face the point light.
         lights: The field's.
         min_views: Views a sample must be lit in.
         min_light_variation: See :func:`light_varies`.
@@ -33,9 +33,9 @@ def judge_data(
         A :class:`~pimper_torch.records.PatchStatus` each.
     """
     count = seen.sum(dim=2)
-    share = count / count.amax(dim=1, keepdim=True).clamp_min(1)
+    fraction = count / count.amax(dim=1, keepdim=True).clamp_min(1)
     status = torch.zeros_like(count[:, 0])
-    varies = light_varies(lights, share, min_light_variation)
+    varies = light_varies(lights, fraction, min_light_variation)
     status[~varies] = int(PatchStatus.CONSTANT_LIGHT)
     status[~(seen.sum(dim=1) >= min_views).any(dim=1)] = int(PatchStatus.FEW_VIEWS)
     status[~finite] = int(PatchStatus.NOT_FINITE)
@@ -45,17 +45,17 @@ def judge_data(
 
 def light_varies(
     lights: Float[Tensor, "patch view rank"],
-    share: Float[Tensor, "patch view"],
+    fraction: Float[Tensor, "patch view"],
     least: float,
 ) -> Bool[Tensor, " patch"]:
     r"""Tell in which patches the light changed enough between the views that see them.
 
     The lights, each scaled to length 1 so that exposure does not count, are weighed by the
-    share of the patch that their view sees. A shading vector has three degrees of freedom:
+    fraction of the patch that their view sees. A shading vector has three degrees of freedom:
     the third singular value of the weighted lights, over the first, must reach ``least``.
     """
     unit = (lights / lights.norm(dim=2, keepdim=True).clamp_min(1e-30)).double()
-    moment = unit.mT @ (share.double()[..., None] * unit)
+    moment = unit.mT @ (fraction.double()[..., None] * unit)
     values = torch.linalg.eigvalsh(moment).clamp_min(0)
     return (values[:, -3] > 0) & (values[:, -3] >= least**2 * values[:, -1])
 

@@ -40,9 +40,9 @@ from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Convergence, Record, StopCause
 
-# The damping starts at this share of the mean curvature; it falls and rises by the factors below.
-# Of starts from 1e-4 to 1e-2 and factors from 3 to 10 these led most random starts to the best
-# minimum known (9 of 10 on dino_trimmed; 10 and 1e-3 led 5 there).
+# The damping starts at this fraction of the mean curvature; it falls and rises by the factors
+# below. Of starts from 1e-4 to 1e-2 and factors from 3 to 10 these led most random starts to the
+# best minimum known (9 of 10 on dino_trimmed; 10 and 1e-3 led 5 there).
 _FIRST_DAMPING = 1e-2
 _LESS, _MORE = 0.2, 5.0
 
@@ -83,7 +83,7 @@ def solve_variable_projection(
         problem: With its start. In low-rank factorization only the lights matter, which must
             be of full rank.
         max_iterations: Steps at most.
-        tolerance: A step that lowered a patch's objective by less than this share is small.
+        tolerance: A step that lowered a patch's objective by less than this fraction is small.
         small_steps: A patch is done after so many of them in a row: one may be the end of a
             bend in the valley.
         curvature_samples: The Gauss-Newton matrix, most of the work, is summed over about so
@@ -137,8 +137,8 @@ def curvature_of_lights(
     )
     own = curvature_of_views(shading, weight)
     normal = own - _explained(_whitened(some, lights, shading, weight), shading)
-    pull = problem.pull[..., None].expand(-1, -1, rank).flatten(1)
-    return stride * normal + torch.diag_embed(pull)
+    regularization = problem.regularization[..., None].expand(-1, -1, rank).flatten(1)
+    return stride * normal + torch.diag_embed(regularization)
 
 
 def _step(
@@ -274,7 +274,7 @@ def _move(state: _State) -> Float[Tensor, "patch view rank"]:
 
 def _is_free(problem: Bilinear) -> bool:
     """Tell whether lights are free up to any invertible matrix."""
-    return problem.manifold.flat and not bool((problem.pull > 0).any())
+    return problem.manifold.flat and not bool((problem.regularization > 0).any())
 
 
 def _has_kernel(problem: Bilinear) -> bool:
@@ -309,7 +309,7 @@ def _solve_by_kernel(
         as_array(J),
         as_array(problem.weight),
         as_array(problem.anchor),
-        as_array(problem.pull),
+        as_array(problem.regularization),
         as_array(prior),
         0.0 if isinstance(problem.loss, Squares) else problem.loss.scale,
         problem.stride,

@@ -16,7 +16,7 @@ SaturationChoice = Literal["auto"] | float | tuple[float | int, float | int, flo
 class Encoding:
     """How radiance became the values in the files.
 
-    Levels up to 1 are shares of the files' full scale, larger ones are in the files' own units:
+    Levels up to 1 are fractions of the files' full scale, larger ones are in the files' own units:
     0.25 and 16384 are the same in files of 16 bits.
 
     Attributes:

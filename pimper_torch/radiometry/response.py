@@ -74,7 +74,7 @@ class Curve:
     last entry have its radiance, which is 1.
 
     Attributes:
-        encoded: Levels as shares of the file's full scale, from 0 on, rising.
+        encoded: Levels as fractions of the file's full scale, from 0 on, rising.
         radiance: Of these levels, rising, 1 at the last; one row, or one each for red,
             green and blue.
         bits: Of the files that the curve was measured on; ``None`` for any.
@@ -121,7 +121,7 @@ def curve_from_table(
     """Make a curve of a measured inverse response.
 
     Args:
-        levels: Rising from 0: shares of full scale up to 1, or a file's levels: up to 255 for
+        levels: Rising from 0: fractions of full scale up to 1, or a file's levels: up to 255 for
             files of 8 bits, to more (65535, or 16383 for data of 14 bits) for those of 16.
         radiance: Of each level in any unit, rising; one row, or red, green and blue. Set to 1
             at the last level, each row by itself.
@@ -151,7 +151,7 @@ def curve_from_table(
     bits = None if last == 1 else 8 if last == 255 else 16
     if bits == 16 and not 255 < last <= 65535:
         raise InputError(
-            f"the last level is {last:g}; needed: 1 (shares of full scale), 255 (files of 8 bits), "
+            f"the last level is {last:g}; needed: 1 (full scale), 255 (files of 8 bits), "
             "or more than 255 and at most 65535 (files of 16 bits)."
         )
     full = 1 if bits is None else _FULL_SCALE[bits]

@@ -10,7 +10,7 @@ from torch import Tensor
 # 255 down by two levels, which in sRGB are 0.018 of radiance.
 SATURATED = 0.98
 
-# Levels that belong together, as a share of the top: noise after saturation, such as a dark
+# Levels that belong together, as a fraction of the top: noise after saturation, such as a dark
 # frame's that was subtracted, spreads a sensor's by less.
 _BAND = 0.004
 # So many bands below the top show how the values fall off; half of them must be occupied.

@@ -62,8 +62,8 @@ def outside(values: Float[Tensor, "..."], high: float) -> str:
     count = int(bad.sum())
     if count == 0:
         return ""
-    share = f"{count} of {values.numel()} values outside [0, {high:g}]"
-    return f"has {share}, such as {float(values[bad][0]):.4g}"
+    fraction = f"{count} of {values.numel()} values outside [0, {high:g}]"
+    return f"has {fraction}, such as {float(values[bad][0]):.4g}"
 
 
 def not_unit(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"] | None) -> str:

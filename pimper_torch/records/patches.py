@@ -231,7 +231,7 @@ class PatchStatus(IntEnum):
     FEW_VIEWS = 3
     """No sample is lit in as many views as it has unknowns."""
     CONSTANT_LIGHT = 4
-    """The light varied too little between the views, such as under one lamp."""
+    """The light varied too little between the views, such as under one point light."""
     FAILED = 5
     """The solver's answer is not finite or has no albedo anywhere."""
 
@@ -370,12 +370,12 @@ class SweptPatches(OverPhotometry):
 
 
 class AlignStatus(IntEnum):
-    """Whether neighbours bear a patch's relief out."""
+    """Whether neighbours bear a patch's height field out."""
 
     ALIGNED = 0
     """Moved to where it agrees with a neighbour at least."""
     ALONE = 1
-    """No neighbour's relief lies over its own: it stays on the mesh."""
+    """No neighbour's height field lies over its own: it stays on the mesh."""
     DISPUTED = 2
     """Every neighbour that it meets lies elsewhere, even after all was tried: it stays on
     the mesh."""
@@ -383,11 +383,11 @@ class AlignStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Depths(Record):
-    """A bucket of patches with relief.
+    """A bucket of patches with height field.
 
     Attributes:
         depth: z of every sample in the patch frame, replacing the template's own.
-        valid: True where the relief was integrated or filled from neighbours; false
+        valid: True where the height field was integrated or filled from neighbours; false
             outside the enlarged triangle.
         transform: The alignment's ``(h_x, h_y, h_z, h_0)``: ``depth`` is
             ``h . (x, y, z, 1)`` of what integration gave; identity (0, 0, 1, 0) before.
@@ -412,7 +412,7 @@ class Depths(Record):
 
     @property
     def aligned(self) -> Bool[Tensor, " patch"]:
-        """Whether a neighbour bears the relief out; false before alignment."""
+        """Whether a neighbour bears the height field out; false before alignment."""
         if self.status is None:
             return torch.zeros_like(self.transform[:, 0], dtype=torch.bool)
         return self.status == int(AlignStatus.ALIGNED)
@@ -423,8 +423,8 @@ class DepthPatches(OverPhotometry):
     """Relief of all patches, with the photometry it was integrated from.
 
     Attributes:
-        buckets: The reliefs.
-        mismatch: Root mean square distance of neighbouring reliefs where they overlap, scene
+        buckets: The height fields.
+        mismatch: Root mean square distance of neighbouring height fields where they overlap, scene
             units: before alignment, then after each of its rounds. ``None`` before it.
     """
 
@@ -434,10 +434,10 @@ class DepthPatches(OverPhotometry):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Surface(Record):
-    """The joined surface: every facet subdivided, lattice points on shared edges shared.
+    """The joined surface: every facet subdivided, subdivided mesh points on shared edges shared.
 
     Attributes:
-        vertices_world: Where the lattice points came to lie.
+        vertices_world: Where the subdivided mesh points came to lie.
         faces: Counter-clockwise from outside.
         facet: A facet each vertex lies in; a shared vertex names one of its facets.
         barycentric: Where in that facet.

@@ -17,7 +17,7 @@ class StageReport(Record):
         name: Of the stage.
         seconds: Wall clock.
         peak_memory_mb: Highest resident memory of the process up to the stage's end.
-        figures: Counts and shares worth telling, such as ``samples`` or ``missing_share``.
+        figures: Counts and shares worth telling, such as ``samples`` or ``missing_fraction``.
     """
 
     name: str

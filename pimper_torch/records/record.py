@@ -178,8 +178,8 @@ def _arrays(cls: type[Record]) -> dict[str, Any]:
 
 def _choices(hint: object) -> tuple[object, ...]:
     """Give the types of a union."""
-    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    return typing.get_args(hint) if union else ()
+    blend = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    return typing.get_args(hint) if blend else ()
 
 
 def _is_array(hint: object) -> bool:

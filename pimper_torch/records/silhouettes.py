@@ -17,20 +17,20 @@ class Silhouettes(Record):
 
     Attributes:
         inside: Probability that the pixel shows the object; 0 in the padding.
-        trusted: True for views whose silhouette agrees with the hull of the others.
+        reliable: True for views whose silhouette agrees with the hull of the others.
         source: ``masks`` that a person gave, ``found`` in the photographs, or ``everything``: no
             view constrains the object.
     """
 
     inside: Float[Tensor, "view height width"]
-    trusted: Bool[Tensor, " view"]
+    reliable: Bool[Tensor, " view"]
     source: Literal["masks", "found", "everything"]
 
     @classmethod
     def everything(cls, views: Views) -> "Silhouettes":
         """Give silhouettes that leave nothing out."""
-        trusted = torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device)
-        return cls(inside=views.inside.float(), trusted=trusted, source="everything")
+        reliable = torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device)
+        return cls(inside=views.inside.float(), reliable=reliable, source="everything")
 
     @property
     def masks(self) -> Bool[Tensor, "view height width"]:

@@ -24,11 +24,11 @@ class Truth(Record):
         normals_world: Unit, outward; zero where the ray meets nothing.
         albedo: Linear; zero where the ray meets nothing.
         foreground: True on the object, false on its table and the background.
-        lit: True where the lamp reaches the surface.
+        lit: True where the point light reaches the surface.
         highlight: True where a highlight adds noticeably to the matte part.
         lights_world: First-order light ``l`` at the object, radiance = albedo * l . (1, n),
             up to one scale for all views.
-        lamps_world: Places of point lights.
+        point_lights_world: Places of point lights.
     """
 
     mesh: Mesh | None = None
@@ -41,15 +41,15 @@ class Truth(Record):
     lit: Bool[Tensor, "view height width"] | None = None
     highlight: Bool[Tensor, "view height width"] | None = None
     lights_world: Float[Tensor, "view 4"] | None = None
-    lamps_world: Float[Tensor, "view 3"] | None = None
+    point_lights_world: Float[Tensor, "view 3"] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Capture(Record):
     """Photographs of a data set with all that came along.
 
-    Views that share a number in ``position`` were taken by the same camera from the same
-    place; views that share one in ``light`` under the same light.
+    Views that fraction a number in ``position`` were taken by the same camera from the same
+    place; views that fraction one in ``light`` under the same light.
 
     Attributes:
         views: The photographs, linear radiance. Names are unique.
@@ -71,7 +71,7 @@ class DtuProtocol(Record):
     """Where a scan of the DTU 2014 set is judged, in the data set's frame and millimetres.
 
     Attributes:
-        obs_mask: True in voxels that the structured light scanner could see. The middle of
+        obs_mask: True in voxels that the structured light scanner could see. The centre of
             voxel ``(i, j, k)`` is ``bounding_box[0] + resolution * (i, j, k)``.
         bounding_box: Lower corner, upper corner.
         resolution: Distance of neighbouring voxels.

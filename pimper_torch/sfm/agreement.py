@@ -13,17 +13,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.sfm.at_rest import sampson_errors
 from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
 from pimper_torch.sfm.matching import PhotographPair, VerifiedPair
 from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.static_background import sampson_errors
 
 # Pairs that judge a view. Of the matches in its 3 strongest pairs, 91 to 100 % agree for the worst
 # view of 4 right models of a carton, 4 to 31 % in 3 wrong models; in its strongest pair alone 77 to
 # 100 %, in its 6 strongest 85 to 90 %.
 _JUDGES = 3
 
-# Share of those matches that must agree.
+# Fraction of those matches that must agree.
 _MIN_AGREEMENT = 0.5
 
 
@@ -39,7 +39,7 @@ def misplaced_views(
         max_error_px: Distance from the model's epipolar geometry up to which a match agrees.
 
     Returns:
-        By name, the share of the matches in those pairs that agree.
+        By name, the fraction of the matches in those pairs that agree.
     """
     view_of = {files.index(name): view for view, name in enumerate(model.names)}
     judged: dict[PhotographPair, tuple[int, float]] = {}
@@ -53,14 +53,14 @@ def misplaced_views(
         mine = [judged[pair] for pair in judged if view in pair]
         judges = sorted(mine, reverse=True)[:_JUDGES]
         total = sum(count for count, _ in judges)
-        agreeing = sum(count * share for count, share in judges)
+        agreeing = sum(count * fraction for count, fraction in judges)
         if agreeing < _MIN_AGREEMENT * total:
             found[name] = agreeing / total
     return found
 
 
 def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> float:
-    """Give the share of a pair's matches that the model's epipolar geometry explains."""
+    """Give the fraction of a pair's matches that the model's epipolar geometry explains."""
     ends = [
         _undistorted(model, view, pixels)
         for view, pixels in zip(pair.views, (pair.first, pair.second), strict=True)

@@ -7,8 +7,8 @@ import torch
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import triangulation_angles
-from pimper_torch.sfm.at_rest import Rest
 from pimper_torch.sfm.model import SparseModel, list_some
+from pimper_torch.sfm.static_background import StaticBackground
 
 FEWEST_VIEWS = 3
 # Points seen under less are of no use to the coarse surface (coarse/surface.py).
@@ -39,7 +39,7 @@ def count_spread_views(model: SparseModel, fewest: int) -> int:
     return int((seen >= fewest).sum())
 
 
-def require_motion(rest: Rest, num_views: int) -> None:
+def require_motion(rest: StaticBackground, num_views: int) -> None:
     """Refuse photographs in which nothing moves.
 
     Raises:
@@ -47,8 +47,8 @@ def require_motion(rest: Rest, num_views: int) -> None:
     """
     if rest.nothing_moves:
         raise ReconstructionError(
-            f"Nothing moves in {num_views} photographs: {rest.still_share:.0%} of the matches lie "
-            "at the same pixel, and in no pair do enough others agree on a motion. Camera and "
+            f"Nothing moves in {num_views} photographs: {rest.still_fraction:.0%} of the matches "
+            "lie at the same pixel, and in no pair do enough others agree on a motion. Camera and "
             f"background were at rest, and an object that turned has too little texture. {MOVE}"
         )
 
@@ -57,7 +57,7 @@ def choose_component(
     components: Sequence[tuple[str, ...]],
     spread: Sequence[int],
     names: Sequence[str],
-    min_share: float,
+    min_fraction: float,
 ) -> int:
     """Choose the component to keep: the one with most views that see depth.
 
@@ -66,7 +66,7 @@ def choose_component(
         spread: How many views of each see enough points under real triangulation angles, see
             :func:`count_spread_views`.
         names: Of all photographs.
-        min_share: Of the photographs that the chosen component must have when another one
+        min_fraction: Of the photographs that the chosen component must have when another one
             holds at least 3 views that it lacks.
 
     Returns:
@@ -98,13 +98,13 @@ def choose_component(
         for part, depth in zip(components, spread, strict=True)
         if depth >= FEWEST_VIEWS and len(set(part) - set(kept)) >= 3
     ]
-    if rivals and len(kept) < min_share * len(names):
+    if rivals and len(kept) < min_fraction * len(names):
         parts = "; ".join(
             f"{len(part)} photographs ({list_some(part, most=12)})" for part in (kept, *rivals)
         )
         raise ReconstructionError(
             f"Structure from motion split {len(names)} photographs into {1 + len(rivals)} models "
-            f"that nothing ties together: {parts}. One model with at least {min_share:.0%} of the "
-            f"photographs is needed. {ADVICE} Or reconstruct one of the groups on its own."
+            f"that nothing ties together: {parts}. One model with at least {min_fraction:.0%} of "
+            f"the photographs is needed. {ADVICE} Or reconstruct one of the groups on its own."
         )
     return largest

@@ -74,10 +74,10 @@ class NearEpipolarLines:
         """Hold all pixels of one photograph against all of another."""
         lines = homogeneous(first) @ self.matrix.mT
         back = homogeneous(second) @ self.matrix
-        # From the middle of all on, single precision tells a hundredth of a pixel.
-        middle = second.mean(dim=0)
-        offsets = (lines[:, :2] @ middle + lines[:, 2]).float()
-        residual = torch.addmm(offsets[:, None], lines[:, :2].float(), (second - middle).float().mT)
+        # From the centre of all on, single precision tells a hundredth of a pixel.
+        centre = second.mean(dim=0)
+        offsets = (lines[:, :2] @ centre + lines[:, 2]).float()
+        residual = torch.addmm(offsets[:, None], lines[:, :2].float(), (second - centre).float().mT)
         slopes = [ends[:, :2].square().sum(dim=1).float() for ends in (lines, back)]
         return residual.square_() <= self.max_error_px**2 * (slopes[0][:, None] + slopes[1])
 

@@ -11,9 +11,15 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pimper_torch.progress import track
-from pimper_torch.sfm.at_rest import Keypoints, Pair, Rest, find_rest, moving_matches
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.matching import MatchSettings
+from pimper_torch.sfm.static_background import (
+    Keypoints,
+    Pair,
+    StaticBackground,
+    find_static_background,
+    moving_matches,
+)
 
 # Measured on 24 rendered photographs of 640x480: 99 % of the matches of a room at rest are
 # shorter, and 0.4 % of those of a turning mug.
@@ -24,7 +30,7 @@ STILL_PX = 1.0
 _TRIALS = 3000
 
 
-def leave_out_room(database: Path, settings: MatchSettings) -> Rest:
+def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
     """Find what is at rest while something else moves, and keep features and matches of the latter.
 
     Pairs that were verified on what is at rest are verified anew.
@@ -42,7 +48,7 @@ def leave_out_room(database: Path, settings: MatchSettings) -> Rest:
     with quiet(), pycolmap.Database.open(database) as stored:
         matched = _read(stored)
         verifier = _Verifier(matched=matched, options=_options(settings))
-        rest = find_rest(
+        rest = find_static_background(
             matched.keypoints,
             track(matched.pairs),
             verifier,
@@ -121,7 +127,7 @@ def _read_geometries(stored: Any) -> dict[tuple[int, int], Any]:  # noqa: ANN401
     }
 
 
-def _drop_features(stored: Any, matched: _Matched, rest: Rest) -> None:  # noqa: ANN401 - see _read
+def _drop_features(stored: Any, matched: _Matched, rest: StaticBackground) -> None:  # noqa: ANN401 - see _read
     pycolmap = loaded()
 
     descriptors = [stored.read_descriptors(image) for image in matched.ids]
@@ -137,7 +143,7 @@ def _drop_features(stored: Any, matched: _Matched, rest: Rest) -> None:  # noqa:
 def _drop_matches(
     stored: Any,  # noqa: ANN401 - see _read
     matched: _Matched,
-    rest: Rest,
+    rest: StaticBackground,
     geometries: dict[tuple[int, int], Any],
     fewest: int,
 ) -> None:

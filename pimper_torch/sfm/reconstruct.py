@@ -28,9 +28,9 @@ from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
 
 # Verified matches below which a pair of photographs does not count; points of the model that a view
-# must see to be added, and to stay in it (COLMAP's own); share of the photographs that the largest
-# component must hold when the model splits.
-_MIN_MATCHES, _MIN_POINTS, _MIN_SHARE = 15, 30, 0.6
+# must see to be added, and to stay in it (COLMAP's own); fraction of the photographs that the
+# largest component must hold when the model splits.
+_MIN_MATCHES, _MIN_POINTS, _MIN_FRACTION = 15, 30, 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +54,7 @@ class ReconstructConfig:
             stayed unregistered or contradict their matches; each has other random numbers, and
             the last also counts points that only two views see. 0 is content with the first
             model.
-        track_rounds: Of finding the points again in every view, by aligning what photographs
+        track_iterations: Of finding the points again in every view, by aligning what photographs
             show round them, and adjusting cameras to that; 0 leaves the features' places.
         threads: 0 for all cores. With 1 the result is the same bit for bit.
         seed: Of everything random.
@@ -70,7 +70,7 @@ class ReconstructConfig:
     guided_pairs: int = 10
     max_error_px: float = 2.0
     starts: int = 3
-    track_rounds: int = 2
+    track_iterations: int = 2
     threads: int = 0
     seed: int = 0
 
@@ -88,7 +88,7 @@ class ReconstructConfig:
         require(self.max_error_px > 0, "max_error_px", self.max_error_px, "more than 0")
         require(self.guided_pairs >= 0, "guided_pairs", self.guided_pairs, "0 or more")
         require(self.starts >= 0, "starts", self.starts, "0 or more")
-        require(self.track_rounds >= 0, "track_rounds", self.track_rounds, "0 or more")
+        require(self.track_iterations >= 0, "track_iterations", self.track_iterations, "0 or more")
         require(self.threads >= 0, "threads", self.threads, "0 for all cores, or a number of them")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
 
@@ -130,7 +130,7 @@ class ReconstructConfig:
     def tracks(self) -> TrackSettings:
         """How tracks are refined."""
         return TrackSettings(
-            rounds=self.track_rounds,
+            iterations=self.track_iterations,
             fewest_points=_MIN_POINTS,
             threads=self.threads or -1,
         )
@@ -240,24 +240,24 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
         found = register(space, config.registration)
     release_memory()
     names = dict(zip(space.files, views.names, strict=True))
-    model = _chosen(found, names, _MIN_SHARE)
+    model = _chosen(found, names, _MIN_FRACTION)
     numbers = [views.names.index(name) for name in model.names]
     model = refine_tracks(views.take(numbers), model, config.tracks)
     release_memory()
     return model
 
 
-def _chosen(found: Registration, names: dict[str, str], min_share: float) -> SparseModel:
+def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> SparseModel:
     """Choose among the models and put its views in the photographs' order."""
     models = [
         model.replace(names=tuple(names[file] for file in model.names)) for model in found.models
     ]
     photographs = tuple(names.values())
     parts = [model.names for model in models]
-    model = models[choose_component(parts, found.spread, photographs, min_share)]
+    model = models[choose_component(parts, found.spread, photographs, min_fraction)]
     misplaced = [
-        f"{names[file]} ({share:.0%} agree)"
-        for file, share in found.misplaced.items()
+        f"{names[file]} ({fraction:.0%} agree)"
+        for file, fraction in found.misplaced.items()
         if names[file] in model.names
     ]
     if misplaced:

@@ -12,15 +12,20 @@ from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.reprojection import observation_errors
-from pimper_torch.sfm.sightings import Sightings, SightingSettings, log_pictures, sight
 from pimper_torch.sfm.tangents import tangents
+from pimper_torch.sfm.track_observations import (
+    SightingSettings,
+    TrackObservations,
+    log_pictures,
+    sight,
+)
 from pimper_torch.sfm.undistort import pinholes_for, undistorted
 
 # Views that must show a point, its reference among them, for its features to be given up.
-_FEWEST_SIGHTINGS = 3
+_FEWEST_TRACK_OBSERVATIONS = 3
 
-# Residual at which a sighting counts half, before the residuals themselves tell; then their
-# spread, between bounds. Cauchy's 2.4 spreads would suit Gaussian residuals; these have long
+# Residual at which a track observation counts half, before the residuals themselves tell; then
+# their spread, between bounds. Cauchy's 2.4 spreads would suit Gaussian residuals; these have long
 # tails, from light that is no slope: one spread puts points a quarter nearer to the truth.
 _FIRST_SCALE_PX, _SCALES_PX = 0.5, (0.05, 1.0)
 
@@ -46,16 +51,16 @@ class TrackSettings:
     """How tracks are refined.
 
     Attributes:
-        rounds: Of finding points again and adjusting cameras.
+        iterations: Of finding points again and adjusting cameras.
         fewest_points: A view that shows fewer of the points that were found keeps its features.
         threads: -1 for all cores.
-        sightings: When a point counts as found.
+        track_observations: When a point counts as found.
     """
 
-    rounds: int
+    iterations: int
     fewest_points: int
     threads: int
-    sightings: SightingSettings = field(default_factory=SightingSettings)
+    track_observations: SightingSettings = field(default_factory=SightingSettings)
 
 
 def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> SparseModel:
@@ -74,19 +79,21 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
     Returns:
         The same views. Points that nothing agrees about are left out.
     """
-    for left in reversed(range(settings.rounds)):
+    for left in reversed(range(settings.iterations)):
         some = longest_tracks(model, _PILOTS) if left else model
-        found, cameras = _sighted(views, some, settings.sightings)
+        found, cameras = _sighted(views, some, settings.track_observations)
         renewed, aligned = _renewed(some, found, cameras, settings.fewest_points)
         if not bool(aligned.any()):
             return model
         tied, scale = _cameras_adjusted(renewed, aligned, settings)
-        model = model if left else renewed  # all points of the last round, with its sightings
+        model = (
+            model if left else renewed
+        )  # all points of the last round, with its track observations
         model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
         model = bundle(
             model, _FIRST_SCALE_PX, settings.threads, cameras=False, tolerance=_FIRST_TOLERANCE
         )
-    if settings.rounds:
+    if settings.iterations:
         model = bundle(model, scale, settings.threads, cameras=False)
         limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
         model = model.without(observation_errors(model) > limit)
@@ -95,7 +102,7 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
 
 def _sighted(
     views: Views, model: SparseModel, settings: SightingSettings
-) -> tuple[Sightings, Cameras]:
+) -> tuple[TrackObservations, Cameras]:
     """Find the points in undistorted photographs, which are held no longer than that."""
     raster = (views.num_views, *views.images.shape[-2:])
     pictures = log_pictures(undistorted(views, model.lenses), raster)
@@ -109,10 +116,12 @@ def _sighted(
 
 
 def _renewed(
-    model: SparseModel, found: Sightings, cameras: Cameras, fewest_points: int
+    model: SparseModel, found: TrackObservations, cameras: Cameras, fewest_points: int
 ) -> tuple[SparseModel, Bool[Tensor, " renewed"]]:
-    """Replace features by sightings; tell which observations are sightings."""
-    often = torch.bincount(found.point, minlength=len(model.points_world)) >= _FEWEST_SIGHTINGS
+    """Replace features by track observations; tell which observations are track observations."""
+    often = (
+        torch.bincount(found.point, minlength=len(model.points_world)) >= _FEWEST_TRACK_OBSERVATIONS
+    )
     kept = often[found.point]
     point, view = found.point[kept], found.view[kept]
     pixels = _photographed(found.pixels[kept], view, cameras, model)

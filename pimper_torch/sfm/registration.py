@@ -54,7 +54,7 @@ class Registration:
         spread: How many views of each see depth, see
             :func:`~pimper_torch.sfm.components.count_spread_views`.
         missing: Files that the first model lacks; all without a model.
-        misplaced: Files of the first model whose strongest pairs contradict it, and the share of
+        misplaced: Files of the first model whose strongest pairs contradict it, and the fraction of
             the matches in those that agrees.
     """
 

@@ -27,7 +27,7 @@ class Tangents(Record):
     """Planes through points, float64.
 
     Attributes:
-        points_world: Their middles.
+        points_world: Their centres.
         steps_world: Two vectors along the plane, right-angled and equally long: about a pixel of
             the reference view each.
         reference: The view that shows the plane best among those that see the point.
@@ -99,11 +99,11 @@ def plane_normals(
 def plane_homographies(
     tangent: Tangents, cameras: Cameras, view: int, some: Int[Tensor, " chosen"]
 ) -> Float[Tensor, "chosen 3 3"]:
-    """Give the homographies from planes, in steps from the middle, to a view's pixels."""
+    """Give the homographies from planes, in steps from the centre, to a view's pixels."""
     steps = tangent.steps_world[some]
-    middle = transform(cameras.cam_from_world[view], tangent.points_world[some])
-    turned = steps @ cameras.cam_from_world[view, :3, :3].mT
-    return cameras.intrinsics[view] @ torch.cat([turned, middle[:, None]], dim=1).mT
+    centre = transform(cameras.cam_from_world[view], tangent.points_world[some])
+    rotated = steps @ cameras.cam_from_world[view, :3, :3].mT
+    return cameras.intrinsics[view] @ torch.cat([rotated, centre[:, None]], dim=1).mT
 
 
 def _along(normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point 2 3"]:

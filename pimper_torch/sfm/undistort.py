@@ -16,7 +16,7 @@ from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_p
 
 _MAX_ZOOM = 1.25
 _AT_ONCE = 2**17  # pixels that are distorted at a time: rays and powers of radii take memory
-_TOUCHED = 1e-3  # share of saturated light in a pixel; below is the rounding of its weights
+_TOUCHED = 1e-3  # fraction of saturated light in a pixel; below is the rounding of its weights
 
 
 def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tensor, "view 3 3"]]:
@@ -122,7 +122,7 @@ def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:
     """Choose the pinhole that a photograph is undistorted to; ``K`` in float64.
 
     It keeps the lens's principal point and, for a lens that bulges (barrel), its focal
-    length: a rim of the photograph is lost, the middle keeps its scale. For a lens that
+    length: a rim of the photograph is lost, the centre keeps its scale. For a lens that
     pulls the corners out (pincushion) the focal length grows until no pixel looks past the
     photograph's edge, but never by more than a quarter.
     """

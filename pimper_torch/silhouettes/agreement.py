@@ -30,15 +30,15 @@ class Agreement(Record):
 
     Attributes:
         overlap: Intersection over union.
-        covered: Share of the cut that is inside the projection.
-        extent: Share of the picture that the cut takes.
+        covered: Fraction of the cut that is inside the projection.
+        extent: Fraction of the picture that the cut takes.
     """
 
     overlap: Float[Tensor, " view"]
     covered: Float[Tensor, " view"]
     extent: Float[Tensor, " view"]
 
-    def trusted(self, min_covered: float) -> Bool[Tensor, " view"]:
+    def reliable(self, min_covered: float) -> Bool[Tensor, " view"]:
         """Mark views whose cut shows something, little of it outside the projection."""
         return (self.covered >= min_covered) & (self.extent > 0)
 

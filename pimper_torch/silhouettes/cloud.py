@@ -8,13 +8,13 @@ from torch import Tensor
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, Record, SparseScene
-from pimper_torch.silhouettes.ground import Gaze, Plane, well_tracked
+from pimper_torch.silhouettes.ground import Fixation, Plane, well_tracked
 
 _CLEAR = 1.5  # tolerances above the plane: nearer points may lie on it
 _NEAR = 0.6  # of the cameras' distance: an object that fills photographs of 60 degrees
 # Without a plane: this quantile of the distances to the fixation point, and what beyond it is
 # the object's, and certainly is not.
-_MIDDLE, _WITHIN, _OUTSIDE = 0.7, 1.3, 2.6
+_CENTRE, _WITHIN, _OUTSIDE = 0.7, 1.3, 2.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -32,7 +32,7 @@ class SplitCloud(Record):
 
 def split_cloud(
     scene: SparseScene,
-    gaze: Gaze,
+    fixation: Fixation,
     plane: Plane | None,
     tolerance: float,
     box_world: Float[Tensor, "2 3"] | None,
@@ -44,18 +44,18 @@ def split_cloud(
 
     Args:
         scene: With tracks.
-        gaze: Where the cameras look.
+        fixation: Where the cameras look.
         plane: The object stands on.
         tolerance: Of the plane, scene units.
         box_world: What is outside is not the object.
     """
     points, good = scene.points_world, well_tracked(scene)
-    away = (points - gaze.fixation_world).norm(dim=1)
+    away = (points - fixation.fixation_world).norm(dim=1)
     if plane is None:
-        middle = torch.quantile(away[good], _MIDDLE) if bool(good.any()) else away.sum()
-        own, other = away < _WITHIN * middle, away > _OUTSIDE * middle
+        centre = torch.quantile(away[good], _CENTRE) if bool(good.any()) else away.sum()
+        own, other = away < _WITHIN * centre, away > _OUTSIDE * centre
     else:
-        own = (plane.height_of(points) > _CLEAR * tolerance) & (away < _NEAR * gaze.distance)
+        own = (plane.height_of(points) > _CLEAR * tolerance) & (away < _NEAR * fixation.distance)
         other = ~own
     if box_world is not None:
         low, high = box_world.to(points)

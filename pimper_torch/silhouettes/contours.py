@@ -15,8 +15,8 @@ from pimper_torch.silhouettes.rays import RayConfig, contour_rays
 from pimper_torch.silhouettes.tangency import contour_points
 from pimper_torch.stage import Stage
 
-# Share of the views whose silhouette may be wrong at a place: as large for those that are found as
-# in the vote that finds them. In one of 24 photographs of a skull, shadow took the jaw's end.
+# Fraction of the views whose silhouette may be wrong at a place: as large for those that are found
+# as in the vote that finds them. In one of 24 photographs of a skull, shadow took the jaw's end.
 _DISAGREEING = {"masks": 0.03, "found": 0.05}
 
 
@@ -99,9 +99,9 @@ class TraceContours(Stage):
         box = box_round(silhouettes, cameras)
         hull = None
         if box is not None:  # voxels need no more than single precision
-            share = _DISAGREEING[silhouettes.source]
+            fraction = _DISAGREEING[silhouettes.source]
             hull = visual_hull(
-                silhouettes, cameras.to(torch.float32), box.float(), disagreeing=share
+                silhouettes, cameras.to(torch.float32), box.float(), disagreeing=fraction
             )
         if hull is None:
             warnings.warn(
@@ -120,7 +120,7 @@ class TraceContours(Stage):
 def box_round(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
     """Give the corners of a box that holds what the silhouettes show.
 
-    Its middle is nearest to the rays through the middles of the silhouettes' bounding boxes; from
+    Its centre is nearest to the rays through the centres of the silhouettes' bounding boxes; from
     there it reaches as far as the largest of them, seen from its camera, and half as far again:
     an silhouette may be cut by the photograph's border.
 
@@ -128,7 +128,7 @@ def box_round(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"
         ``None`` where fewer than two trusted views show anything.
     """
     masks = silhouettes.masks
-    views = (silhouettes.trusted & masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
+    views = (silhouettes.reliable & masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
     if len(views) < 2:
         return None
     chosen, boxes = cameras.take(views), []
@@ -138,8 +138,8 @@ def box_round(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"
         boxes.append(torch.stack([low, torch.stack([columns.amax(), rows.amax()]) + 1]))
     low, high = torch.stack(boxes).to(chosen.intrinsics).unbind(dim=1)
     seen = torch.ones(1, len(views), dtype=torch.bool, device=low.device)
-    middle = triangulate_rays(chosen, (low + high)[None] / 2, seen)[0]
-    distance = (middle - chosen.centers_world).norm(dim=1)
+    centre = triangulate_rays(chosen, (low + high)[None] / 2, seen)[0]
+    distance = (centre - chosen.centers_world).norm(dim=1)
     half = (high - low).norm(dim=1) / 2 / chosen.intrinsics[:, 0, 0]
     reach = 1.5 * (distance * half).amax()
-    return torch.stack([middle - reach, middle + reach])
+    return torch.stack([centre - reach, centre + reach])

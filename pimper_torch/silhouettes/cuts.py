@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pimper_torch.records import Record, Silhouettes
-from pimper_torch.silhouettes.ground import Gaze, Plane
+from pimper_torch.silhouettes.ground import Fixation, Plane
 from pimper_torch.silhouettes.hull import margins, visual_hull
 from pimper_torch.silhouettes.opencv import (
     OBJECT,
@@ -34,7 +34,7 @@ from pimper_torch.silhouettes.seeds import (
 _MIN_OBSERVED = 12
 _WELL = 2.0  # times as deep as is_deep asks for
 _CUTS = 2  # rounds of mixtures and cut inside GrabCut
-_SPECK = 2e-4  # share of the picture
+_SPECK = 2e-4  # fraction of the picture
 
 Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
 
@@ -49,7 +49,7 @@ class Cues(Record):
         other_px: Of points that are not the object's.
         plane: That the object stands on.
         agreement: With the plane's texture.
-        gaze: Where the cameras look.
+        fixation: Where the cameras look.
         box_world: The object is inside.
     """
 
@@ -58,7 +58,7 @@ class Cues(Record):
     other_px: tuple[Float[Tensor, "_ 2"], ...]
     plane: Plane | None
     agreement: Float[Tensor, "view height width"] | None
-    gaze: Gaze
+    fixation: Fixation
     box_world: Float[Tensor, "2 3"]
 
     @property
@@ -88,7 +88,9 @@ class Cuts(Record):
     on_plane: bool = False
 
 
-def cut_in_rounds(cues: Cues, *, rounds: int, disagreeing: float, num_voxels: int) -> Cuts | None:
+def cut_in_iterations(
+    cues: Cues, *, iterations: int, disagreeing: float, num_voxels: int
+) -> Cuts | None:
     """Cut every view, vote, and cut again from what the vote says.
 
     Before every vote the plane's texture is learned anew where the cuts do not hide it: holes
@@ -98,7 +100,7 @@ def cut_in_rounds(cues: Cues, *, rounds: int, disagreeing: float, num_voxels: in
         ``None`` where the cuts have nothing in common.
     """
     masks = _first(cues)
-    for _ in range(rounds):
+    for _ in range(iterations):
         cues = _looked_behind(cues, masks)
         masks = _filled(cues, masks)
         seen = _voted(cues, masks | _likely(cues), disagreeing, num_voxels)
@@ -116,7 +118,7 @@ def _looked_behind(cues: Cues, masks: Bool[Tensor, "view height width"]) -> Cues
     """Learn the plane's texture where the cuts do not hide it; elsewhere keep what was known."""
     if cues.plane is None or cues.agreement is None:
         return cues
-    found = plane_agreement(cues.pictures, cues.plane, cues.gaze, masks)
+    found = plane_agreement(cues.pictures, cues.plane, cues.fixation, masks)
     return cues.replace(agreement=torch.where(found.isnan(), cues.agreement, found))
 
 
@@ -209,7 +211,7 @@ def _voted(
     """Build the hull above the plane, and see it in every view."""
     cameras = cues.pictures.cameras
     silhouettes = Silhouettes(
-        inside=masks.float(), trusted=torch.ones(len(masks), dtype=torch.bool), source="found"
+        inside=masks.float(), reliable=torch.ones(len(masks), dtype=torch.bool), source="found"
     )
     hull = visual_hull(
         silhouettes, cameras, cues.box_world, num_voxels=num_voxels, disagreeing=disagreeing

@@ -15,8 +15,8 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Silhouettes, SparseScene, Views
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of, settled
 from pimper_torch.silhouettes.cloud import pixels_seen, split_cloud
-from pimper_torch.silhouettes.cuts import Cues, Cuts, cut_in_rounds
-from pimper_torch.silhouettes.ground import gaze, supporting_plane, well_tracked
+from pimper_torch.silhouettes.cuts import Cues, Cuts, cut_in_iterations
+from pimper_torch.silhouettes.ground import fixation, supporting_plane, well_tracked
 from pimper_torch.silhouettes.opencv import signed_distance
 from pimper_torch.silhouettes.parallax import plane_agreement
 from pimper_torch.silhouettes.pictures import working_pictures
@@ -36,8 +36,8 @@ class SilhouetteConfig:
     Attributes:
         object: Find silhouettes and fall back to everything (``auto``), take the masks that come
             with the photographs (``masks``), or take all that the photographs show for the object
-            (``everything``), as for walls, reliefs and scenes. Masks that are given are believed
-            by ``auto``, too.
+            (``everything``), as for walls, height fields and scenes. Masks that are given are
+            believed by ``auto``, too.
         region: Box that the object is inside: smallest x, y, z, then largest, scene units; none
             unless given.
         size_px: Longer side of the pictures that are cut.
@@ -61,21 +61,21 @@ class SilhouetteDetails:
     Chosen on the four rendered scenes and the skull (``benchmarks/silhouettes.py``).
 
     Attributes:
-        rounds: Of cutting and voting after the first cut.
+        iterations: Of cutting and voting after the first cut.
         num_voxels: Of the visual hull.
-        disagreeing: Share of the views that may see a voxel of the hull outside.
-        plane_tolerance: Distance up to which a point lies on the supporting plane, as a share of
+        disagreeing: Fraction of the views that may see a voxel of the hull outside.
+        plane_tolerance: Distance up to which a point lies on the supporting plane, as a fraction of
             the cameras' distance.
-        min_on_plane: Share of the points that lie on it.
-        max_below_plane: Share of the points that may lie below it.
-        min_covered: Share of a view's silhouette that the hull's projection must cover, or the
+        min_on_plane: Fraction of the points that lie on it.
+        max_below_plane: Fraction of the points that may lie below it.
+        min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
             view is not trusted.
         min_overlap: Intersection over union of silhouettes and projections, in the median, below
             which silhouettes are not trusted.
         seed: Of the plane's trials.
     """
 
-    rounds: int = 2
+    iterations: int = 2
     num_voxels: int = 500_000
     disagreeing: float = 0.05
     plane_tolerance: float = 0.004
@@ -116,8 +116,8 @@ class FindSilhouettes(Stage):
         if config.object == "everything":
             return everything
         if masks is not None:
-            trusted = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
-            return Silhouettes(inside=masks.float(), trusted=trusted, source="masks")
+            reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
+            return Silhouettes(inside=masks.float(), reliable=reliable, source="masks")
         if config.object == "masks":
             raise InputError(
                 "`silhouettes.object` is masks, but the photographs come without any. Give a "
@@ -133,15 +133,15 @@ class FindSilhouettes(Stage):
             return everything
         cuts = settled(cuts)
         found = _at_full_size(cuts, scene.views)
-        trusted = agreement_of(cuts).trusted(self.details.min_covered).to(found.device)
-        return Silhouettes(inside=found, trusted=trusted, source="found")
+        reliable = agreement_of(cuts).reliable(self.details.min_covered).to(found.device)
+        return Silhouettes(inside=found, reliable=reliable, source="found")
 
     def _cuts(self, scene: SparseScene) -> Cuts | None:
         config, details = self.config, self.details
         scene = scene.to("cpu", torch.float32)
         pictures = working_pictures(scene.views, scene.cameras, config.size_px)
         cameras, points = pictures.cameras, scene.points_world
-        looked_at = gaze(cameras)
+        looked_at = fixation(cameras)
         tolerance = details.plane_tolerance * float(looked_at.distance)
         plane = supporting_plane(
             points[well_tracked(scene)],
@@ -158,7 +158,7 @@ class FindSilhouettes(Stage):
         )
         cloud = split_cloud(scene, looked_at, plane, tolerance, region)
         half = _BOX * looked_at.distance
-        middle = looked_at.fixation_world
+        centre = looked_at.fixation_world
         agreement = None if plane is None else plane_agreement(pictures, plane, looked_at)
         cues = Cues(
             pictures=pictures,
@@ -166,29 +166,31 @@ class FindSilhouettes(Stage):
             other_px=tuple(pixels_seen(scene, cameras, cloud.other)),
             plane=plane,
             agreement=agreement,
-            gaze=looked_at,
-            box_world=torch.stack([middle - half, middle + half]) if region is None else region,
+            fixation=looked_at,
+            box_world=torch.stack([centre - half, centre + half]) if region is None else region,
         )
         if plane is None and not cues.has_points:
             return None
-        return cut_in_rounds(
+        return cut_in_iterations(
             cues,
-            rounds=details.rounds,
+            iterations=details.iterations,
             disagreeing=details.disagreeing,
             num_voxels=details.num_voxels,
         )
 
     def _doubt(self, agreement: Agreement) -> str:
         """Say why silhouettes cannot be trusted, or nothing."""
-        trusted = agreement.trusted(self.details.min_covered)
+        reliable = agreement.reliable(self.details.min_covered)
         overlap = float(agreement.overlap.median())
         if overlap < self.details.min_overlap:
             return (
                 f"silhouettes overlap with the hull of all views by {overlap:.0%} in the median; "
                 f"needed: {self.details.min_overlap:.0%}"
             )
-        if int(trusted.sum()) < max(3, len(trusted) / 2):
-            return f"only {int(trusted.sum())} of {len(trusted)} silhouettes agree with the others"
+        if int(reliable.sum()) < max(3, len(reliable) / 2):
+            return (
+                f"only {int(reliable.sum())} of {len(reliable)} silhouettes agree with the others"
+            )
         return ""
 
 

@@ -14,7 +14,7 @@ _MIN_POINTS = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Gaze(Record):
+class Fixation(Record):
     """Where the cameras look.
 
     Attributes:
@@ -43,7 +43,7 @@ class Plane(Record):
         return points_world @ self.normal_world - self.offset
 
 
-def gaze(cameras: Cameras) -> Gaze:
+def fixation(cameras: Cameras) -> Fixation:
     """Find the point nearest to all optical axes in the least-squares sense.
 
     Parallel axes meet nowhere: then it is as far away as the cameras are apart.
@@ -53,13 +53,13 @@ def gaze(cameras: Cameras) -> Gaze:
     across = torch.eye(3).to(axes) - axes[:, :, None] * axes[:, None, :]
     # The regularization is what axes within 1 degree of parallel would give.
     near = 3e-4 * len(axes) * torch.eye(3).to(axes)
-    middle = eyes.mean(dim=0)
-    spread = (eyes - middle).norm(dim=1).mean()
-    prior = middle + spread * axes.mean(dim=0)
+    centre = eyes.mean(dim=0)
+    spread = (eyes - centre).norm(dim=1).mean()
+    prior = centre + spread * axes.mean(dim=0)
     right = (across @ eyes[..., None])[..., 0].sum(dim=0) + near @ prior
     fixation = torch.linalg.solve(across.sum(dim=0) + near, right)
     distance = (eyes - fixation).norm(dim=1).median()
-    return Gaze(
+    return Fixation(
         fixation_world=fixation.to(cameras.cam_from_world),
         distance=distance.to(cameras.cam_from_world),
     )
@@ -85,8 +85,8 @@ def supporting_plane(
         points_world: Well tracked.
         cameras: All on its upper side.
         tolerance: Distance from the plane up to which a point lies on it, scene units.
-        least_on: Share of the points that must lie on it.
-        max_below: Share of the points that may lie below it.
+        least_on: Fraction of the points that must lie on it.
+        max_below: Fraction of the points that may lie below it.
         generator: Draws the trials.
 
     Returns:
@@ -117,7 +117,7 @@ def supporting_plane(
 
 
 def _refitted(points: Float[Tensor, "point 3"], plane: Plane) -> Plane:
-    middle = points.mean(dim=0)
-    normal = torch.linalg.svd(points - middle, full_matrices=False).Vh[2]
+    centre = points.mean(dim=0)
+    normal = torch.linalg.svd(points - centre, full_matrices=False).Vh[2]
     normal = normal * torch.where(normal @ plane.normal_world < 0, -1.0, 1.0).to(normal)
-    return Plane(normal_world=normal, offset=normal @ middle)
+    return Plane(normal_world=normal, offset=normal @ centre)

@@ -139,14 +139,14 @@ def visual_hull(
         box_world: Smallest and largest corner of the region to look in; the grid is fitted to
             what it holds.
         num_voxels: Of the whole grid; an arc of views gives a hull that is long along their rays.
-        disagreeing: Share of the views in sight of a voxel that may see it outside. What only
+        disagreeing: Fraction of the views in sight of a voxel that may see it outside. What only
             a few views cut, such as the ends of an arc, needs a small one.
-        min_seen: Share of the trusted views that a voxel must be in sight of.
+        min_seen: Fraction of the trusted views that a voxel must be in sight of.
 
     Returns:
         ``None`` where the silhouettes have nothing in common inside the box.
     """
-    views = silhouettes.trusted.nonzero()[:, 0].tolist()
+    views = silhouettes.reliable.nonzero()[:, 0].tolist()
     masks = silhouettes.masks
 
     def framed(view: int) -> Float[Tensor, "high wide"]:
@@ -191,8 +191,8 @@ def margins(
 ) -> Float[Tensor, "height width"]:
     """Give how far each pixel is inside the hull's projection, in pixels; negative outside.
 
-    It is how deep the ray gets into the hull, over the size of a pixel there: right to a share of
-    a pixel at the border, less so far from it. Rays are followed through every fourth pixel.
+    It is how deep the ray gets into the hull, over the size of a pixel there: right to a fraction
+    of a pixel at the border, less so far from it. Rays are followed through every fourth pixel.
     """
     width, height = size_px
     columns, rows = -(-width // _STRIDE), -(-height // _STRIDE)
@@ -229,9 +229,9 @@ def _deepest(
     start, step = 2 * (eye - low) / (high - low) - 1, 2 * rays / (high - low)
     lengths = ((far - near) * rays.norm(dim=-1))[meets]
     count = int(lengths.max() / hull.spacing) + 2
-    share = torch.linspace(0, 1, count).to(rays)
+    fraction = torch.linspace(0, 1, count).to(rays)
     for some in torch.split(meets, max(1, _SAMPLES // count)):
-        along = torch.addcmul(near[some, None], share, (far - near)[some, None])
+        along = torch.addcmul(near[some, None], fraction, (far - near)[some, None])
         grid = torch.addcmul(start, along[..., None], step[some, None]).flip(-1)
         depths = grid_sample(field, grid[None, None], padding_mode="border", align_corners=True)
         depth[some], best = depths[0, 0, 0].max(dim=1)
@@ -252,7 +252,7 @@ def _voted(
     cameras: Cameras,
     box_world: Float[Tensor, "2 3"],
     num_voxels: int,
-    shares: tuple[float, float],
+    fractions: tuple[float, float],
 ) -> Hull:
     """Fill a grid between two corners with about so many voxels."""
     low, high = box_world.to(cameras.intrinsics)
@@ -266,7 +266,7 @@ def _voted(
     slab = max(1, _VOXELS // int(counts[1:].prod()))
 
     def vote(some: Float[Tensor, " x"]) -> Float[Tensor, "x y z"]:
-        return _vote(maps, cameras, (first, steps), (some, reach[1], reach[2]), shares)
+        return _vote(maps, cameras, (first, steps), (some, reach[1], reach[2]), fractions)
 
     distance = list(side_by_side(vote, torch.split(reach[0], slab), tracked=False))
     return Hull(origin_world=low, spacing=spacing, distance=torch.cat(distance))
@@ -277,7 +277,7 @@ def _vote(
     cameras: Cameras,
     projected: tuple[Float[Tensor, "view 3"], Float[Tensor, "view 3 3"]],
     reach: tuple[Float[Tensor, " x"], Float[Tensor, " y"], Float[Tensor, " z"]],
-    shares: tuple[float, float],
+    fractions: tuple[float, float],
 ) -> Float[Tensor, "x y z"]:
     """Give the smallest distance to an silhouette after those that may disagree.
 
@@ -286,9 +286,9 @@ def _vote(
         cameras: Of the same views.
         projected: Homogeneous pixels of the first voxel, and what a step along each axis adds.
         reach: Numbers of the voxels along each axis.
-        shares: Of views that may disagree, and that must look.
+        fractions: Of views that may disagree, and that must look.
     """
-    disagreeing, min_seen = shares
+    disagreeing, min_seen = fractions
     shape = tuple(len(axis) for axis in reach)
     ranks = int(disagreeing * len(maps)) + 1
     smallest = [reach[0].new_full(shape, _UNSEEN) for _ in range(ranks)]

@@ -68,16 +68,16 @@ def window_means(
 
 
 def grab_cut_halved(
-    colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], rounds: int
+    colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], iterations: int
 ) -> Bool[Tensor, "height width"]:
     """Cut as :func:`grab_cut`, but every other pixel each way: right to two, in a quarter of it."""
-    half = grab_cut(colours[::2, ::2], labels[::2, ::2], rounds)
+    half = grab_cut(colours[::2, ::2], labels[::2, ::2], iterations)
     height, width = labels.shape
     return half.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)[:height, :width]
 
 
 def grab_cut(
-    colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], rounds: int
+    colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], iterations: int
 ) -> Bool[Tensor, "height width"]:
     """Cut the object out by two mixtures of colours and a graph cut.
 
@@ -87,7 +87,7 @@ def grab_cut(
         colours: The photograph.
         labels: ``BACKGROUND`` or ``OBJECT`` for certain, or ``PERHAPS_BACKGROUND`` or
             ``PERHAPS_OBJECT``; some of each side.
-        rounds: Of estimating the mixtures and cutting.
+        iterations: Of estimating the mixtures and cutting.
     """
     told = labels & 1 > 0
     if not told.any() or told.all():
@@ -99,7 +99,7 @@ def grab_cut(
     drawn = labels[window].contiguous().numpy().copy()
     models = np.zeros((1, 65)), np.zeros((1, 65))
     pixels = colours[window].contiguous().numpy()
-    cv2.grabCut(pixels, drawn, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(pixels, drawn, None, *models, iterations, cv2.GC_INIT_WITH_MASK)
     found = torch.zeros_like(told)
     found[window] = torch.from_numpy((drawn & 1) > 0)
     return found
@@ -180,9 +180,9 @@ def _large(
 
 
 def blind_holes(
-    mask: Bool[Tensor, "height width"], seen_through: Bool[Tensor, "height width"], share: float
+    mask: Bool[Tensor, "height width"], seen_through: Bool[Tensor, "height width"], fraction: float
 ) -> Bool[Tensor, "height width"]:
-    """Mark the holes of a mask of which less than a share is seen through."""
+    """Mark the holes of a mask of which less than a fraction is seen through."""
     drawn = (~mask).numpy().astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(drawn, connectivity=4)
     through = np.bincount(labels[seen_through.numpy()], minlength=count)
@@ -190,5 +190,5 @@ def blind_holes(
     right, bottom = left + stats[:, cv2.CC_STAT_WIDTH], top + stats[:, cv2.CC_STAT_HEIGHT]
     height, width = drawn.shape
     enclosed = (left > 0) & (top > 0) & (right < width) & (bottom < height)
-    blind = enclosed & (through < share * stats[:, cv2.CC_STAT_AREA]) & (np.arange(count) > 0)
+    blind = enclosed & (through < fraction * stats[:, cv2.CC_STAT_AREA]) & (np.arange(count) > 0)
     return torch.from_numpy(blind[labels])

@@ -16,11 +16,11 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record
-from pimper_torch.silhouettes.ground import Gaze, Plane
+from pimper_torch.silhouettes.ground import Fixation, Plane
 from pimper_torch.silhouettes.opencv import warped, window_means
 from pimper_torch.silhouettes.pictures import Pictures, of_views
 
-# Shares of the pictures' longer side.
+# Fractions of the pictures' longer side.
 _WINDOW = 1 / 80  # windows that are compared: 9 px of 640
 _SHADING = 1 / 25  # what is smoother than this is light, not texture
 # Log radiance whose deviation in a window is below this is flat: a sensor's noise of 0.01.
@@ -51,7 +51,7 @@ class Sheet(Record):
 def plane_agreement(
     pictures: Pictures,
     plane: Plane,
-    gaze: Gaze,
+    fixation: Fixation,
     hidden: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view height width"]:
     r"""Say how well each view agrees with the plane's texture.
@@ -62,7 +62,7 @@ def plane_agreement(
     Args:
         pictures: At the working size.
         plane: Supporting the object.
-        gaze: Its fixation point is the middle of what is looked at.
+        fixation: Its fixation point is the centre of what is looked at.
         hidden: Where views do not show the plane, as far as is known. What they show there is
             compared with the plane's texture, but is no part of it.
 
@@ -79,8 +79,8 @@ def plane_agreement(
 
     texture = of_views(textured, cameras.num_views)
     seen, radiance = (layer.masked_fill(hidden, torch.nan) for layer in (texture, pictures.grey))
-    common, spread = _common(seen, cameras, _sheet(cameras, plane, gaze, _REACH, _STEP))
-    far = _sheet(cameras, plane, gaze, _FAR_REACH, _FAR_STEP)
+    common, spread = _common(seen, cameras, _sheet(cameras, plane, fixation, _REACH, _STEP))
+    far = _sheet(cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
     level, level_spread = _common(radiance, cameras, far)
 
     def agreement_of(view: int) -> Float[Tensor, "height width"]:
@@ -100,7 +100,7 @@ def _common(
     square = (sheet.size_px, sheet.size_px)
     seen = of_views(lambda view: warped(values[view], maps[view], square), len(values))
     rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * sheet.size_px)), dim=1)
-    common, spread = torch.cat(list(side_by_side(_middle, rows, tracked=False)), dim=1)
+    common, spread = torch.cat(list(side_by_side(_centre, rows, tracked=False)), dim=1)
     size = (values.shape[2], values.shape[1])
 
     def back(view: int) -> Float[Tensor, "layer height width"]:
@@ -111,7 +111,7 @@ def _common(
     return common, spread
 
 
-def _middle(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row column"]:
+def _centre(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row column"]:
     """Give the views' median and the spread round it; NaN where too few see the plane."""
     common = seen.nanmedian(dim=0).values
     spread = (seen - common).abs().nanmedian(dim=0).values
@@ -129,15 +129,17 @@ def _before(
     return torch.where(scale > 0, layer, torch.nan)
 
 
-def _sheet(cameras: Cameras, plane: Plane, gaze: Gaze, reach: float, step_px: float) -> Sheet:
+def _sheet(
+    cameras: Cameras, plane: Plane, fixation: Fixation, reach: float, step_px: float
+) -> Sheet:
     """Lay a raster on the plane about the foot of the fixation point."""
     normal = plane.normal_world
     axis = torch.eye(3)[normal.abs().argmin()].to(normal)
     first = normalize(torch.linalg.cross(normal, axis), dim=0)
     second = torch.linalg.cross(normal, first)
-    foot = gaze.fixation_world - plane.height_of(gaze.fixation_world) * normal
-    step = step_px * gaze.distance / cameras.intrinsics[:, 0, 0].median()
-    size = int(2 * reach * gaze.distance / step)
+    foot = fixation.fixation_world - plane.height_of(fixation.fixation_world) * normal
+    step = step_px * fixation.distance / cameras.intrinsics[:, 0, 0].median()
+    size = int(2 * reach * fixation.distance / step)
     corner = foot - step * size / 2 * (first + second)
     return Sheet(
         world_from_sheet=torch.stack([step * first, step * second, corner], dim=1), size_px=size

@@ -94,7 +94,7 @@ def contour_rays(
     def of_view(view: int) -> ContourRays:
         return _of_view(silhouettes.inside[view], cameras, view, config)
 
-    views = silhouettes.trusted.nonzero()[:, 0].tolist()
+    views = silhouettes.reliable.nonzero()[:, 0].tolist()
     found = [_nothing(cameras), *side_by_side(of_view, views)]
     return ContourRays(
         view=torch.cat([one.view for one in found]),
@@ -183,12 +183,12 @@ def _samples(line: _Line, smooth: Array, stride: float, config: RayConfig) -> Ar
     outward = -np.sign(rise)[:, None] * across
     reach = round(config.corner_px)
     behind, ahead = line.shifted(tangent, -reach), line.shifted(tangent, reach)
-    turn = np.degrees(np.arccos((behind * ahead).sum(axis=1).clip(-1, 1)))
+    rotation = np.degrees(np.arccos((behind * ahead).sum(axis=1).clip(-1, 1)))
     convex = ((ahead - behind) * outward).sum(axis=1) < 0
     most = np.where(convex, config.max_convex_deg, config.max_concave_deg)
     size = np.array([smooth.shape[1], smooth.shape[0]]) - 1.0
     margin = np.minimum(places, size - places).min(axis=1) + 0.5
-    good = (turn <= most) & (margin >= config.border_px) & (rise != 0)
+    good = (rotation <= most) & (margin >= config.border_px) & (rise != 0)
     chosen = np.arange(0, len(places), stride).astype(int)
     chosen = chosen[good[chosen]]
     rows = np.concatenate([places, tangent, outward, np.abs(rise)[:, None]], axis=1)

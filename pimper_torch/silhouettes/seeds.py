@@ -17,7 +17,7 @@ from pimper_torch.silhouettes.opencv import (
     signed_distance,
 )
 
-# Lengths are shares of the pictures' longer side.
+# Lengths are fractions of the pictures' longer side.
 _DISC = 1 / 400  # about a point: its feature is larger, but may reach over the silhouette
 _STRIP = 1 / 64  # along the border of a photograph, where nothing else is known
 _CLOSING = 1 / 90

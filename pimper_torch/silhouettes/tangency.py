@@ -66,7 +66,7 @@ def contour_points(
         cameras: Of all views.
         hull: Of the same silhouettes.
         points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
-            any, places are in the middle of what is in the hull.
+            any, places are in the centre of what is in the hull.
         normals_world: Theirs, unit, outward.
         config: Settings.
 
@@ -133,9 +133,9 @@ def _depths_in_box(
 ) -> tuple[Float[Tensor, "ray 1"], Float[Tensor, "ray 1"]]:
     """Give the depths at which rays enter and leave the ball round the hull's grid."""
     corners = hull.corners_world.to(rays)
-    middle, radius = corners.mean(dim=0), (corners[1] - corners[0]).norm() / 2
+    centre, radius = corners.mean(dim=0), (corners[1] - corners[0]).norm() / 2
     square = rays.square().sum(dim=1, keepdim=True)
-    along = ((middle - centers) * rays).sum(dim=1, keepdim=True) / square
+    along = ((centre - centers) * rays).sum(dim=1, keepdim=True) / square
     reach = radius / square.sqrt()
     return (along - reach).clamp_min(0), (along + reach).clamp_min(0)
 
@@ -150,14 +150,14 @@ def _costs(
 ) -> Float[Tensor, "ray step"]:
     """Give the signed distance to the surface along the rays; infinite outside the hull.
 
-    Without a surface it is the distance to the middle of what is in the hull.
+    Without a surface it is the distance to the centre of what is in the hull.
     """
     places = centers[:, None] + depth[..., None] * rays.rays_world[:, None]
     inside = hull.depth_of(places.to(hull.distance)) >= -tolerance[:, None].to(hull.distance)
     inside &= depth > 0
     if surface is None:
-        middle = (inside * depth).sum(dim=1) / inside.sum(dim=1).clamp_min(1)
-        return torch.where(inside, (depth - middle[:, None]).abs(), torch.inf)
+        centre = (inside * depth).sum(dim=1) / inside.sum(dim=1).clamp_min(1)
+        return torch.where(inside, (depth - centre[:, None]).abs(), torch.inf)
     cost = torch.full_like(depth, torch.inf)
     cost[inside] = surface(places[inside])
     return cost

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.kernels.sweep import ALBEDO_ROUNDS
+from pimper_torch.kernels.sweep import ALBEDO_ITERATIONS
 
 
 def inconsistency(
@@ -17,7 +17,7 @@ def inconsistency(
     shading: Float[Tensor, "sample view"],
     seen: Bool[Tensor, "sample view"],
     scale: Float[Tensor, " sample"],
-    rounds: int = ALBEDO_ROUNDS,
+    iterations: int = ALBEDO_ITERATIONS,
 ) -> Float[Tensor, "sample hypothesis"]:
     r"""Give the robust cost of every hypothesis.
 
@@ -31,7 +31,7 @@ def inconsistency(
         seen: Views that take part; the same for all hypotheses, as costs of different sets
             could not be compared.
         scale: ``c``, in units of radiance.
-        rounds: Of the albedo.
+        iterations: Of the albedo.
 
     Differentiable in radiance, shading and scale, through the rounds of the albedo.
     """
@@ -39,7 +39,7 @@ def inconsistency(
     taken, per_scale = seen[..., None].to(radiance), 1 / scale[:, None, None]
     said = torch.where(seen[..., None], radiance / s, torch.nan)
     albedo = said.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
-    for _ in range(rounds):
+    for _ in range(iterations):
         residual = (radiance - albedo * s) * per_scale
         lit = taken * s / (1 + residual.square())
         square = (lit * s).sum(dim=1, keepdim=True)

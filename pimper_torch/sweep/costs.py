@@ -15,7 +15,7 @@ def compiled_costs(
     templates: Templates,
     registered: Observations,
     photometry: Photometry,
-    carried: Float[Tensor, "patch height width 3"],
+    transferred: Float[Tensor, "patch height width 3"],
     cameras: Cameras,
     sources: Sources,
     *,
@@ -31,7 +31,7 @@ def compiled_costs(
         templates: The bucket.
         registered: Which views have which samples.
         photometry: Normals and lights.
-        carried: Normals that samples are swept along.
+        transferred: Normals that samples are swept along.
         cameras: Of all views.
         sources: Photographs.
         ladder: Heights that are tried, in samples.
@@ -56,7 +56,7 @@ def compiled_costs(
         as_array(templates.origin, torch.float64),
         as_array(templates.spacing, torch.float64),
         as_array(templates.depth, torch.float32),
-        as_array(carried, torch.float32),
+        as_array(transferred, torch.float32),
         as_array(photometry.normals_patch, torch.float32),
         as_array(photometry.lights_patch[..., :4], torch.float32),
         as_array(registered.valid),

@@ -24,12 +24,12 @@ def parabola_minimum(
     last = cost.shape[-1] - 1
     best = cost.detach().argmin(dim=-1, keepdim=True)
     interior = (best > 0) & (best < last)
-    middle = best.clamp(1, last - 1)
-    before, here, after = (cost.gather(-1, middle + step)[..., 0] for step in (-1, 0, 1))
+    centre = best.clamp(1, last - 1)
+    before, here, after = (cost.gather(-1, centre + step)[..., 0] for step in (-1, 0, 1))
     curvature = before - 2 * here + after
     bent = interior[..., 0] & (curvature > 0)
     aside = (before - after) / (2 * torch.where(bent, curvature, 1))
-    place = torch.where(bent, middle[..., 0] + aside.clamp(-0.5, 0.5), best[..., 0].to(cost))
+    place = torch.where(bent, centre[..., 0] + aside.clamp(-0.5, 0.5), best[..., 0].to(cost))
     return place, torch.where(bent, curvature, 0), bent
 
 
@@ -50,8 +50,8 @@ def posterior_variance(
     tensor([0.0050])
     """
     steps = torch.arange(cost.shape[-1], device=cost.device, dtype=cost.dtype)
-    share = torch.softmax(-cost, dim=-1)
-    mean = (share * steps).sum(dim=-1, keepdim=True)
-    spread = (share * (steps - mean).square()).sum(dim=-1)
+    fraction = torch.softmax(-cost, dim=-1)
+    mean = (fraction * steps).sum(dim=-1, keepdim=True)
+    spread = (fraction * (steps - mean).square()).sum(dim=-1)
     bent = curvature > 0
     return torch.where(bent, spread + 1 / torch.where(bent, curvature, 1), torch.inf)

@@ -13,9 +13,9 @@ from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.parallel import side_by_side
-from pimper_torch.patches.carry import carried_normals
 from pimper_torch.patches.pyramid import look_up
 from pimper_torch.patches.sources import Sources, prepare
+from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -156,7 +156,7 @@ class Sweep(Stage):
     ) -> Heights:
         config = self.config
         templates, registered, photometry = bucket
-        carried = carried_normals(coarse, templates)
+        transferred = transferred_normals(coarse, templates)
         shown = registered.valid.flatten(2).any(dim=2).sum(dim=1)
         gray = sources.gray.finest
         fast = gray.dtype == torch.float32 and compiled_for(
@@ -165,13 +165,13 @@ class Sweep(Stage):
             cameras.intrinsics,
             templates.depth,
             templates.patch_from_world,
-            carried,
+            transferred,
             photometry.normals_patch,
             photometry.lights_patch,
             photometry.convergence.residual,
         )
         how = self._compiled_costs if fast else self._costs
-        costs, swept = how(templates, registered, photometry, carried, cameras, sources)
+        costs, swept = how(templates, registered, photometry, transferred, cameras, sources)
         step = _STEP * templates.spacing
         window = level_weight(templates.depth.detach(), swept, templates.spacing, _CLIFF)
         averaged = window_size(_WINDOW)
@@ -182,11 +182,11 @@ class Sweep(Stage):
         place, curvature, found = parabola_minimum(costs)
         variance = posterior_variance(costs, curvature)
         unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
-        share = (1 / variance - 1 / unknown).clamp_min(0) / averaged
-        found = found & (window > 0) & (share > 0)
+        fraction = (1 / variance - 1 / unknown).clamp_min(0) / averaged
+        found = found & (window > 0) & (fraction > 0)
         return Heights(
             offset=torch.where(found, (place - config.steps) * step[:, None, None], 0),
-            information=torch.where(found, share / step[:, None, None].square(), 0),
+            information=torch.where(found, fraction / step[:, None, None].square(), 0),
             num_views=shown,
         )
 
@@ -199,7 +199,7 @@ class Sweep(Stage):
         templates: Templates,
         registered: Observations,
         photometry: Photometry,
-        carried: Float[Tensor, "patch height width 3"],
+        transferred: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
         sources: Sources,
     ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
@@ -209,7 +209,7 @@ class Sweep(Stage):
             templates,
             registered,
             photometry,
-            carried,
+            transferred,
             cameras,
             sources,
             ladder=_STEP * torch.arange(-config.steps, config.steps + 1.0),
@@ -224,13 +224,13 @@ class Sweep(Stage):
         templates: Templates,
         registered: Observations,
         photometry: Photometry,
-        carried: Float[Tensor, "patch height width 3"],
+        transferred: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
         sources: Sources,
     ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
         """Give the cost of every height, and 1 where a sample is swept, else 0."""
         config = self.config
-        rows = self._rows(templates, registered, photometry, carried, cameras)
+        rows = self._rows(templates, registered, photometry, transferred, cameras)
         step = _STEP * templates.spacing
         ladder = torch.arange(-config.steps, config.steps + 1, device=step.device).to(step)
         moves = step[rows.patch, None] * ladder
@@ -245,7 +245,7 @@ class Sweep(Stage):
         templates: Templates,
         registered: Observations,
         photometry: Photometry,
-        carried: Float[Tensor, "patch height width 3"],
+        transferred: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
     ) -> _Swept:
         """List the samples that enough views judge, with these."""
@@ -256,7 +256,7 @@ class Sweep(Stage):
         patch = place // asked[0].numel()
         world_from_patch = invert_rigid(templates.patch_from_world)
         points = transform(world_from_patch, templates.points_patch.flatten(1, 2))
-        outward = rotate(world_from_patch, carried.flatten(1, 2))
+        outward = rotate(world_from_patch, transferred.flatten(1, 2))
         points, outward = points.reshape(-1, 3)[place], outward.reshape(-1, 3)[place]
         normals = photometry.normals_patch.reshape(-1, 3)[place]
         basis = torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)

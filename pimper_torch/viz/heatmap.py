@@ -27,7 +27,7 @@ Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 _COLORS = "viridis"  # perceptually uniform, and it has no red
 MISSED = (0.88, 0.20, 0.16)
-_DARKEST = 0.65  # shading of the steepest relief; darker would hide the colour it tints
+_DARKEST = 0.65  # shading of the steepest height field; darker would hide the colour it tints
 _MARGIN = 0.04
 # Inches: width of a panel, room between panels, a title, names at the left, the colour bar.
 _PANEL_IN, _GAP_IN, _TITLE_IN, _NAME_IN, _BAR_IN = 2.6, 0.08, 0.32, 0.3, 0.95
@@ -103,7 +103,7 @@ def error_picture(
     Args:
         error: See the head of this file.
         scale: From the first colour at 0 to the last at its clip.
-        shading: The surface, shaded; tints the colours a little so that relief is seen.
+        shading: The surface, shaded; tints the colours a little so that height field is seen.
 
     Returns:
         sRGB. Missed pixels are red, whatever the shading; white where there is nothing.
@@ -229,9 +229,9 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path) -> None:
         x = _NAME_IN + index * (_PANEL_IN + _GAP_IN) + _PANEL_IN / 2
         figure.text(x / size[0], (top + 0.1) / size[1], name, ha="center", fontsize=10)
     for row, height in zip(rows, heights, strict=True):
-        middle = (top - height - _GAP_IN / 2) / size[1]
+        centre = (top - height - _GAP_IN / 2) / size[1]
         figure.text(
-            0.12 / size[0], middle, row.scene, rotation=90, va="center", ha="center", fontsize=11
+            0.12 / size[0], centre, row.scene, rotation=90, va="center", ha="center", fontsize=11
         )
         for index, panels in enumerate(_columns(row, names)):
             left = _NAME_IN + index * (_PANEL_IN + _GAP_IN)

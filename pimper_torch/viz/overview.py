@@ -1,4 +1,4 @@
-"""The contact sheet of a run: photographs with silhouettes, facets, normals, albedo, relief."""
+"""The contact sheet of a run: photographs, silhouettes, facets, normals, albedo, height."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +12,14 @@ from pimper_torch.meshing.simplify import with_few_faces
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
-from pimper_torch.viz.render import bounding_box, frame, shade, turn
-from pimper_torch.viz.silhouettes import TRUSTED, thumbnails
+from pimper_torch.viz.render import bounding_box, frame, rotation, shade
+from pimper_torch.viz.silhouettes import RELIABLE, thumbnails
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-Box = tuple[float, float, float, float]  # left, bottom, width, height, shares of the sheet
+Box = tuple[float, float, float, float]  # left, bottom, width, height, fractions of the sheet
 
 _MARGIN = 0.05
-_TURN_DEG = 40.0
+_ROTATION_DEG = 40.0
 _DIMMED = 0.45
 _ACROSS = 4
 # Inches of the sheet: width of a panel, room round it, heights of its title and of the sheet's.
@@ -82,7 +82,7 @@ def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> No
         axes.imshow(panel.picture, extent=(0, width, height, 0), interpolation="antialiased")
         if panel.inside is not None and _has_border(panel.inside):
             at = np.arange(width) + 0.5, np.arange(height) + 0.5
-            axes.contour(*at, panel.inside, levels=[0.5], colors=[TRUSTED], linewidths=0.8)
+            axes.contour(*at, panel.inside, levels=[0.5], colors=[RELIABLE], linewidths=0.8)
         if panel.lines is not None:
             axes.add_collection(
                 PolyCollection(
@@ -99,7 +99,7 @@ def _boxes(shown: list[Panel]) -> tuple[list[Box], tuple[float, float]]:
     """Lay panels out in rows as high as their highest.
 
     Returns:
-        Left, bottom, width and height of every panel as shares of the sheet, and the
+        Left, bottom, width and height of every panel as fractions of the sheet, and the
         sheet's width and height in inches.
     """
     ratios = [min(panel.picture.shape[0] / panel.picture.shape[1], _TALLEST) for panel in shown]
@@ -143,8 +143,8 @@ def _all_views(result: Reconstruction) -> Panel | None:
         result.scene.views, silhouettes, width_px=width_px, across=_THUMBNAILS_ACROSS
     )
     origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
-    trusted = f"{int(silhouettes.trusted.sum())} of {len(silhouettes.trusted)} views trusted"
-    return Panel(title=f"{origin}, {trusted}", picture=_array(tiles))
+    reliable = f"{int(silhouettes.reliable.sum())} of {len(silhouettes.reliable)} views trusted"
+    return Panel(title=f"{origin}, {reliable}", picture=_array(tiles))
 
 
 def _has_border(inside: Picture) -> bool:
@@ -164,8 +164,8 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     albedo = (albedo_scale(result.mesh) * maps.albedo).clamp(0, 1)
     center = vertices.mean(dim=0)
     sides = [
-        frame(turn(own, center, angle), vertices, panel_px, _MARGIN)
-        for angle in (-_TURN_DEG, _TURN_DEG)
+        frame(rotation(own, center, angle), vertices, panel_px, _MARGIN)
+        for angle in (-_ROTATION_DEG, _ROTATION_DEG)
     ]
     coarse = result.coarse.mesh
     return [
@@ -179,8 +179,12 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
         Panel(title="surface, shaded", picture=_array(shade(shape, camera))),
         Panel(title="normals", picture=_array(normal_colors(maps.normals_cam))),
         Panel(title="albedo", picture=_array(_rgb(srgb_from_linear(albedo)))),
-        Panel(title=f"surface from {_TURN_DEG:.0f}° left", picture=_array(shade(shape, sides[0]))),
-        Panel(title=f"surface from {_TURN_DEG:.0f}° right", picture=_array(shade(shape, sides[1]))),
+        Panel(
+            title=f"surface from {_ROTATION_DEG:.0f}° left", picture=_array(shade(shape, sides[0]))
+        ),
+        Panel(
+            title=f"surface from {_ROTATION_DEG:.0f}° right", picture=_array(shade(shape, sides[1]))
+        ),
     ]
 
 

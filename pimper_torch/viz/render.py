@@ -14,18 +14,18 @@ from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.visibility import cast_view
 from pimper_torch.records import Cameras, Mesh
 
-# Raking light from up on the left shows relief; a weaker one beside the viewer keeps the far
+# Raking light from up on the left shows height field; a weaker one beside the viewer keeps the far
 # side from drowning.
-_LAMPS_CAM = ((0.62, (-0.60, -0.60, -0.53)), (0.26, (0.0, 0.0, -1.0)))
+_POINT_LIGHTS_CAM = ((0.62, (-0.60, -0.60, -0.53)), (0.26, (0.0, 0.0, -1.0)))
 _AMBIENT = 0.04
 _INSIDE = (0.55, 0.62, 0.75)  # tint of faces seen from behind
 _OVERSAMPLING = 2
 
 
 def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "height width 3"]:
-    """Draw a mesh as grey matte stuff under a raking lamp.
+    """Draw a mesh as grey matte stuff under a raking point light.
 
-    Its own shape is shaded, never the normals that it carries: relief that is seen is there.
+    Its own shape is shaded, never the normals that it carries: height field that is seen is there.
     Faces seen from behind are bluish. A constant to autograd.
 
     Args:
@@ -53,17 +53,17 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     from_behind = (faces_cam * _towards(fine)).sum(dim=-1) > 0
     normals_cam = torch.where(from_behind[..., None], -normals_cam, normals_cam)
     light = torch.full_like(normals_cam[..., 0], _AMBIENT)
-    for strength, direction in _LAMPS_CAM:
-        lamp = normalize(normals_cam.new_tensor(direction), dim=0)
-        light = light + strength * (normals_cam @ lamp).clamp_min(0)
+    for strength, direction in _POINT_LIGHTS_CAM:
+        point_light = normalize(normals_cam.new_tensor(direction), dim=0)
+        light = light + strength * (normals_cam @ point_light).clamp_min(0)
     tint = torch.where(from_behind[..., None], light.new_tensor(_INSIDE), 1.0)
     radiance = torch.where(seen[..., None], light[..., None] * tint, 1.0)
     radiance = avg_pool2d(radiance.movedim(-1, 0)[None], _OVERSAMPLING)[0].movedim(0, -1)
-    # Well short of a display's curve: steeper tones show more relief.
+    # Well short of a display's curve: steeper tones show more height field.
     return radiance.clamp(0, 1) ** (1 / 1.3)
 
 
-def turn(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
+def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
     """Walk round a point, about the vertical of the picture.
 
     Args:
@@ -75,8 +75,8 @@ def turn(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -
     cos, sin = math.cos(angle), math.sin(angle)
     about_y = center_world.new_tensor([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
     center_cam = transform(camera.cam_from_world[0], center_world[None])[0]
-    turned_from_cam = rigid(about_y, center_cam - about_y @ center_cam)
-    return camera.replace(cam_from_world=turned_from_cam[None] @ camera.cam_from_world)
+    rotated_from_cam = rigid(about_y, center_cam - about_y @ center_cam)
+    return camera.replace(cam_from_world=rotated_from_cam[None] @ camera.cam_from_world)
 
 
 def frame(
@@ -88,7 +88,7 @@ def frame(
         camera: One view.
         points_world: At least one of them before the camera.
         longer_side_px: Of the new picture.
-        margin: Round the box, as a share of its longer side.
+        margin: Round the box, as a fraction of its longer side.
     """
     return crop(camera, *bounding_box(camera, points_world, margin), longer_side_px)
 

@@ -8,7 +8,7 @@ from torch.nn.functional import adaptive_avg_pool2d, max_pool2d
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes, Views
 
-TRUSTED, DOUBTED = (1.0, 0.82, 0.29), (1.0, 0.2, 0.2)
+RELIABLE, DOUBTED = (1.0, 0.82, 0.29), (1.0, 0.2, 0.2)
 
 
 def thumbnails(
@@ -35,7 +35,7 @@ def thumbnails(
         inside = adaptive_avg_pool2d(silhouettes.inside[view].cpu()[None], (high, wide))[0]
         tile = srgb_from_linear(image.clamp(0, 1)).expand(3, -1, -1).movedim(0, -1).clone()
         tile[border(inside > 0.5)] = tile.new_tensor(
-            TRUSTED if silhouettes.trusted[view] else DOUBTED
+            RELIABLE if silhouettes.reliable[view] else DOUBTED
         )
         top, left = view // across * high, view % across * wide
         sheet[top : top + high, left : left + wide] = tile

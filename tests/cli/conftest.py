@@ -39,7 +39,7 @@ def chain(reconstruction, monkeypatch):
             return reconstruction
 
         def work(self):
-            """Whatever a test wants to happen in the middle of a run."""
+            """Whatever a test wants to happen in the centre of a run."""
 
     draw = results.draw_overview
     monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))

@@ -14,7 +14,7 @@ def show(terminal):
         name="warp",
         seconds=2.5,
         peak_memory_mb=9.0,
-        figures={"samples": 12345, "missing_share": 0.25},
+        figures={"samples": 12345, "missing_fraction": 0.25},
     )
     with Bars(console) as bars:
         assert isinstance(bars, Observer)
@@ -28,9 +28,9 @@ def show(terminal):
 def test_a_terminal_sees_a_bar_that_ends_full():
     shown = show(terminal=True)
     assert "100%" in shown
-    assert "samples 12,345, missing share 0.25" in shown
+    assert "samples 12,345, missing fraction 0.25" in shown
 
 
 def test_a_log_file_sees_one_line_a_stage():
     shown = show(terminal=False)
-    assert " ".join(shown.split()) == "warp 2.5 s samples 12,345, missing share 0.25"
+    assert " ".join(shown.split()) == "warp 2.5 s samples 12,345, missing fraction 0.25"

@@ -82,8 +82,8 @@ def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, 
     """The silhouettes that a run found come back to the bit, whatever they look like."""
     scene = reconstruction.scene
     inside = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(4))
-    trusted = torch.tensor([True, True, False])
-    found = Silhouettes(inside=inside, trusted=trusted, source="found")
+    reliable = torch.tensor([True, True, False])
+    found = Silhouettes(inside=inside, reliable=reliable, source="found")
     write_result(
         reconstruction.replace(silhouettes=found), CoarseToFineConfig(), tmp_path / "first"
     )
@@ -99,7 +99,7 @@ def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, 
     silhouettes = FindSilhouettes()(scene.replace(views=views))
     assert silhouettes.source == "masks"
     assert torch.equal(silhouettes.masks, found.masks)
-    assert silhouettes.trusted.all()  # also of views whose silhouette was not trusted
+    assert silhouettes.reliable.all()  # also of views whose silhouette was not trusted
 
 
 def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkeypatch):

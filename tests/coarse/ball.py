@@ -33,7 +33,7 @@ def mottled(points):
 def photographed(cameras, texture=mottled):
     generator = torch.Generator().manual_seed(0)
     count = cameras.num_views
-    # The lamp goes with the camera and is never quite the same.
+    # The point light goes with the camera and is never quite the same.
     towards = normalize(cameras.centers_world, dim=-1)
     aside = 0.4 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
     lights = torch.cat(
@@ -66,6 +66,6 @@ def silhouettes_of(cameras):
     met = Sphere().intersect(cameras.centers_world[:, None], rays).isfinite()
     return Silhouettes(
         inside=met.float().reshape(-1, height, width),
-        trusted=torch.ones(len(met), dtype=torch.bool),
+        reliable=torch.ones(len(met), dtype=torch.bool),
         source="masks",
     )

@@ -134,16 +134,16 @@ def test_poisson_puts_a_ball_through_points_of_a_ball_and_simplification_keeps_i
 
 def test_small_holes_are_closed_and_large_ones_and_crumbs_are_not():
     vertices, faces = icosphere(3)
-    middle = vertices[faces].mean(dim=1)
-    kept = (middle[:, 2] < 0.6) & ~(middle[:, 0] > 0.95)
+    centre = vertices[faces].mean(dim=1)
+    kept = (centre[:, 2] < 0.6) & ~(centre[:, 0] > 0.95)
     whole = torch.ones(len(faces), dtype=torch.bool)
     assert (supported_pieces(vertices, faces, whole, 0.9)).all()
     repaired = without_small_holes(vertices, faces, kept, 1.0)
-    assert repaired[middle[:, 0] > 0.95].all()  # 0.3 of the area unit
-    assert not repaired[middle[:, 2] > 0.6].any()  # 2.5
-    crumbs = (middle[:, 2] < 0) | (middle[:, 2] > 0.97)
+    assert repaired[centre[:, 0] > 0.95].all()  # 0.3 of the area unit
+    assert not repaired[centre[:, 2] > 0.6].any()  # 2.5
+    crumbs = (centre[:, 2] < 0) | (centre[:, 2] > 0.97)
     pieces = supported_pieces(vertices, faces[crumbs], whole[crumbs], 0.05)
-    assert (pieces == (middle[crumbs][:, 2] < 0)).all()
+    assert (pieces == (centre[crumbs][:, 2] < 0)).all()
 
 
 def test_narrow_strips_along_a_border_go_unless_they_are_long_and_supported():
@@ -175,11 +175,11 @@ def test_faces_go_with_what_they_hang_together_with():
 
 def test_what_spans_a_gap_does_not_go_with_what_hangs_in_the_air_beside_it():
     flat = table(half_side=12.0, cells=48)
-    middle = flat.vertices_world[flat.faces].mean(dim=1)[:, :2]
+    centre = flat.vertices_world[flat.faces].mean(dim=1)[:, :2]
     # Points all over, but in two discs of radius 6 and 3, and in a strip that joins them.
-    wide = (middle - middle.new_tensor([-5.0, 0.0])).norm(dim=-1)
-    narrow = (middle - middle.new_tensor([6.0, 0.0])).norm(dim=-1)
-    strip = torch.where((middle[:, 0] - 0.5).abs() < 5.5, 0.9 - middle[:, 1].abs(), 0.0)
+    wide = (centre - centre.new_tensor([-5.0, 0.0])).norm(dim=-1)
+    narrow = (centre - centre.new_tensor([6.0, 0.0])).norm(dim=-1)
+    strip = torch.where((centre[:, 0] - 0.5).abs() < 5.5, 0.9 - centre[:, 1].abs(), 0.0)
     distance = torch.stack([6 - wide, 3 - narrow, strip]).amax(dim=0).clamp_min(0)
     between = distance > 0.2
     hanging = hanging_together(flat.faces, between, distance > 4)

@@ -7,7 +7,7 @@ from pimper_torch.coarse.cropping import cropped
 from pimper_torch.coarse.fine_surface import FineSurfaceConfig, closed_surface, seen_surface
 from pimper_torch.coarse.oriented import no_points
 from pimper_torch.coarse.surface import CoarseSurface
-from pimper_torch.coarse.trim import Evidence
+from pimper_torch.coarse.trim import Terms
 from pimper_torch.errors import ConfigError, ReconstructionError
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.meshes import icosphere
@@ -53,12 +53,12 @@ def test_a_ball_textured_on_one_half_is_enclosed_whole_and_says_what_supports_it
     coarse = enclosed(scene, lambda points: points[:, 2] > 0)
     mesh = coarse.mesh
     assert is_closed(mesh)
-    middle = mesh.vertices_world[mesh.faces].mean(dim=1)
-    off = (middle.norm(dim=1) - 1).abs()
+    centre = mesh.vertices_world[mesh.faces].mean(dim=1)
+    off = (centre.norm(dim=1) - 1).abs()
     # A pixel is 0.022 of the radius there.
     assert off.mean() < 0.02
     assert off.max() < 0.1
-    above, below = middle[:, 2] > 0.2, middle[:, 2] < -0.2
+    above, below = centre[:, 2] > 0.2, centre[:, 2] < -0.2
     # Views 40 degrees apart match some of it.
     assert (coarse.support[above] == Support.POINTS).float().mean() > 0.15
     assert (coarse.support[below] == Support.POINTS).float().mean() < 0.02
@@ -81,7 +81,7 @@ def test_a_ball_of_one_colour_is_enclosed_by_its_silhouettes_alone(round_about):
 def test_what_no_view_sees_is_left_out():
     cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
     mesh = enclosed(photographed(cameras)).mesh
-    # The hull reaches to -2.2; views 25 degrees off the middle see to -0.2, and Poisson runs on
+    # The hull reaches to -2.2; views 25 degrees off the centre see to -0.2, and Poisson runs on
     # along the last contours for a few facets.
     assert -0.75 < float(mesh.vertices_world[:, 2].min()) < 0.1
     off = (mesh.vertices_world.norm(dim=1) - 1).abs()
@@ -91,12 +91,12 @@ def test_what_no_view_sees_is_left_out():
 
 def test_a_lid_goes_and_small_dents_stay():
     vertices, faces = icosphere(3)
-    middle = vertices[faces].mean(dim=1)
-    lid, speck = middle[:, 2] > 0.8, middle[:, 2] < -0.97
+    centre = vertices[faces].mean(dim=1)
+    lid, speck = centre[:, 2] > 0.8, centre[:, 2] < -0.97
     count = torch.full((len(faces),), 3)
-    said = Evidence(seen=count, lit=count, denied=torch.where(lid | speck, 2, 0))
+    said = Terms(seen=count, lit=count, denied=torch.where(lid | speck, 2, 0))
     support = torch.full_like(count, Support.LIGHT)
-    support[middle[:, 0] > 0.9] = Support.CONTOUR
+    support[centre[:, 0] > 0.9] = Support.CONTOUR
     everywhere = torch.ones_like(lid)
     kept = seen_surface(vertices, faces, support, said, everywhere, 1.0, SMALL_HOLES)
     assert bool((kept == ~lid).all())  # the lid's area is 1.2, the speck's 0.2
@@ -107,12 +107,12 @@ def test_a_lid_goes_and_small_dents_stay():
 
 def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes():
     vertices, faces = icosphere(3)
-    middle = vertices[faces].mean(dim=1)
-    bottom, back, lid = middle[:, 2] > 0.97, middle[:, 2] < -0.5, middle[:, 0] > 0.97
+    centre = vertices[faces].mean(dim=1)
+    bottom, back, lid = centre[:, 2] > 0.97, centre[:, 2] < -0.5, centre[:, 0] > 0.97
     assert 0.005 < bottom.double().mean() < 0.02 < back.double().mean()
     count = torch.full((len(faces),), 3)
     seen = torch.where(bottom | back | lid, 0, count)
-    said = Evidence(seen=seen, lit=seen, denied=torch.where(lid, 2, 0))
+    said = Terms(seen=seen, lit=seen, denied=torch.where(lid, 2, 0))
     support = torch.where(seen > 0, Support.POINTS, Support.NOTHING)
     everywhere = torch.ones_like(lid)
     config = FineSurfaceConfig(hole_px=0.0)
@@ -122,7 +122,7 @@ def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes():
 
     assert bool((kept() == ~(back | lid)).all())
     # One face of it behind which something is seen, or outside the hull, opens all of it.
-    assert bool((kept(inside=everywhere & (middle[:, 2] < middle[:, 2].max())) == (seen > 0)).all())
+    assert bool((kept(inside=everywhere & (centre[:, 2] < centre[:, 2].max())) == (seen > 0)).all())
     none = FineSurfaceConfig(hole_px=0.0, max_unseen=0.0)
     assert bool((kept(config=none) == (seen > 0)).all())
 
@@ -132,7 +132,7 @@ def test_pieces_that_neither_points_nor_contours_support_go():
     two = torch.cat([vertices, 0.3 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
     first = torch.arange(len(two[1])) < len(faces)
     count = torch.full((len(two[1]),), 3)
-    said = Evidence(seen=count, lit=count, denied=0 * count)
+    said = Terms(seen=count, lit=count, denied=0 * count)
     support = torch.where(first, Support.POINTS, Support.LIGHT)
     kept = seen_surface(*two, support, said, torch.ones_like(first), 1.0, FineSurfaceConfig())
     assert bool((kept == first).all())

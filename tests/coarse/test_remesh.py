@@ -9,7 +9,7 @@ from pimper_torch.coarse.fill import delaunay
 from pimper_torch.coarse.remesh import RemeshConfig, remesh, within
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import (
     barycentric_2d,
     boundary_vertices,
@@ -46,18 +46,18 @@ def coarse_of(vertices, faces):
 
 
 def surface_on(coarse, place, spacing=SPACING, normals=None, confidence=None):
-    """The lattice of a mesh, its vertices moved by ``place``."""
+    """The subdivided mesh of a mesh, its vertices moved by ``place``."""
     mesh = coarse.mesh
     count = len(mesh.faces)
-    lattice = subdivide(mesh.vertices_world, mesh.faces, torch.full((count,), spacing).double())
-    points = place(lattice.points)
-    found = vertex_normals(points, lattice.faces) if normals is None else normals(points)
-    sure = torch.ones_like(points[:, 0]) if confidence is None else confidence(lattice)
+    subdivision = subdivide(mesh.vertices_world, mesh.faces, torch.full((count,), spacing).double())
+    points = place(subdivision.points)
+    found = vertex_normals(points, subdivision.faces) if normals is None else normals(points)
+    sure = torch.ones_like(points[:, 0]) if confidence is None else confidence(subdivision)
     return Surface(
         vertices_world=points,
-        faces=lattice.faces,
-        facet=lattice.facet,
-        barycentric=lattice.barycentric,
+        faces=subdivision.faces,
+        facet=subdivision.facet,
+        barycentric=subdivision.barycentric,
         normals_world=found,
         albedo=torch.ones_like(points),
         confidence=sure,
@@ -89,9 +89,9 @@ def test_parts_of_a_facet_have_its_support(generator):
     coarse = coarse.replace(support=torch.arange(len(coarse.mesh.faces)) % 4)
     found = remesh(coarse, surface_on(coarse, wavy), SPACING)
     assert len(found.mesh.faces) > len(coarse.mesh.faces)
-    middle = found.mesh.vertices_world[found.mesh.faces].mean(dim=1)[:, :2]
+    centre = found.mesh.vertices_world[found.mesh.faces].mean(dim=1)[:, :2]
     corners = coarse.mesh.vertices_world[coarse.mesh.faces][..., :2]
-    place = barycentric_2d(middle[:, None], corners[None])
+    place = barycentric_2d(centre[:, None], corners[None])
     parent = place.amin(dim=-1).argmax(dim=1)
     assert bool((found.support == coarse.support[parent]).all())
 
@@ -109,15 +109,15 @@ def test_a_surface_that_fits_changes_nothing(generator):
 def test_a_mesh_gets_finer_on_a_ball_and_not_on_the_plane_beside_it(generator):
     coarse = sheet(generator, side=9)
     found = remesh(coarse, surface_on(coarse, dome), SPACING, RemeshConfig(min_samples=5.0))
-    middles = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
+    centres = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
     area = face_normals(found.mesh.vertices_world, found.mesh.faces)[:, 2] / 2
     where = found.mesh.vertices_world[found.mesh.faces].mean(dim=1)
     assert (area > 0).all()
     assert_close(area.sum(), area.new_tensor(4.0), atol=1e-6, rtol=0)  # the square, seen from above
-    flat_before, flat_after = middles[:, 0] < -0.6, where[:, 0] < -0.6
+    flat_before, flat_after = centres[:, 0] < -0.6, where[:, 0] < -0.6
     assert int(flat_before.sum()) == int(flat_after.sum()) > 5
     on_dome = (where[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.45
-    was_dome = (middles[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.45
+    was_dome = (centres[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.45
     assert int(on_dome.sum()) > 2 * int(was_dome.sum())
 
 
@@ -220,13 +220,13 @@ def test_small_facets_are_never_split_and_the_limit_holds(generator):
 
 def test_facets_without_data_go_except_holes_inside(generator):
     coarse = sheet(generator, side=9)
-    middles = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
-    hole = middles[:, :2].norm(dim=1).argsort()[:2]
-    rim = middles[:, 0] > 0.7
+    centres = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
+    hole = centres[:, :2].norm(dim=1).argsort()[:2]
+    rim = centres[:, 0] > 0.7
 
-    def confidence(lattice):
-        inner = (lattice.barycentric > 0).all(dim=1)
-        lost = torch.isin(lattice.facet, torch.cat([hole, rim.nonzero()[:, 0]])) & inner
+    def confidence(subdivision):
+        inner = (subdivision.barycentric > 0).all(dim=1)
+        lost = torch.isin(subdivision.facet, torch.cat([hole, rim.nonzero()[:, 0]])) & inner
         return (~lost).double()
 
     surface = surface_on(coarse, lambda points: points, confidence=confidence)

@@ -16,7 +16,7 @@ from pimper_torch.coarse.select import (
 from pimper_torch.errors import InputError
 
 
-def test_frontal_view_is_the_middle_of_the_arc(dome_cloud):
+def test_frontal_view_is_the_centre_of_the_arc(dome_cloud):
     assert frontal_view(dome_cloud) == 2
 
 

@@ -35,11 +35,11 @@ def generator():
     return torch.Generator().manual_seed(23)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
-def test_any_marks_leave_a_closed_mesh_closed_with_its_area_volume_and_sides(generator, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.1, 0.5, 1.0])
+def test_any_marks_leave_a_closed_mesh_closed_with_its_area_volume_and_sides(generator, fraction):
     vertices, faces = icosphere(2)
     edges, _ = face_edges(faces)
-    marked = torch.rand(len(edges), generator=generator) < share
+    marked = torch.rand(len(edges), generator=generator) < fraction
     split, places = halved(vertices, faces, marked)
     assert (faces_per_edge(split.faces) == 2).all()
     assert len(split.faces) == len(faces) + 2 * int(marked.sum())

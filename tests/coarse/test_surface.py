@@ -38,12 +38,12 @@ def test_views_all_round_give_one_closed_surface(enclosed):
 
 def test_the_surface_is_where_the_ball_is_and_faces_outward(enclosed):
     mesh = enclosed.mesh
-    middle = mesh.vertices_world[mesh.faces].mean(dim=1)
+    centre = mesh.vertices_world[mesh.faces].mean(dim=1)
     # A pixel is 1 / 60 of the radius; facets of a ball of 600 lie up to 0.01 inside it.
-    assert (middle.norm(dim=1) - 1).abs().mean() < 0.01
-    assert (middle.norm(dim=1) - 1).abs().max() < 0.05
+    assert (centre.norm(dim=1) - 1).abs().mean() < 0.01
+    assert (centre.norm(dim=1) - 1).abs().max() < 0.05
     outward = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
-    assert ((outward * normalize(middle, dim=-1)).sum(dim=-1) > 0.8).all()
+    assert ((outward * normalize(centre, dim=-1)).sum(dim=-1) > 0.8).all()
     assert (mesh.normals_world * normalize(mesh.vertices_world, dim=-1)).sum(dim=-1).min() > 0.8
 
 
@@ -90,10 +90,10 @@ def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_ab
     inside_out = Mesh(vertices_world=vertices, faces=faces.flip(1))
     coarse = built(round_about, inside_out)
     outward = face_normals(coarse.mesh.vertices_world, coarse.mesh.faces)
-    middle = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
-    assert ((outward * middle).sum(dim=-1) > 0).all()
+    centre = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
+    assert ((outward * centre).sum(dim=-1) > 0).all()
     assert len(coarse.mesh.faces) <= 600 < len(faces)
-    assert (middle.norm(dim=1) - 1).abs().max() < 0.03
+    assert (centre.norm(dim=1) - 1).abs().max() < 0.03
     assert len(coarse.points.facet) > 0.9 * len(round_about.points_world)
 
 

@@ -58,8 +58,8 @@ def test_regions_without_points_are_filled_smoothly(dome_cloud):
     new = filled.mesh.vertices_world[~filled.is_point]
     # A flat lid over the bald cap would lie 1 - sqrt(1 - 0.45^2) = 0.107 under its top.
     assert (new.norm(dim=-1) - 1).abs().max() < 0.03
-    middle = flat.mesh.vertices_world[flat.mesh.faces].mean(dim=1).norm(dim=-1)
-    assert middle.min() < 0.92
+    centre = flat.mesh.vertices_world[flat.mesh.faces].mean(dim=1).norm(dim=-1)
+    assert centre.min() < 0.92
 
 
 def test_outliers_do_not_become_vertices(dome_cloud):

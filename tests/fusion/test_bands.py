@@ -3,39 +3,39 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.fusion.bands import CoarsePart
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.subdivision import subdivide
 
 FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 
 @pytest.fixture
-def lattice():
+def subdivision():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     return subdivide(corners, FACETS, torch.full((2,), 0.02, dtype=torch.float64))
 
 
-def test_what_is_linear_on_every_facet_is_coarse_whole(lattice):
+def test_what_is_linear_on_every_facet_is_coarse_whole(subdivision):
     corners = torch.tensor([0.3, -1.0, 2.0, 0.7], dtype=torch.float64)
-    values = lattice.interpolate(corners[:, None], FACETS)[:, 0]
-    assert_close(CoarsePart(lattice, FACETS)(values), values, rtol=0, atol=1e-4)
+    values = subdivision.interpolate(corners[:, None], FACETS)[:, 0]
+    assert_close(CoarsePart(subdivision, FACETS)(values), values, rtol=0, atol=1e-4)
 
 
-def test_a_needle_and_waves_are_none_of_it(lattice):
-    needle = torch.zeros(len(lattice.points), dtype=torch.float64)
+def test_a_needle_and_waves_are_none_of_it(subdivision):
+    needle = torch.zeros(len(subdivision.points), dtype=torch.float64)
     needle[len(needle) // 2] = 1.0
-    assert CoarsePart(lattice, FACETS)(needle).abs().max() < 0.01
-    waves = torch.sin(60 * lattice.points[:, 0]) * torch.sin(60 * lattice.points[:, 1])
-    assert CoarsePart(lattice, FACETS)(waves).abs().max() < 0.05
+    assert CoarsePart(subdivision, FACETS)(needle).abs().max() < 0.01
+    waves = torch.sin(60 * subdivision.points[:, 0]) * torch.sin(60 * subdivision.points[:, 1])
+    assert CoarsePart(subdivision, FACETS)(waves).abs().max() < 0.05
 
 
-def test_it_is_the_nearest_and_can_be_differentiated(lattice):
+def test_it_is_the_nearest_and_can_be_differentiated(subdivision):
     generator = torch.Generator().manual_seed(79)
-    values = torch.randn(len(lattice.points), generator=generator, dtype=torch.float64)
+    values = torch.randn(len(subdivision.points), generator=generator, dtype=torch.float64)
     values.requires_grad_()
-    found = CoarsePart(lattice, FACETS)(values)
+    found = CoarsePart(subdivision, FACETS)(values)
     # What is left is at right angles to all functions that are linear on the facets.
     for corner in torch.eye(4, dtype=torch.float64):
-        hat = lattice.interpolate(corner[:, None], FACETS)[:, 0]
+        hat = subdivision.interpolate(corner[:, None], FACETS)[:, 0]
         assert abs(float(hat @ (values - found).detach())) < 1e-2
     found.sum().backward()
     assert_close(values.grad, torch.ones_like(values), rtol=0, atol=1e-2)

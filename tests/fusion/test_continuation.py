@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.fusion.continuation import about_mean, continued, enclosed
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import face_edges
 
 WORLD = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
@@ -13,8 +13,8 @@ WORLD = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
 def square():
     """Vertices and faces of a fine square."""
     facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    lattice = subdivide(WORLD, facets, torch.full((2,), 0.05).double())
-    return lattice.points, lattice.faces
+    subdivision = subdivide(WORLD, facets, torch.full((2,), 0.05).double())
+    return subdivision.points, subdivision.faces
 
 
 def ramp(points):
@@ -67,7 +67,7 @@ def test_an_island_takes_what_lies_round_it_and_the_rest_is_kept(square):
     assert (truth[~island].mean(dim=0) - truth[island]).abs().max() > 0.2
 
 
-def test_what_varies_much_from_step_to_step_is_not_carried_far(square):
+def test_what_varies_much_from_step_to_step_is_not_transferred_far(square):
     points, faces = square
     generator = torch.Generator().manual_seed(3)
     known = points[:, 0] < 0.5
@@ -110,5 +110,5 @@ def test_gradients_are_those_of_what_is_known(square):
     values = ramp(points).requires_grad_()
     about_mean(values, known, face_edges(faces)[0])[~known].sum().backward()
     assert (values.grad[~known] == 0).all()
-    # Shares of those round it and of the mean: they add up to one for each unknown value.
+    # Fractions of those round it and of the mean: they add up to one for each unknown value.
     assert_close(values.grad.sum(), torch.tensor(2.0 * int((~known).sum())).double())

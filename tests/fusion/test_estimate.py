@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
-from pimper_torch.fusion.estimate import fuse_evidence, noise_factor
-from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.fusion.estimate import fuse_terms, noise_factor
+from pimper_torch.fusion.terms import Terms
 from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.singular import SingularSystemError
@@ -22,10 +22,10 @@ def smooth() -> torch.Tensor:
     return x.sin() + 0.3 * (3 * x).cos()
 
 
-def steps(noise: torch.Tensor, deviation: float) -> Evidence:
+def steps(noise: torch.Tensor, deviation: float) -> Terms:
     """Differences of a chain of heights, each measured three times, as in a triangle mesh."""
     first = torch.arange(COUNT - 1).repeat(3)
-    return Evidence(
+    return Terms(
         unknowns=torch.stack([first, first + 1], dim=1),
         coefficients=torch.tensor([-1.0, 1.0]).double().expand(len(first), 2),
         targets=smooth().diff().repeat(3) + noise,
@@ -34,8 +34,8 @@ def steps(noise: torch.Tensor, deviation: float) -> Evidence:
     )
 
 
-def places(noise: torch.Tensor, deviation: float) -> Evidence:
-    return Evidence(
+def places(noise: torch.Tensor, deviation: float) -> Terms:
+    return Terms(
         unknowns=torch.arange(COUNT)[:, None],
         coefficients=torch.ones(COUNT, 1, dtype=torch.float64),
         targets=smooth() + noise,
@@ -44,9 +44,9 @@ def places(noise: torch.Tensor, deviation: float) -> Evidence:
     )
 
 
-def fused(kinds, rounds: int = 6):
-    return fuse_evidence(
-        kinds, torch.zeros(COUNT).double(), torch.full((COUNT,), 1e-9).double(), rounds
+def fused(kinds, iterations: int = 6):
+    return fuse_terms(
+        kinds, torch.zeros(COUNT).double(), torch.full((COUNT,), 1e-9).double(), iterations
     )
 
 
@@ -59,14 +59,14 @@ def test_the_noise_of_each_kind_is_found_whatever_it_claims(generator):
         steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.005),  # claims a quarter of its noise
         places(drawn(generator, 0.1), 0.18),  # and nearly twice its own
     ]
-    found = fused(kinds, rounds=12)
+    found = fused(kinds, iterations=12)
     assert abs(found.factors[0] / 16 - 1) < 0.25
     assert abs(found.factors[1] * 3.24 - 1) < 0.25
 
 
 def test_the_answer_beats_each_kind_alone(generator):
     slopes, heights = drawn(generator, 0.02, 3 * (COUNT - 1)), drawn(generator, 0.1)
-    both = fused([steps(slopes, 0.05), places(heights, 0.05)], rounds=20).heights - smooth()
+    both = fused([steps(slopes, 0.05), places(heights, 0.05)], iterations=20).heights - smooth()
     assert both.square().mean().sqrt() < 0.5 * heights.square().mean().sqrt()
     mean = slopes.reshape(3, -1).mean(dim=0)
     integrated = torch.cat([torch.zeros(1), mean]).cumsum(0)
@@ -100,7 +100,7 @@ def test_one_solve_is_plain_least_squares(generator):
             J[index, kind.unknowns[:, term]] += scale * kind.coefficients[:, term]
         row += len(scale)
     right = torch.cat([kind.information.sqrt() * kind.targets for kind in kinds])
-    assert_close(fused(kinds, rounds=1).heights, torch.linalg.lstsq(J, right).solution)
+    assert_close(fused(kinds, iterations=1).heights, torch.linalg.lstsq(J, right).solution)
 
 
 def test_vertices_that_nothing_is_known_of_stay():
@@ -113,7 +113,7 @@ def test_vertices_that_nothing_is_known_of_stay():
         correlated=kind.correlated[:10],
     )
     start = torch.full((COUNT,), 5.0, dtype=torch.float64)
-    found = fuse_evidence([some], start, torch.full((COUNT,), 1e-9).double(), 1).heights
+    found = fuse_terms([some], start, torch.full((COUNT,), 1e-9).double(), 1).heights
     assert_close(found[10:], start[10:])
     assert_close(found[:10], smooth()[:10], rtol=0, atol=1e-6)
 

@@ -4,10 +4,10 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.fusion.bands import CoarsePart
-from pimper_torch.fusion.estimate import fuse_evidence
-from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.expected_error import expected_error, regions
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.fusion.terms import Terms
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import face_edges
 
 # Standard errors from so many draws are off by 4 %; of all vertices, by three times that.
@@ -31,11 +31,11 @@ def square():
     return subdivide(corners, facets, torch.full((32,), 0.1).double()), facets
 
 
-def differences(lattice, deviation, correlated=1.0, judged=True):
+def differences(subdivision, deviation, correlated=1.0, judged=True):
     """Say how heights differ along all edges."""
-    edges = face_edges(lattice.faces)[0]
-    length = (lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]]).norm(dim=1)
-    return Evidence(
+    edges = face_edges(subdivision.faces)[0]
+    length = (subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]]).norm(dim=1)
+    return Terms(
         unknowns=edges,
         coefficients=torch.tensor([-1.0, 1.0]).double().expand(len(edges), 2),
         targets=torch.zeros(len(edges)).double(),
@@ -45,10 +45,10 @@ def differences(lattice, deviation, correlated=1.0, judged=True):
     )
 
 
-def heights(lattice, deviation, correlated=1.0, vertices=None):
-    vertices = torch.arange(len(lattice.points)) if vertices is None else vertices
+def heights(subdivision, deviation, correlated=1.0, vertices=None):
+    vertices = torch.arange(len(subdivision.points)) if vertices is None else vertices
     ones = torch.ones(len(vertices)).double()
-    return Evidence(
+    return Terms(
         unknowns=vertices[:, None],
         coefficients=ones[:, None],
         targets=0 * ones,
@@ -57,22 +57,22 @@ def heights(lattice, deviation, correlated=1.0, vertices=None):
     )
 
 
-def solved(lattice, *kinds):
-    count = len(lattice.points)
-    hold = torch.full((count,), 1e-6).double()
-    return fuse_evidence(kinds, torch.zeros(count).double(), hold, rounds=1)
+def solved(subdivision, *kinds):
+    count = len(subdivision.points)
+    damping = torch.full((count,), 1e-6).double()
+    return fuse_terms(kinds, torch.zeros(count).double(), damping, iterations=1)
 
 
 def dense(fused):
     """The matrix that was solved, and what each target is multiplied by."""
-    count = len(fused.hold)
+    count = len(fused.damping)
     rows = []
     for kind in fused.kinds:
         jacobian = torch.zeros(len(kind.targets), count).double()
         jacobian.scatter_add_(1, kind.unknowns, kind.coefficients)
         rows.append(jacobian)
     jacobian = torch.cat([*rows, torch.eye(count).double()])
-    weight = torch.cat([*(kind.information for kind in fused.kinds), fused.hold])
+    weight = torch.cat([*(kind.information for kind in fused.kinds), fused.damping])
     matrix = jacobian.mT @ (weight[:, None] * jacobian)
     return matrix, torch.linalg.solve(matrix, jacobian.mT * weight)
 
@@ -83,44 +83,44 @@ def near(found, expected):
 
 @pytest.mark.parametrize("deviation", [0.01, 0.1])
 def test_independent_noise_gives_the_diagonal_of_the_inverse(square, deviation):
-    lattice, facets = square
-    fused = solved(lattice, differences(lattice, 0.02), heights(lattice, deviation))
-    found = expected_error(fused, fused, lattice, facets, DRAWS)
+    subdivision, facets = square
+    fused = solved(subdivision, differences(subdivision, 0.02), heights(subdivision, deviation))
+    found = expected_error(fused, fused, subdivision, facets, DRAWS)
     near(found, torch.linalg.inv(dense(fused)[0]).diagonal().sqrt())
 
 
 def test_what_a_region_errs_by_together_does_not_average_out(square):
-    lattice, facets = square
-    sure, alike = heights(lattice, 0.05), heights(lattice, 0.05, correlated=12.0)
-    tied = differences(lattice, 0.02)
-    fused = solved(lattice, tied, alike)
-    found = expected_error(fused, fused, lattice, facets, DRAWS)
+    subdivision, facets = square
+    sure, alike = heights(subdivision, 0.05), heights(subdivision, 0.05, correlated=12.0)
+    tied = differences(subdivision, 0.02)
+    fused = solved(subdivision, tied, alike)
+    found = expected_error(fused, fused, subdivision, facets, DRAWS)
     # Oracle: the covariance of the targets, written out.
-    facet = lattice.facet
+    facet = subdivision.facet
     count = torch.bincount(facet)[facet].double()
-    share = (11 / (count - 1)).clamp(0, 1)
-    region = regions(lattice)[facet]
-    together = (share[:, None] * share).sqrt() * (region[:, None] == region)
-    covariance = 0.05**2 * (together + torch.diag(1 - share))
+    fraction = (11 / (count - 1)).clamp(0, 1)
+    region = regions(subdivision)[facet]
+    together = (fraction[:, None] * fraction).sqrt() * (region[:, None] == region)
+    covariance = 0.05**2 * (together + torch.diag(1 - fraction))
     _, answer = dense(fused)
     edges = len(tied.targets)
     total = answer[:, :edges] @ torch.diag(1 / tied.information) @ answer[:, :edges].mT
     own = answer[:, edges : edges + len(facet)]
     total = total + own @ covariance @ own.mT
     near(found, total.diagonal().sqrt())
-    trusting = solved(lattice, tied, sure)
-    assert (found > 1.5 * expected_error(trusting, trusting, lattice, facets, DRAWS)).all()
+    trusting = solved(subdivision, tied, sure)
+    assert (found > 1.5 * expected_error(trusting, trusting, subdivision, facets, DRAWS)).all()
 
 
 def test_a_tilt_of_a_region_turns_edges_by_where_they_point(square):
-    lattice, facets = square
-    kept = differences(lattice, 0.1, judged=False)  # all of it is alike
-    fused = solved(lattice, kept, heights(lattice, 0.01, vertices=torch.tensor([0])))
-    found = expected_error(fused, fused, lattice, facets, DRAWS)
+    subdivision, facets = square
+    kept = differences(subdivision, 0.1, judged=False)  # all of it is alike
+    fused = solved(subdivision, kept, heights(subdivision, 0.01, vertices=torch.tensor([0])))
+    found = expected_error(fused, fused, subdivision, facets, DRAWS)
     # Oracle: one tilt of five times 0.1 a region, along both axes of the plane.
     edges = kept.unknowns
-    along = normalize(lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]], dim=1)
-    region = regions(lattice)[lattice.facet[edges[:, 0]]]
+    along = normalize(subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]], dim=1)
+    region = regions(subdivision)[subdivision.facet[edges[:, 0]]]
     alike = (along @ along.mT) * (region[:, None] == region)
     deviation = 5 * kept.information.rsqrt()
     covariance = deviation[:, None] * deviation * alike
@@ -132,86 +132,88 @@ def test_a_tilt_of_a_region_turns_edges_by_where_they_point(square):
 
 
 def test_detail_of_one_solve_and_shape_of_another_err_by_the_same_noise(square):
-    lattice, facets = square
-    tied = differences(lattice, 0.03, correlated=9.0)
-    fine = solved(lattice, differences(lattice, 0.03), heights(lattice, 0.1))
-    coarse = solved(lattice, tied, heights(lattice, 0.1))
-    found = expected_error(fine, coarse, lattice, facets, DRAWS)
-    eye = torch.eye(len(lattice.points)).double()
-    low = torch.stack([CoarsePart(lattice, facets)(one) for one in eye], dim=1)
+    subdivision, facets = square
+    tied = differences(subdivision, 0.03, correlated=9.0)
+    fine = solved(subdivision, differences(subdivision, 0.03), heights(subdivision, 0.1))
+    coarse = solved(subdivision, tied, heights(subdivision, 0.1))
+    found = expected_error(fine, coarse, subdivision, facets, DRAWS)
+    eye = torch.eye(len(subdivision.points)).double()
+    low = torch.stack([CoarsePart(subdivision, facets)(one) for one in eye], dim=1)
     (_, of_fine), (_, of_coarse) = dense(fine), dense(coarse)
     answer = of_fine + low @ (of_coarse - of_fine)
     # Noise is that of the coarse solve: in a region, edges share a part of it.
     edges = tied.unknowns
-    along = normalize(lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]], dim=1)
-    facet = lattice.facet[edges[:, 0]]
+    along = normalize(subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]], dim=1)
+    facet = subdivision.facet[edges[:, 0]]
     count = torch.bincount(facet)[facet].double()
-    share = (8 / (count - 1)).clamp(0, 1)
-    region = regions(lattice)[facet]
+    fraction = (8 / (count - 1)).clamp(0, 1)
+    region = regions(subdivision)[facet]
     alike = (along @ along.mT) * (region[:, None] == region)
-    together = (share[:, None] * share).sqrt() * alike
+    together = (fraction[:, None] * fraction).sqrt() * alike
     deviation = (tied.information * 9).rsqrt()
-    covariance = deviation[:, None] * deviation * (together + torch.diag(1 - share))
+    covariance = deviation[:, None] * deviation * (together + torch.diag(1 - fraction))
     own, rest = answer[:, : len(edges)], answer[:, len(edges) : len(edges) + len(eye)]
     total = own @ covariance @ own.mT + 0.1**2 * rest @ rest.mT
     near(found, total.diagonal().sqrt())
 
 
 def test_regions_are_a_few_facets_wide(square):
-    lattice, _ = square
-    label = regions(lattice)
+    subdivision, _ = square
+    label = regions(subdivision)
     assert len(label.unique()) == 4
-    middle = lattice.points.new_zeros(32, 3).index_add(0, lattice.facet, lattice.points)
-    middle = middle / torch.bincount(lattice.facet)[:, None]
+    centre = subdivision.points.new_zeros(32, 3).index_add(0, subdivision.facet, subdivision.points)
+    centre = centre / torch.bincount(subdivision.facet)[:, None]
     for one in label.unique():
-        extent = middle[label == one].amax(dim=0) - middle[label == one].amin(dim=0)
+        extent = centre[label == one].amax(dim=0) - centre[label == one].amin(dim=0)
         assert extent.max() < 2.5 * 0.27  # the edge of an equilateral facet of their area
-    moved = lattice.replace(points=3 * lattice.points)
+    moved = subdivision.replace(points=3 * subdivision.points)
     assert torch.equal(regions(moved), label)  # whatever the scale
 
 
 def test_facets_whose_vertices_name_others_have_regions():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]).double()
     facets = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    lattice = subdivide(corners, facets, torch.full((4,), 9.0).double())
-    assert int(lattice.facet.max()) < 3  # four vertices, each named after one of its facets
-    assert len(regions(lattice)) == 4
+    subdivision = subdivide(corners, facets, torch.full((4,), 9.0).double())
+    assert int(subdivision.facet.max()) < 3  # four vertices, each named after one of its facets
+    assert len(regions(subdivision)) == 4
 
 
 def test_no_kind_is_taken_to_be_surer_than_it_claims(square, generator):
-    lattice, facets = square
-    exact = [differences(lattice, 0.1), heights(lattice, 0.1)]  # without noise at all
-    count = len(lattice.points)
-    hold = torch.full((count,), 1e-6).double()
-    modest = fuse_evidence(exact, torch.zeros(count).double(), hold, 5)
+    subdivision, facets = square
+    exact = [differences(subdivision, 0.1), heights(subdivision, 0.1)]  # without noise at all
+    count = len(subdivision.points)
+    damping = torch.full((count,), 1e-6).double()
+    modest = fuse_terms(exact, torch.zeros(count).double(), damping, 5)
     assert max(modest.factors) < 0.5
-    claimed = solved(lattice, *exact)
-    found = expected_error(modest, modest, lattice, facets, DRAWS)
-    assert_close(found, expected_error(claimed, claimed, lattice, facets, DRAWS), rtol=0.1, atol=0)
+    claimed = solved(subdivision, *exact)
+    found = expected_error(modest, modest, subdivision, facets, DRAWS)
+    assert_close(
+        found, expected_error(claimed, claimed, subdivision, facets, DRAWS), rtol=0.1, atol=0
+    )
 
 
 def test_what_nothing_tells_may_be_anywhere(square):
-    lattice, facets = square
-    known = heights(lattice, 0.01, vertices=torch.arange(10))
-    fused = solved(lattice, known)
-    found = expected_error(fused, fused, lattice, facets, 20)
+    subdivision, facets = square
+    known = heights(subdivision, 0.01, vertices=torch.arange(10))
+    fused = solved(subdivision, known)
+    found = expected_error(fused, fused, subdivision, facets, 20)
     assert (found[:10] < 0.03).all()
     assert (found[10:] > 300).all()  # held by 1e-6
 
 
 def test_outliers_that_lost_their_weight_are_no_part_of_the_noise(square, generator):
-    lattice, facets = square
-    told = heights(lattice, 0.05)
+    subdivision, facets = square
+    told = heights(subdivision, 0.05)
     noise = 0.05 * torch.randn(len(told.targets), generator=generator, dtype=torch.float64)
     wild = noise.clone()
     wild[::15] += 3.0
-    count = len(lattice.points)
-    hold = torch.full((count,), 1e-6).double()
-    tied = differences(lattice, 0.02)
+    count = len(subdivision.points)
+    damping = torch.full((count,), 1e-6).double()
+    tied = differences(subdivision, 0.02)
     plain, spoiled = (
-        fuse_evidence([tied, told.replace(targets=one)], torch.zeros(count).double(), hold, 6)
+        fuse_terms([tied, told.replace(targets=one)], torch.zeros(count).double(), damping, 6)
         for one in (noise, wild)
     )
-    clean = expected_error(plain, plain, lattice, facets, DRAWS)
-    found = expected_error(spoiled, spoiled, lattice, facets, DRAWS)
+    clean = expected_error(plain, plain, subdivision, facets, DRAWS)
+    found = expected_error(spoiled, spoiled, subdivision, facets, DRAWS)
     assert_close(found.mean(), clean.mean(), rtol=0.25, atol=0)

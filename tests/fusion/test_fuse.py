@@ -18,7 +18,7 @@ from pimper_torch.sweep.sweep import Sweep
 # Silhouettes that constrain nothing.
 FREE = Contours.none(
     Silhouettes(
-        inside=torch.ones(1, 1, 1), trusted=torch.zeros(1, dtype=torch.bool), source="everything"
+        inside=torch.ones(1, 1, 1), reliable=torch.zeros(1, dtype=torch.bool), source="everything"
     ),
     Cameras(
         intrinsics=torch.eye(3)[None],
@@ -81,7 +81,7 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
     photometric = given.photometric.replace(buckets=tuple(buckets))
     tilted = given.replace(photometric=photometric)
     kept = off_plane(lifted, Fuse()(tilted, FREE))
-    trusting = off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(tilted, FREE))
+    trusting = off_plane(lifted, Fuse(FuseConfig(bias_iterations=0))(tilted, FREE))
     assert kept.std() < 0.1
     assert kept.std() < 0.5 * trusting.std()
 
@@ -162,7 +162,7 @@ def test_heights_that_err_alike_do_not_outvote_points(swept):
     misled = known.replace(buckets=wrong)
     off = off_plane(lifted, Fuse()(misled, FREE))
     assert off.abs().quantile(0.9) < 0.1
-    assert off_plane(lifted, Fuse(FuseConfig(drift_rounds=0))(misled, FREE)).median() > 0.5
+    assert off_plane(lifted, Fuse(FuseConfig(bias_iterations=0))(misled, FREE)).median() > 0.5
     # Heights that are right still help: they know more than a few points.
     assert off_plane(lifted, Fuse()(known, FREE)).abs().quantile(0.9) < 0.05
 
@@ -225,32 +225,32 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
     assert pimple.abs().max() < 0.1
 
 
-def noisy(lifted, given, points: float, turn: float, seed: int):
+def noisy(lifted, given, points: float, rotation: float, seed: int):
     """Add noise to normals, radians, and to points of the cloud, samples; both say how much."""
     generator = torch.Generator().manual_seed(seed)
     spacing = float(given.patches.buckets[0].spacing[0])
     buckets = []
     for found in given.photometric.buckets:
         noise = torch.randn(found.normals_patch.shape, generator=generator, dtype=torch.float64)
-        wrong = normalize(found.normals_patch + turn * noise, dim=-1)
-        sure = 1 / (1 + (turn / math.radians(HALF_CONFIDENCE_DEG)) ** 2)
+        wrong = normalize(found.normals_patch + rotation * noise, dim=-1)
+        sure = 1 / (1 + (rotation / math.radians(HALF_CONFIDENCE_DEG)) ** 2)
         confidence = torch.full_like(found.confidence, sure)
         buckets.append(found.replace(normals_patch=wrong, confidence=confidence))
-    turned = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
+    rotated = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
     cloud = near_plane(lifted, 0.0)
     cloud = cloud + points * spacing * torch.randn(cloud.shape, generator=generator).double()
-    return with_points(turned, cloud, points * spacing)
+    return with_points(rotated, cloud, points * spacing)
 
 
 def test_the_expected_error_is_the_true_one_on_noise_of_two_levels(swept):
     lifted, given = swept(0.5)
     spacing = float(given.patches.buckets[0].spacing[0])
-    fuse = Fuse(FuseConfig(heights=False, drift_rounds=1, noise_rounds=2))
+    fuse = Fuse(FuseConfig(heights=False, bias_iterations=1, noise_iterations=2))
     median = []
-    for points, turn in ((0.05, 0.02), (0.4, 0.1)):
+    for points, rotation in ((0.05, 0.02), (0.4, 0.1)):
         ratios, expected = [], []
         for seed in range(3):
-            surface = fuse(noisy(lifted, given, points, turn, seed), FREE)
+            surface = fuse(noisy(lifted, given, points, rotation, seed), FREE)
             error = surface.expected_error / spacing
             off = off_plane(lifted, surface).abs()
             ratios.append(float((off / error).median() / 0.6745))
@@ -259,7 +259,7 @@ def test_the_expected_error_is_the_true_one_on_noise_of_two_levels(swept):
         assert 0.4 < sorted(ratios)[1] < 2.5
         median.append(sorted(expected)[1])
     assert 3 < median[1] / median[0] < 12  # noise is 8 and 5 times as large
-    silent = Fuse(FuseConfig(heights=False, drift_rounds=1, noise_rounds=2, error_draws=0))
+    silent = Fuse(FuseConfig(heights=False, bias_iterations=1, noise_iterations=2, error_draws=0))
     assert silent(noisy(lifted, given, 0.1, 0.05, 0), FREE).expected_error is None
 
 
@@ -282,11 +282,12 @@ def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
     assert (surface.confidence == 0).all()
 
 
-def in_the_middle_of_each(found, spoiled):
-    """Make a square in the middle of every template dark, and something else of its relief."""
+def in_the_centre_of_each(found, spoiled):
+    """Make a square in the centre of every template dark, and something else of its height
+    field."""
     valid = found.valid.clone()
-    middle = valid.shape[-1] // 2
-    square = (slice(None), slice(middle - 4, middle + 4), slice(middle - 4, middle + 4))
+    centre = valid.shape[-1] // 2
+    square = (slice(None), slice(centre - 4, centre + 4), slice(centre - 4, centre + 4))
     valid[square] = False
     spoiled(square)
     return found.replace(valid=valid, confidence=found.confidence * valid)
@@ -294,7 +295,7 @@ def in_the_middle_of_each(found, spoiled):
 
 def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
     _, given = swept(0.8)
-    buckets = [in_the_middle_of_each(b, lambda square: None) for b in given.photometric.buckets]
+    buckets = [in_the_centre_of_each(b, lambda square: None) for b in given.photometric.buckets]
     photometric = given.photometric.replace(buckets=tuple(buckets))
     whole, holed = Fuse()(given, FREE), Fuse()(given.replace(photometric=photometric), FREE)
     dark = holed.confidence == 0
@@ -305,7 +306,7 @@ def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
 
 
 def with_dark_dents(given, spacings: float):
-    """Carry a dent in the middle of every template, where neither light nor sweep tells of it."""
+    """Carry a dent in the centre of every template, where neither light nor sweep tells of it."""
     spacing = float(given.patches.buckets[0].spacing[0])
     templates, found, heights = [], [], []
     buckets = zip(given.patches.buckets, given.photometric.buckets, given.buckets, strict=True)
@@ -316,7 +317,7 @@ def with_dark_dents(given, spacings: float):
             depth[square] += spacings * spacing
             known[square] = 0
 
-        found.append(in_the_middle_of_each(photometry, dent))
+        found.append(in_the_centre_of_each(photometry, dent))
         templates.append(template.replace(depth=depth))
         heights.append(swept_there.replace(information=known))
     patches = given.patches.replace(buckets=tuple(templates))
@@ -360,18 +361,18 @@ def test_facets_that_views_see_stay_though_light_tells_nothing_of_them(swept):
 def test_the_surface_has_the_slope_of_its_differences_by_normals_and_offsets(swept, name):
     _, given = swept(0.5)
     generator = torch.Generator().manual_seed(1)
-    turned = name == "normals_patch"
-    held = given.photometric if turned else given
+    rotated = name == "normals_patch"
+    held = given.photometric if rotated else given
     values = [getattr(bucket, name) for bucket in held.buckets]
-    unit = 1.0 if turned else float(given.patches.buckets[0].spacing[0])
+    unit = 1.0 if rotated else float(given.patches.buckets[0].spacing[0])
     along = [unit * torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in values]
 
     def fused(step):
         moved = [value + step * each for value, each in zip(values, along, strict=True)]
-        moved = [normalize(each, dim=-1) for each in moved] if turned else moved
+        moved = [normalize(each, dim=-1) for each in moved] if rotated else moved
         pairs = zip(held.buckets, moved, strict=True)
         new = held.replace(buckets=tuple(bucket.replace(**{name: each}) for bucket, each in pairs))
-        return Fuse()(given.replace(photometric=new) if turned else new, FREE).vertices_world
+        return Fuse()(given.replace(photometric=new) if rotated else new, FREE).vertices_world
 
     here = torch.zeros((), dtype=torch.float64, requires_grad=True)
     surface = fused(here)

@@ -25,7 +25,7 @@ def test_a_vertex_between_two_fans_becomes_two():
     assert not set(renamed[:2].flatten().tolist()) & set(renamed[2:].flatten().tolist())
 
 
-def test_a_closed_fan_keeps_its_middle_and_unused_vertices_go():
+def test_a_closed_fan_keeps_its_centre_and_unused_vertices_go():
     faces = torch.tensor([[9, 1, 2], [9, 2, 3], [9, 3, 1]])
     source, renamed = vertex_fans(faces)
     assert source.tolist() == [1, 2, 3, 9]

@@ -18,7 +18,7 @@ def random_rigid(generator, *batch):
     return rigid(rotation.reshape(*batch, 3, 3), translation)
 
 
-def test_points_are_carried_as_scipy_carries_them(generator):
+def test_points_are_transferred_as_scipy_carries_them(generator):
     target_from_source = random_rigid(generator, 1)[0]
     points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
     scipy_transform = RigidTransform.from_matrix(target_from_source.numpy())

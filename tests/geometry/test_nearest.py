@@ -48,8 +48,8 @@ def _candidates(points, a, b, c):
 
 def mixed_mesh(generator):
     """A hundred tiny triangles, a huge one, a needle, and one that is a point."""
-    middle = torch.rand(100, 1, 3, generator=generator, dtype=torch.float64)
-    tiny = middle + 0.01 * torch.randn(100, 3, 3, generator=generator, dtype=torch.float64)
+    centre = torch.rand(100, 1, 3, generator=generator, dtype=torch.float64)
+    tiny = centre + 0.01 * torch.randn(100, 3, 3, generator=generator, dtype=torch.float64)
     huge = torch.tensor([[[-30.0, -30, -1], [40, -20, -1.5], [0, 50, -2]]], dtype=torch.float64)
     needle = torch.tensor([[[0.0, 0, 2], [9, 0, 2], [4, 1e-7, 2]]], dtype=torch.float64)
     point = torch.tensor([[[1.0, 1, 3]] * 3], dtype=torch.float64)

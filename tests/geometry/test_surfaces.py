@@ -14,7 +14,7 @@ from pimper_torch.geometry.surfaces import (
     vertex_normals,
 )
 
-# Two triangles that share the edge 0-2, and a third on its own.
+# Two triangles that fraction the edge 0-2, and a third on its own.
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
 
 

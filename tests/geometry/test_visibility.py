@@ -85,7 +85,7 @@ def test_a_view_of_a_ball_shows_its_depth_along_the_camera_axis():
     hit = hits.face >= 0
     assert 0.2 < hit.float().mean() < 0.9
     assert_close(hits.distance[hit], depth[hit], atol=1e-5, rtol=0)
-    # The ray through the middle of the image goes to the ball's centre.
+    # The ray through the centre of the image goes to the ball's centre.
     around = hits.distance[8:10, 11:13]
     assert_close(around, torch.full_like(around, 3.0), atol=2e-3, rtol=0)
     origin = cameras.centers_world[1].expand(1, 3)
@@ -121,11 +121,13 @@ def test_a_ray_is_blocked_where_its_first_hit_is_within_reach(generator):
 def test_ambient_occlusion_of_an_open_sphere_is_the_share_that_is_there():
     vertices, faces = icosphere(4)
     assert_close(ambient_occlusion(vertices, faces), torch.zeros(len(faces)).to(vertices))
-    middle = vertices[faces].mean(dim=1)
+    centre = vertices[faces].mean(dim=1)
     area = face_normals(vertices, faces).norm(dim=1)
     for height in (-0.5, 0.0, 0.6):
-        bowl = middle[:, 2] < height
-        share = area[bowl].sum() / area.sum()  # a sphere's form factors are shares of its area
+        bowl = centre[:, 2] < height
+        fraction = (
+            area[bowl].sum() / area.sum()
+        )  # a sphere's form factors are fractions of its area
         found = ambient_occlusion(vertices, faces[bowl].flip(1), num_rays=512)
-        assert (found - share).abs().max() < 0.03  # the fan's rays, and edges of the opening
-        assert (found - share).mean().abs() < 0.005
+        assert (found - fraction).abs().max() < 0.03  # the fan's rays, and edges of the opening
+        assert (found - fraction).mean().abs() < 0.005

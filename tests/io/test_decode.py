@@ -9,7 +9,7 @@ from PIL import Image, ImageOps
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.io.decode import decode, focal_from_exif, read_header, turned
+from pimper_torch.io.decode import decode, focal_from_exif, read_header, rotated
 
 
 @pytest.fixture
@@ -82,7 +82,7 @@ def test_turning_agrees_with_pillow_for_all_orientations(pixels, orientation):
     stored = io.BytesIO()
     Image.fromarray(pixels).save(stored, "png", exif=exif)
     oracle = np.asarray(ImageOps.exif_transpose(Image.open(stored)))
-    assert np.array_equal(turned(pixels, orientation), oracle)
+    assert np.array_equal(rotated(pixels, orientation), oracle)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -92,7 +92,7 @@ def test_files_are_turned_as_exif_says(tmp_path, pixels, suffix, orientation):
     exif[274] = orientation
     path = tmp_path / f"a.{suffix}"
     Image.fromarray(pixels).save(path, exif=exif)
-    assert_close(decode(path).samples, as_planes(turned(pixels, orientation), 255))
+    assert_close(decode(path).samples, as_planes(rotated(pixels, orientation), 255))
     header = read_header(path)
     assert decode(path).samples.shape[1:] == (header.height, header.width)
 
@@ -160,8 +160,8 @@ def test_a_truncated_file_is_refused_by_name(tmp_path, suffix):
     noise = np.random.default_rng(74).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     Image.fromarray(noise).save(path)
     whole = path.read_bytes()
-    for share in (0.0, 0.01, 0.5, 0.9):
-        path.write_bytes(whole[: int(share * len(whole))])
+    for fraction in (0.0, 0.01, 0.5, 0.9):
+        path.write_bytes(whole[: int(fraction * len(whole))])
         with pytest.raises(InputError, match=f"cut.{suffix}"):
             decode(path)
 

@@ -43,11 +43,11 @@ def test_a_result_says_the_same_from_memory_and_from_its_folder(folder, reconstr
 
 
 def test_lights_are_paired_by_name_and_unknown_ones_are_nan(folder):
-    account = json.loads((folder / "lights.json").read_text())
-    told = {view["name"]: view["light"] for view in account["views"]}
+    report = json.loads((folder / "lights.json").read_text())
+    told = {view["name"]: view["light"] for view in report["views"]}
     assert None in told.values()  # or this test saw nothing
-    account["views"].reverse()
-    (folder / "lights.json").write_text(json.dumps(account))
+    report["views"].reverse()
+    (folder / "lights.json").write_text(json.dumps(report))
     found = read_estimate(folder)
     for name, light in zip(found.names, found.lights_world, strict=True):
         if told[name] is None:

@@ -22,8 +22,8 @@ def write(path, table):
     else:
         columns = table.T.tolist()
         given = len(columns) in (2, 4)
-        account = {"radiance": columns[1:] if given else columns}
-        path.write_text(json.dumps(account | ({"levels": columns[0]} if given else {})))
+        report = {"radiance": columns[1:] if given else columns}
+        path.write_text(json.dumps(report | ({"levels": columns[0]} if given else {})))
     return path
 
 

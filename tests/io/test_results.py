@@ -16,9 +16,9 @@ from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io import results
-from pimper_torch.io.accounts import common_lights, lights_account, summary_account, world_lights
 from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply, written_channels
+from pimper_torch.io.reports import common_lights, lights_report, summary_report, world_lights
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
@@ -149,9 +149,9 @@ def test_normals_and_albedo_are_pictures_of_the_reference_photographs_size(
         assert (picture.size, picture.mode) == ((60, 40), "RGB")
         colors = np.asarray(picture).astype(float)
     assert (colors[0, 0] == 0).all()
-    middle = colors[20, 30]  # the top of the bump, seen from straight before it
-    assert middle[2] > 240
-    assert abs(middle[:2] - 127.5).max() < 40
+    centre = colors[20, 30]  # the top of the bump, seen from straight before it
+    assert centre[2] > 240
+    assert abs(centre[:2] - 127.5).max() < 40
     left, right, up, down = colors[20, 25], colors[20, 35], colors[15, 30], colors[25, 30]
     assert left[0] < 110 < 145 < right[0]
     assert down[1] < 110 < 145 < up[1]
@@ -174,15 +174,15 @@ def test_lights_in_the_world_shade_as_lights_in_the_patch(reconstruction):
 
 
 def test_the_mean_light_leaves_out_what_is_unknown(reconstruction):
-    account = lights_account(reconstruction)
+    report = lights_report(reconstruction)
     _, lights_world, _ = world_lights(reconstruction)
     # Facet 0 is not determined; view c does not have facet 1.
-    assert [view["patches"] for view in account["views"]] == [1, 1, 0]
-    assert_close(torch.tensor(account["views"][0]["light"]), lights_world[1, 0], rtol=1e-5, atol=0)
-    assert account["views"][2]["light"] is None
-    assert account["patches"][1]["lights"][2] is None
-    assert account["patches"][0]["lights"][2] is not None
-    assert account["reference"] == "b.png"
+    assert [view["patches"] for view in report["views"]] == [1, 1, 0]
+    assert_close(torch.tensor(report["views"][0]["light"]), lights_world[1, 0], rtol=1e-5, atol=0)
+    assert report["views"][2]["light"] is None
+    assert report["patches"][1]["lights"][2] is None
+    assert report["patches"][0]["lights"][2] is not None
+    assert report["reference"] == "b.png"
 
 
 def test_the_common_light_is_what_the_patches_see_of_one_light(reconstruction):
@@ -207,21 +207,21 @@ def test_the_common_light_is_what_the_patches_see_of_one_light(reconstruction):
             )
         )
     patches = reconstruction.patches
-    turned = reconstruction.replace(
+    rotated = reconstruction.replace(
         patches=patches.replace(photometric=photometric.replace(buckets=tuple(buckets)))
     )
-    found, counts = common_lights(turned)
+    found, counts = common_lights(rotated)
     assert counts.tolist() == [2, 2, 2]
     assert_close(found, truth, rtol=1e-4, atol=1e-5)
 
 
 def test_the_summary_counts(reconstruction):
-    summary = summary_account(reconstruction, {})
+    summary = summary_report(reconstruction, {})
     wanted = {
         "mesh_points": 4,
         "triangles": 2,
         "samples": 96,
-        "missing_share": 0.25,
+        "missing_fraction": 0.25,
         "vertices": 225,
         "seconds": 2.0,
         "peak_memory_mb": 310.0,
@@ -233,14 +233,14 @@ def test_the_summary_counts(reconstruction):
 
 
 def test_numbers_that_json_cannot_hold_become_null(reconstruction, tmp_path):
-    report = reconstruction.report[0].replace(figures={"missing_share": float("nan")})
+    report = reconstruction.report[0].replace(figures={"missing_fraction": float("nan")})
     write_result(reconstruction.replace(report=(report,)), Config(), tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["missing_share"] is None
-    assert summary["stages"][0]["missing_share"] is None
+    assert summary["missing_fraction"] is None
+    assert summary["stages"][0]["missing_fraction"] is None
 
 
-def test_a_failure_in_the_middle_leaves_nothing_behind(reconstruction, tmp_path, monkeypatch):
+def test_a_failure_in_the_centre_leaves_nothing_behind(reconstruction, tmp_path, monkeypatch):
     for error in (OSError(28, "No space left on device"), KeyboardInterrupt()):
 
         def fail(*_, error=error):
@@ -344,8 +344,8 @@ def test_silhouettes_are_written_as_masks_that_can_be_given(reconstruction, tmp_
     inside = torch.zeros(3, 40, 60)
     inside[:, 5:30, 10:50] = 0.9
     inside[:, :, 50:] = 0.4
-    trusted = torch.tensor([True, True, False])
-    silhouettes = Silhouettes(inside=inside, trusted=trusted, source="found")
+    reliable = torch.tensor([True, True, False])
+    silhouettes = Silhouettes(inside=inside, reliable=reliable, source="found")
     write_result(
         reconstruction.replace(silhouettes=silhouettes), Config(zeta=2.0), tmp_path / "out"
     )

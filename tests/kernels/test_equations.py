@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.fusion.estimate import _judged
-from pimper_torch.fusion.evidence import Evidence
+from pimper_torch.fusion.terms import Terms
 from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
 
@@ -12,9 +12,9 @@ from pimper_torch.linalg.equations import compressed_equations, normal_equations
 def test_compressed_rows_are_those_of_the_entries(real):
     generator = torch.Generator().manual_seed(4)
     size = 40
-    hold = torch.rand(size, generator=generator, dtype=torch.float64) + 0.1
+    damping = torch.rand(size, generator=generator, dtype=torch.float64) + 0.1
     start = torch.randn(size, generator=generator, dtype=real)
-    kinds, dense, side = [], torch.diag(hold), hold * start
+    kinds, dense, side = [], torch.diag(damping), damping * start
     for terms, count in ((2, 90), (1, 25), (3, 10), (1, 0)):
         unknowns = torch.randint(0, size, (count, terms), generator=generator)
         coefficients = torch.randn(count, terms, generator=generator, dtype=real)
@@ -25,7 +25,7 @@ def test_compressed_rows_are_those_of_the_entries(real):
         rows, cols, values, told = normal_equations(*wide, size)
         dense = dense.index_put((rows, cols), values, accumulate=True)
         side = side + told
-    matrix, found = compressed_equations(kinds, hold, start)
+    matrix, found = compressed_equations(kinds, damping, start)
     assert_close(torch.from_numpy(matrix.toarray()), dense)
     assert_close(found, side)
     assert matrix.has_sorted_indices
@@ -39,7 +39,7 @@ def test_evidence_is_judged_as_in_torch(real):
     def draw(*shape, dtype=real):
         return torch.rand(*shape, generator=generator, dtype=dtype) + 0.1
 
-    kind = Evidence(
+    kind = Terms(
         unknowns=torch.randint(0, 30, (200, 2), generator=generator),
         coefficients=draw(200, 2) - 0.6,
         targets=draw(200),

@@ -10,7 +10,7 @@ from pimper_torch.records import Mesh
 from pimper_torch.sweep.sweep import Sweep
 
 
-def relief(templates):
+def height_field(templates):
     """A wave on the templates, whose neighbours' depths matter to the level of each sample."""
     x, y = templates.points_patch[..., 0], templates.points_patch[..., 1]
     return 0.5 * templates.spacing[:, None, None] * torch.sin(30 * x) * torch.cos(20 * y)
@@ -20,9 +20,12 @@ def waved(patches):
     """Templates that carry a surface, and a screen before a part of it."""
     buckets = tuple(
         bucket.replace(
-            depth=relief(bucket),
+            depth=height_field(bucket),
             normals_patch=torch.nn.functional.normalize(
-                torch.stack([relief(bucket), 0 * relief(bucket), relief(bucket) * 0 - 1], dim=-1),
+                torch.stack(
+                    [height_field(bucket), 0 * height_field(bucket), height_field(bucket) * 0 - 1],
+                    dim=-1,
+                ),
                 dim=-1,
             ),
         )

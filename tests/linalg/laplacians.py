@@ -5,7 +5,8 @@ from scipy.sparse import coo_array, csr_array
 
 
 def triangles(side: int, decades: float, seed: int = 0) -> csr_array:
-    """A Laplacian of a triangle lattice whose weights vary over decades, with holes and anchors."""
+    """A Laplacian of a triangle subdivided mesh whose weights vary over decades, with holes and
+    anchors."""
     generator = np.random.default_rng(seed)
     name = np.arange(side * side).reshape(side, side)
     pairs = (name[:, :-1], name[:, 1:]), (name[:-1], name[1:]), (name[:-1, :-1], name[1:, 1:])

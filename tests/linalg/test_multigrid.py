@@ -65,7 +65,7 @@ def test_the_cycle_is_symmetric_and_positive(generator):
     assert spectrum.min() > 0.02
 
 
-def test_constants_are_carried_to_the_coarse_unknowns_exactly(generator):
+def test_constants_are_transferred_to_the_coarse_unknowns_exactly(generator):
     matrix = compressed(*entries(900, generator, anchor=0.0), 900)
     spread = prolongation(matrix)
     assert spread.shape[1] < 450
@@ -98,9 +98,9 @@ def test_creases_where_unknowns_move_less_far_hardly_cost_cycles(generator):
     pixel = torch.arange(side * side).reshape(side, side)
     one = torch.cat([pixel[:, :-1].flatten(), pixel[:-1].flatten()])
     other = torch.cat([pixel[:, 1:].flatten(), pixel[1:].flatten()])
-    share = torch.ones(side, side, dtype=torch.float64)
-    share[::10] = 0.3
-    a, b = share.flatten()[one], share.flatten()[other]
+    fraction = torch.ones(side, side, dtype=torch.float64)
+    fraction[::10] = 0.3
+    a, b = fraction.flatten()[one], fraction.flatten()[other]
     anchor = torch.full((side * side,), 1e-6)
     rows = torch.cat([one, other, one, other, pixel.flatten()])
     cols = torch.cat([one, other, other, one, pixel.flatten()])

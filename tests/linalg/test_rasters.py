@@ -199,8 +199,8 @@ def test_a_quarter_turn_of_the_raster_turns_the_answer(method, generator):
     source = random(generator, 30, 22)
     found = system(weighted, method=method).solve(source)
     # A turn by 90 degrees makes steps down of steps to the right and reverses the others.
-    turned = RasterSystem(weighted.down.rot90(), weighted.right.rot90(), method=method)
-    assert_close(turned.solve(source.rot90()), found.rot90(), rtol=1e-6, atol=1e-6)
+    rotated = RasterSystem(weighted.down.rot90(), weighted.right.rot90(), method=method)
+    assert_close(rotated.solve(source.rot90()), found.rot90(), rtol=1e-6, atol=1e-6)
 
 
 def bumps(x, y):
@@ -261,7 +261,7 @@ def test_known_heights_are_met_where_they_are_anchored():
 def test_gradients_reach_weights_anchors_and_source(method, held, generator, monkeypatch):
     monkeypatch.setattr(hierarchy, "_DENSE", 3)  # so that there are cycles to differentiate
     tied = torch.tensor([[True, True], [True, False], [True, True]]), torch.ones(2, 3).bool()
-    tied[1][0, 2] = tied[1][1, 2] = False  # one pixel of the middle row is outside
+    tied[1][0, 2] = tied[1][1, 2] = False  # one pixel of the centre row is outside
     anchor = torch.full((3, 3), 0.3 if held else 0.0, dtype=torch.float64)
     anchor[1, 2] = 0
     weights = [0.5 + torch.rand(int(t.sum()), generator=generator).double() for t in tied]

@@ -161,8 +161,8 @@ def test_a_surface_without_enough_support_is_refused():
 
 def test_what_is_expected_to_be_too_far_off_is_cut_out():
     surface = sheet()
-    share = columns(surface) / (SIDE - 1) / 10
-    told = surface.replace(expected_error=share * diagonal(surface.vertices_world))
+    fraction = columns(surface) / (SIDE - 1) / 10
+    told = surface.replace(expected_error=fraction * diagonal(surface.vertices_world))
     mesh = Extract(ExtractConfig(max_expected_error=0.05))(told)
     assert columns(mesh).max() == (SIDE - 1) / 2
     assert len(mesh.faces) == len(surface.faces) // 2
@@ -171,7 +171,7 @@ def test_what_is_expected_to_be_too_far_off_is_cut_out():
     assert len(Extract(ExtractConfig(max_expected_error=0.11))(told).faces) == len(surface.faces)
     with pytest.raises(ReconstructionError, match="max_expected_error"):
         Extract(ExtractConfig(max_expected_error=1e-9))(
-            surface.replace(expected_error=1 + 0 * share)
+            surface.replace(expected_error=1 + 0 * fraction)
         )
 
 

@@ -50,9 +50,9 @@ def folded_sphere(subdivisions=4):
     dragged = vertices.clone()
     step = 2.5 * float(sides(vertices, faces).median())
     for direction in ([1.0, 0.3, 0.2], [-0.2, 1.0, 0.4], [0.1, -0.5, -1.0]):
-        middle = normalize(torch.tensor(direction).double(), dim=0)
-        near = (vertices @ middle).topk(3).indices
-        along = torch.linalg.cross(middle, middle.new_tensor([0.0, 0.6, 0.8]))
+        centre = normalize(torch.tensor(direction).double(), dim=0)
+        near = (vertices @ centre).topk(3).indices
+        along = torch.linalg.cross(centre, centre.new_tensor([0.0, 0.6, 0.8]))
         dragged[near] = 0.95 * vertices[near] + step * normalize(along, dim=0)
     return vertices, surface_of(dragged, faces, surface_of(vertices, faces).facet)
 
@@ -229,7 +229,7 @@ def test_the_least_bent_places_are_those_of_a_dense_solve(generator):
     assert torch.equal(placed[~free], vertices[~free])
 
 
-def test_a_regular_lattice_in_a_plane_is_found_again(generator):
+def test_a_regular_subdivided_mesh_in_a_plane_is_found_again(generator):
     row, column = torch.meshgrid(torch.arange(9), torch.arange(9), indexing="ij")
     here = (row[:-1, :-1] * 9 + column[:-1, :-1]).flatten()
     faces = torch.cat(

@@ -41,7 +41,7 @@ def two_facets():
 
 @pytest.fixture
 def photographed():
-    """Give patches the exact normals of a relief with the slopes ``(x, y) -> (p, q)``."""
+    """Give patches the exact normals of a height field with the slopes ``(x, y) -> (p, q)``."""
 
     def build(patches, slopes, keep=lambda x, y: torch.ones_like(x, dtype=torch.bool)):
         buckets = []

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.frames import transform
-from pimper_torch.geometry.reliefs import sample_raster
+from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.paper.integrate import Integrate, IntegrateConfig, integrate_normals
 
 
@@ -21,11 +21,11 @@ def slopes_of_bumps(x, y):
 def worst_misfit(depths, keep=None):
     """Largest distance to the bumps, each patch shifted along z to fit."""
     worst = 0.0
-    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
         x, y, _ = templates.points_patch.unbind(dim=-1)
         for patch in range(len(x)):
-            chosen = relief.valid[patch] if keep is None else keep(x[patch], y[patch])
-            misfit = (relief.depth[patch] - bumps(x[patch], y[patch]))[chosen]
+            chosen = height_field.valid[patch] if keep is None else keep(x[patch], y[patch])
+            misfit = (height_field.depth[patch] - bumps(x[patch], y[patch]))[chosen]
             worst = max(worst, float((misfit - misfit.mean()).abs().max()))
     return worst
 
@@ -37,7 +37,7 @@ def test_closed_form_surfaces_return_with_an_error_that_falls_with_the_square_of
         worst_misfit(Integrate()(photographed(two_facets(density), slopes_of_bumps)))
         for density in (1.0, 2.0)
     )
-    assert coarse < 2e-3  # of a relief 0.2 high
+    assert coarse < 2e-3  # of a height field 0.2 high
     assert fine < 0.4 * coarse
 
 
@@ -55,10 +55,10 @@ def test_a_tilted_plane_stays_a_plane_to_float32_rounding(two_facets, photograph
         return torch.full_like(x, 0.8), torch.full_like(x, -0.3)
 
     depths = Integrate(IntegrateConfig(iterations=iterations))(photographed(patches, slopes))
-    for templates, relief in zip(patches.buckets, depths.buckets, strict=True):
+    for templates, height_field in zip(patches.buckets, depths.buckets, strict=True):
         x, y, _ = templates.points_patch.unbind(dim=-1)
         plane = 0.8 * x - 0.3 * y
-        rest = relief.depth - plane
+        rest = height_field.depth - plane
         rest = rest - rest.mean(dim=(1, 2), keepdim=True)
         assert rest.abs().max() < 4 * torch.finfo(torch.float32).eps * plane.abs().max()
 
@@ -80,25 +80,25 @@ def test_holes_are_bridged_in_keeping_with_their_rim(two_facets, photographed):
 def test_a_patch_without_normals_stays_its_facet_and_says_so(two_facets, photographed):
     patches = two_facets(1.0)
     seen = photographed(patches, slopes_of_bumps, keep=lambda x, y: torch.zeros_like(x) > 0)
-    for relief in Integrate()(seen).buckets:
-        assert_close(relief.depth, torch.zeros_like(relief.depth))
-        assert not relief.valid.any()
+    for height_field in Integrate()(seen).buckets:
+        assert_close(height_field.depth, torch.zeros_like(height_field.depth))
+        assert not height_field.valid.any()
 
 
-def test_the_relief_passes_on_average_through_the_corners(two_facets, photographed):
+def test_the_height_field_passes_on_average_through_the_corners(two_facets, photographed):
     depths = Integrate()(photographed(two_facets(1.0), slopes_of_bumps))
     mesh = depths.patches.coarse.mesh
-    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
         corners = transform(
             templates.patch_from_world, mesh.vertices_world[mesh.faces[templates.facet]]
         )
         found = sample_raster(
-            relief.depth[:, None], corners[..., :2], templates.origin, templates.spacing
+            height_field.depth[:, None], corners[..., :2], templates.origin, templates.spacing
         )[:, 0]
         assert found.abs().max() > 1e-3  # so that only the mean can be zero
         assert_close(found.mean(dim=1), torch.zeros_like(found[:, 0]))
         identity = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
-        assert_close(relief.transform, identity.expand(len(found), 4))
+        assert_close(height_field.transform, identity.expand(len(found), 4))
 
 
 def test_uncertain_normals_yield_to_certain_ones(generator):
@@ -108,10 +108,10 @@ def test_uncertain_normals_yield_to_certain_ones(generator):
     valid = torch.ones(1, 20, 20, dtype=torch.bool)
     confidence = torch.ones(1, 20, 20, dtype=torch.float64)
     spacing = torch.ones(1, dtype=torch.float64)
-    trusted = integrate_normals(normals, valid, confidence, spacing, 4.0, 30)
+    reliable = integrate_normals(normals, valid, confidence, spacing, 4.0, 30)
     confidence[:, 8:12, 8:12] = 0
     doubted = integrate_normals(normals, valid, confidence, spacing, 4.0, 30)
-    assert doubted.abs().max() < 0.4 * trusted.abs().max()
+    assert doubted.abs().max() < 0.4 * reliable.abs().max()
 
 
 def test_gradients_reach_normals_and_confidence(generator):

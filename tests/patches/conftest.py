@@ -26,7 +26,7 @@ def plane_scene() -> RenderedScene:
 
 @pytest.fixture(scope="session")
 def plane_mesh() -> CoarseMesh:
-    """Two facets of unlike size on the tilted plane, frontal in the middle view."""
+    """Two facets of unlike size on the tilted plane, frontal in the centre view."""
     xy = torch.tensor([[-0.8, -0.6], [0.7, -0.5], [0.5, 0.6], [-0.3, 0.5]], dtype=torch.float64)
     z = -(0.2 * xy[:, :1] - 0.1 * xy[:, 1:])
     mesh = Mesh(

@@ -6,7 +6,7 @@ from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.pyramid import look_up, pyramid_level
-from pimper_torch.patches.warp import Warp, WarpConfig, missing_share
+from pimper_torch.patches.warp import Warp, WarpConfig, missing_fraction
 from pimper_torch.records import CoarseMesh, Mesh
 
 
@@ -36,7 +36,7 @@ def test_every_view_gives_the_albedo_at_each_samples_own_place(registered):
 def test_nothing_is_said_about_missing_samples(registered):
     for seen in registered.buckets:
         assert (seen.radiance * ~seen.valid[:, :, None]).abs().max() == 0
-    assert 0 <= missing_share(registered) < 0.2
+    assert 0 <= missing_fraction(registered) < 0.2
 
 
 def test_saturated_dark_masked_and_outside_samples_are_missing(plane_scene, plane_mesh):
@@ -114,7 +114,7 @@ def test_a_fine_stripe_pattern_seen_from_afar_averages_out():
     assert_close(sampled, torch.full_like(sampled, 0.5))
 
 
-def test_radiance_is_differentiable_in_the_images_and_the_relief(plane_scene, plane_mesh):
+def test_radiance_is_differentiable_in_the_images_and_the_height_field(plane_scene, plane_mesh):
     # Samples further apart than pixels: where they are as far apart, the pyramid's level bends.
     sparse = DecomposeConfig(samples_per_pixel=0.7)
     patches = Decompose(sparse)(plane_mesh, plane_scene.cameras)

@@ -38,7 +38,7 @@ def test_confidence_is_the_variance_of_normals_under_noise(problem, generator, d
         lights=repeated(lights),
         anchor=repeated(lights),
         shading=repeated(shading),
-        pull=given.pull.expand(draws, -1),
+        regularization=given.regularization.expand(draws, -1),
     )
     found = refine_on_manifold(many, solved_under(many, many.lights))
     variance = math.radians(HALF_CONFIDENCE_DEG) ** 2 * (1 / found.confidence - 1)

@@ -28,7 +28,7 @@ def noisy(problem, generator, **settings):
     _, normals = given.manifold.split(given.shading.mT)
     return given.replace(
         radiance=given.weight * (given.radiance + off),
-        pull=torch.full_like(given.pull, 5.0),
+        regularization=torch.full_like(given.regularization, 5.0),
         prior=0.3 * given.manifold.bend(normals.mT),
         loss=Cauchy(),
     ).to(torch.float32)
@@ -92,7 +92,7 @@ def test_views_and_samples_without_data_make_no_difference(problem, generator):
     given = given.replace(weight=weight, radiance=weight * given.radiance)
     keep = torch.arange(12) != 3
     small = given.replace(
-        **{name: getattr(given, name)[:, keep] for name in ("lights", "anchor", "pull")},
+        **{name: getattr(given, name)[:, keep] for name in ("lights", "anchor", "regularization")},
         radiance=given.radiance[:, keep, :50].contiguous(),
         weight=given.weight[:, keep, :50].contiguous(),
         shading=given.shading[..., :50].contiguous(),
@@ -183,9 +183,9 @@ def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
         )
     few = Factorize().light(true.seen.replace(patches=thin, buckets=tuple(registered)))
     every = Factorize().light(true.seen)
-    middle = torch.zeros(1, 3, dtype=torch.float64)
+    centre = torch.zeros(1, 3, dtype=torch.float64)
     # Exact data: both are the truth.
-    assert_close(few.field.lights_at(middle), every.field.lights_at(middle), rtol=0, atol=5e-3)
+    assert_close(few.field.lights_at(centre), every.field.lights_at(centre), rtol=0, atol=5e-3)
 
 
 def test_templates_with_few_samples_are_left_whole(scene):
@@ -194,7 +194,7 @@ def test_templates_with_few_samples_are_left_whole(scene):
         assert_close(few.points_patch, whole.points_patch)
 
 
-@pytest.mark.parametrize("model", ["soft", "lamp"])
+@pytest.mark.parametrize("model", ["soft", "point_light"])
 def test_lights_fitted_to_known_normals_are_those_of_the_reference(generator, model):
     def normal(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -202,8 +202,8 @@ def test_lights_fitted_to_known_normals_are_those_of_the_reference(generator, mo
     n = normalize(normal(700, 3), dim=1)
     x = n + 0.1 * normal(700, 3)
     albedo = 0.3 + torch.rand(700, generator=generator, dtype=torch.float64)
-    lamp = 4 * normalize(normal(9, 3), dim=1)
-    away = lamp - x[:, None]
+    point_light = 4 * normalize(normal(9, 3), dim=1)
+    away = point_light - x[:, None]
     facing = (n[:, None] * away).sum(dim=2).clamp_min(0) / away.norm(dim=2) ** 3
     radiance = albedo[:, None] * (0.02 + 10 * facing) + 0.003 * normal(700, 9)
     gross = torch.rand(radiance.shape, generator=generator) < 0.05
@@ -217,8 +217,8 @@ def test_lights_fitted_to_known_normals_are_those_of_the_reference(generator, mo
     found, expected = fields
     # Both end where a step gains less than 1e-7 of the loss.
     assert_close(found.lights_at(x), expected.lights_at(x), rtol=0, atol=2e-3)
-    if model == "lamp":
+    if model == "point_light":
         told = torch.arange(9) != 4
-        off = torch.cosine_similarity(found.lamp_at(x)[:, told], away[:, told], dim=2)
+        off = torch.cosine_similarity(found.point_light_at(x)[:, told], away[:, told], dim=2)
         assert torch.rad2deg(torch.acos(off.clamp(-1, 1))).median() < 1
-        assert (found.lamp[4] == 0).all()
+        assert (found.point_light[4] == 0).all()

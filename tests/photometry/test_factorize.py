@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.chains.presets import load_config
 from pimper_torch.errors import ConfigError, PimperWarning
-from pimper_torch.patches.carry import coarse_normals
+from pimper_torch.patches.transfer import coarse_normals
 from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.harmonics import harmonics
@@ -191,7 +191,7 @@ def test_confidence_tells_the_error_that_noise_makes(scene, generator, deviation
         )
         for each in true.seen.buckets
     )
-    alone = FactorizeConfig(light="soft", loss="squares", light_pull=1e6, geometry_weight=0.0)
+    alone = FactorizeConfig(light="soft", loss="squares", light_prior=1e6, geometry_weight=0.0)
     found = Factorize(alone)(true.seen.replace(buckets=buckets))
     variance, square = [], []
     for bucket, normals in zip(found.buckets, true.normals, strict=True):
@@ -232,7 +232,7 @@ def test_what_is_handed_in_is_left_alone(scene):
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"light_pull": -1.0},
+        {"light_prior": -1.0},
         {"geometry_weight": -0.1},
         {"loss_scale": 0.0},
         {"min_views": 2},

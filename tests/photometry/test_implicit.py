@@ -33,7 +33,7 @@ def noisy(generator):
             lights=lights,
             anchor=lights + 0.05 * draw(*lights.shape),
             shading=shading,
-            pull=torch.full((patches, views), 2.0, dtype=torch.float64),
+            regularization=torch.full((patches, views), 2.0, dtype=torch.float64),
             prior=0.5 * manifold.bend(normals.mT),
             manifold=manifold,
             loss=loss or Squares(),
@@ -52,15 +52,17 @@ def test_gradients_are_those_of_the_solver(noisy, manifold, generator):
     start = solved(problem)
     assert start.convergence.converged.all()
 
-    def answer(radiance, anchor, pull, prior, solve):
-        given = problem.replace(radiance=radiance, anchor=anchor, pull=pull, prior=prior)
+    def answer(radiance, anchor, regularization, prior, solve):
+        given = problem.replace(
+            radiance=radiance, anchor=anchor, regularization=regularization, prior=prior
+        )
         found = solve(given)
         return torch.cat([found.lights.flatten(1), found.shading.flatten(1)], dim=1)
 
     def again(given):
         return solved(given.replace(lights=start.lights, shading=start.shading))
 
-    data = [problem.radiance, problem.anchor, problem.pull, problem.prior]
+    data = [problem.radiance, problem.anchor, problem.regularization, problem.prior]
     leaves = [one.clone().requires_grad_() for one in data]
     found = answer(*leaves, lambda given: differentiable(given, start))
     assert_close(found, answer(*data, lambda _: start))

@@ -3,13 +3,13 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.photometry.light_field import LightField, faces_lamp
+from pimper_torch.photometry.light_field import LightField, faces_light
 from pimper_torch.photometry.lights import fit_light_field
 
 
 @pytest.fixture
 def room(generator):
-    """Points and normals of a bumpy bowl, and six lamps three to six radii away."""
+    """Points and normals of a bumpy bowl, and six point lights three to six radii away."""
 
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -20,39 +20,39 @@ def room(generator):
     field = LightField(
         origin=points.mean(dim=0),
         soft=torch.tensor([[0.1, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(6, 1),
-        lamp=torch.linspace(0.5, 1.5, 6).double()[:, None] * directions,
+        point_light=torch.linspace(0.5, 1.5, 6).double()[:, None] * directions,
         closeness=1 / torch.linspace(3, 6, 6).double(),
     )
     return points, normals, field
 
 
 def seen_by(field, points, normals, albedo):
-    lamp = field.lamp_at(points)
-    direct = (lamp * normals[:, None]).sum(dim=-1).clamp_min(0)
+    point_light = field.point_light_at(points)
+    direct = (point_light * normals[:, None]).sum(dim=-1).clamp_min(0)
     return albedo[:, None] * (field.soft[:, 0] + direct)
 
 
-def test_a_lamp_falls_off_with_the_square_and_points_at_its_place():
+def test_a_point_light_falls_off_with_the_square_and_points_at_its_place():
     place = torch.tensor([0.0, 3.0, 4.0], dtype=torch.float64)
     field = LightField(
         origin=torch.zeros(3).double(),
         soft=torch.zeros(1, 4).double(),
-        lamp=2.0 * place[None] / 5,
+        point_light=2.0 * place[None] / 5,
         closeness=torch.tensor([1 / 5]).double(),
     )
     points = torch.tensor([[0.0, 0, 0], [1.0, 0, 4], [-2, 1, 0]], dtype=torch.float64)
-    found = field.lamp_at(points)[:, 0]
+    found = field.point_light_at(points)[:, 0]
     away = place - points
     assert_close(normalize(found, dim=1), normalize(away, dim=1))
     assert_close(found.norm(dim=1), 2.0 * 25 / away.square().sum(dim=1))
     assert_close(field.lights_at(points)[:, 0, 1:], found)
 
 
-def test_a_lamp_far_away_is_the_same_everywhere():
+def test_a_point_light_far_away_is_the_same_everywhere():
     field = LightField(
         origin=torch.zeros(3).double(),
         soft=torch.tensor([[0.3, 0.1, 0.2, 0.4]]).double(),
-        lamp=torch.tensor([[0.6, 0.0, 0.8]]).double(),
+        point_light=torch.tensor([[0.6, 0.0, 0.8]]).double(),
         closeness=torch.zeros(1).double(),
     )
     points = torch.tensor([[0.0, 0, 0], [50.0, -8, 4]], dtype=torch.float64)
@@ -60,31 +60,31 @@ def test_a_lamp_far_away_is_the_same_everywhere():
     assert_close(field.lights_at(points)[:, 0], expected.expand(2, 4))
 
 
-def test_lamps_are_found_where_they_are(room, generator):
+def test_point_lights_are_found_where_they_are(room, generator):
     points, normals, field = room
     albedo = 0.2 + torch.rand(len(points), generator=generator, dtype=torch.float64)
     J = seen_by(field, points, normals, albedo)
     seen = torch.rand(J.shape, generator=generator) > 0.4
     found = fit_light_field(torch.where(seen, J, torch.nan), seen, normals, points, iterations=150)
-    scale = field.lamp[0].norm() / found.lamp[0].norm()
-    assert_close(found.lamp * scale, field.lamp, rtol=1e-3, atol=1e-3)
+    scale = field.point_light[0].norm() / found.point_light[0].norm()
+    assert_close(found.point_light * scale, field.point_light, rtol=1e-3, atol=1e-3)
     assert_close(found.soft * scale, field.soft, rtol=1e-3, atol=1e-3)
     assert_close(found.closeness, field.closeness, rtol=1e-3, atol=1e-3)
 
 
-def test_lamps_survive_cast_shadows_and_highlights(room, generator):
+def test_point_lights_survive_cast_shadows_and_highlights(room, generator):
     points, normals, field = room
     albedo = 0.2 + torch.rand(len(points), generator=generator, dtype=torch.float64)
     J = seen_by(field, points, normals, albedo)
     draw = torch.rand(J.shape, generator=generator)
     J = torch.where(draw < 0.15, 0.1 * albedo[:, None], torch.where(draw > 0.95, 2.0, J))
     found = fit_light_field(J, torch.ones_like(draw, dtype=torch.bool), normals, points)
-    cosine = (normalize(found.lamp, dim=1) * normalize(field.lamp, dim=1)).sum(dim=1)
+    cosine = (normalize(found.point_light, dim=1) * normalize(field.point_light, dim=1)).sum(dim=1)
     assert torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max() < 2
     assert (found.closeness / field.closeness - 1).abs().max() < 0.1
 
 
-def test_light_from_all_sides_is_taken_for_no_lamp(room, generator):
+def test_light_from_all_sides_is_taken_for_no_point_light(room, generator):
     points, normals, _ = room
     soft = torch.cat([torch.ones(6, 1), 0.5 * torch.randn(6, 3, generator=generator)], dim=1)
     soft = soft.double()
@@ -92,16 +92,18 @@ def test_light_from_all_sides_is_taken_for_no_lamp(room, generator):
     basis = torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
     J = albedo[:, None] * (basis @ soft.mT)
     found = fit_light_field(J, J > 0, normals, points)
-    assert (found.lamp == 0).all()
+    assert (found.point_light == 0).all()
     assert_close(found.soft / found.soft[:1, :1], soft / soft[:1, :1], rtol=1e-4, atol=1e-4)
-    asked = fit_light_field(J, J > 0, normals, points, model="lamp")
-    assert (asked.lamp.norm(dim=1) > 0).all()
+    asked = fit_light_field(J, J > 0, normals, points, model="point_light")
+    assert (asked.point_light.norm(dim=1) > 0).all()
 
 
-def test_what_faces_away_from_the_lamp_is_told():
-    lamp = torch.tensor([[[0.0, 0, -2], [0, 0, 0]]])
+def test_what_faces_away_from_the_point_light_is_told():
+    point_light = torch.tensor([[[0.0, 0, -2], [0, 0, 0]]])
     normals = torch.tensor([[[0.0, 0, -1], [0, 0, 1], [1, 0, 0]]])
-    assert faces_lamp(lamp, normals).tolist() == [[[True, False, False], [True, True, True]]]
+    assert faces_light(point_light, normals).tolist() == [
+        [[True, False, False], [True, True, True]]
+    ]
 
 
 def test_a_field_without_data_is_dark():
@@ -115,7 +117,7 @@ def test_a_field_without_data_is_dark():
 
 
 @pytest.mark.parametrize("contrast", [0.3, 0.9])
-def test_lamps_are_found_in_spite_of_what_they_leave_in_shadow(generator, contrast):
+def test_point_lights_are_found_in_spite_of_what_they_leave_in_shadow(generator, contrast):
     # What a camera sees of a ball, lit from all sides; in every view a wall shadows a fifth.
     def unit(rows):
         return normalize(torch.tensor(rows, dtype=torch.float64), dim=-1)
@@ -130,8 +132,8 @@ def test_lamps_are_found_in_spite_of_what_they_leave_in_shadow(generator, contra
     albedo = 1 - contrast * torch.rand(len(normals), generator=generator, dtype=torch.float64)
     radiance = albedo[:, None] * (0.1 + lit)
     seen = torch.ones_like(radiance, dtype=torch.bool)
-    field = fit_light_field(radiance, seen, normals, normals, model="lamp")
-    off = (normalize(field.lamp, dim=1) * directions).sum(dim=1).clamp(-1, 1).acos()
+    field = fit_light_field(radiance, seen, normals, normals, model="point_light")
+    off = (normalize(field.point_light, dim=1) * directions).sum(dim=1).clamp(-1, 1).acos()
     assert torch.rad2deg(off).max() < 1
-    ambient = field.soft[:, 0] / field.lamp.norm(dim=1)
+    ambient = field.soft[:, 0] / field.point_light.norm(dim=1)
     assert_close(ambient, torch.full((8,), 0.1).double(), rtol=0.05, atol=0)

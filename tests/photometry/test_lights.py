@@ -22,7 +22,7 @@ def test_lights_are_exact_without_noise_though_half_is_missing(generator):
     J, n, lights, _ = data(generator)
     seen = torch.rand(J.shape, generator=generator) > 0.5
     found = fit_light_field(torch.where(seen, J, torch.nan), seen, n)
-    assert (found.lamp == 0).all()
+    assert (found.point_light == 0).all()
     assert_close(found.soft, lights, rtol=1e-5, atol=1e-5)  # stops at a relative change of 1e-7
 
 
@@ -53,5 +53,7 @@ def test_shading_is_the_same_in_every_frame(generator):
     target_from_source = rigid(rotation, torch.ones(3, dtype=torch.float64))
     lights = torch.randn(5, 4, generator=generator, dtype=torch.float64)
     n = torch.randn(7, 3, generator=generator, dtype=torch.float64)
-    turned = rotate_lights(target_from_source, lights) @ harmonics(rotate(target_from_source, n)).mT
-    assert_close(turned, lights @ harmonics(n).mT)
+    rotated = (
+        rotate_lights(target_from_source, lights) @ harmonics(rotate(target_from_source, n)).mT
+    )
+    assert_close(rotated, lights @ harmonics(n).mT)

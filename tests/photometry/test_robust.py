@@ -21,8 +21,8 @@ def test_the_spread_solves_its_equation(generator):
     noise = drawn(generator, 2, 300)
     everything = torch.ones_like(noise, dtype=torch.bool)
     scale = 0.6472404 * spread(noise, everything)[:, None]
-    share = noise**4 / (noise**4 + scale**4)
-    assert_close(share.mean(dim=1), torch.full((2,), 0.5, dtype=torch.float64))
+    fraction = noise**4 / (noise**4 + scale**4)
+    assert_close(fraction.mean(dim=1), torch.full((2,), 0.5, dtype=torch.float64))
 
 
 def test_outliers_up_to_a_half_are_borne(generator):

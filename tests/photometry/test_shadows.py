@@ -21,14 +21,14 @@ def ball_over_plane():
     return RayCaster(both.vertices_world, both.faces)
 
 
-def lamps(places, distant=False):
-    """Lamps at places, or in their directions."""
+def point_lights(places, distant=False):
+    """Point lights at places, or in their directions."""
     places = torch.tensor(places, dtype=torch.float64)
     distance = places.norm(dim=1)
     return LightField(
         origin=torch.zeros(3).double(),
         soft=torch.zeros(len(places), 4).double(),
-        lamp=2.0 * normalize(places, dim=1),
+        point_light=2.0 * normalize(places, dim=1),
         closeness=torch.zeros_like(distance) if distant else 1 / distance,
     )
 
@@ -43,19 +43,19 @@ def plane():
 
 
 def ellipse(points, direction):
-    """Signed distance, roughly, to the contour of a ball's shadow under a distant lamp."""
+    """Signed distance, roughly, to the contour of a ball's shadow under a distant point light."""
     direction = normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
-    middle = -HEIGHT * direction[:2] / direction[2]
+    centre = -HEIGHT * direction[:2] / direction[2]
     along = normalize(direction[:2], dim=0)
-    offset = points[..., :2] - middle
+    offset = points[..., :2] - centre
     u, v = offset @ along, offset @ torch.stack([-along[1], along[0]])
     return ((u * direction[2]) ** 2 + v**2).sqrt() - RADIUS
 
 
-def test_a_distant_lamp_casts_the_ellipse_of_a_ball(ball_over_plane, plane):
+def test_a_distant_point_light_casts_the_ellipse_of_a_ball(ball_over_plane, plane):
     points, normals = plane
     direction = (0.5, 0.2, 0.9)
-    found = cast_shadows(lamps([direction], True), ball_over_plane, points, normals, 1e-4)
+    found = cast_shadows(point_lights([direction], True), ball_over_plane, points, normals, 1e-4)
     contour = ellipse(points, direction)
     clear = contour.abs() > 0.003  # the icosphere lies 0.0005 inside the ball
     assert clear.float().mean() > 0.98
@@ -63,27 +63,31 @@ def test_a_distant_lamp_casts_the_ellipse_of_a_ball(ball_over_plane, plane):
     assert 0.03 < (~found.lit).float().mean() < 0.2  # a shadow was there to be found
 
 
-def test_a_near_lamp_overhead_casts_a_wider_circle(ball_over_plane, plane):
+def test_a_near_point_light_overhead_casts_a_wider_circle(ball_over_plane, plane):
     points, normals = plane
-    lamp_height = 3.0
-    found = cast_shadows(lamps([(0, 0, lamp_height)]), ball_over_plane, points, normals, 1e-4)
-    opening = math.asin(RADIUS / (lamp_height - HEIGHT))
-    contour = points[..., :2].norm(dim=-1) - lamp_height * math.tan(opening)
+    point_light_height = 3.0
+    found = cast_shadows(
+        point_lights([(0, 0, point_light_height)]), ball_over_plane, points, normals, 1e-4
+    )
+    opening = math.asin(RADIUS / (point_light_height - HEIGHT))
+    contour = points[..., :2].norm(dim=-1) - point_light_height * math.tan(opening)
     clear = contour.abs() > 0.003
     assert (found.lit[..., 0] == (contour > 0))[clear].all()
 
 
-def test_what_stands_behind_the_lamp_casts_no_shadow(ball_over_plane, plane):
+def test_what_stands_behind_the_point_light_casts_no_shadow(ball_over_plane, plane):
     points, normals = plane
-    found = cast_shadows(lamps([(0, 0, HEIGHT - 0.6)]), ball_over_plane, points, normals, 1e-4)
+    found = cast_shadows(
+        point_lights([(0, 0, HEIGHT - 0.6)]), ball_over_plane, points, normals, 1e-4
+    )
     assert found.lit.all()
 
 
-def test_the_ball_s_own_shadow_ends_where_it_turns_from_the_lamp(ball_over_plane, generator):
+def test_the_ball_s_own_shadow_ends_where_it_turns_from_the_point_light(ball_over_plane, generator):
     normals = normalize(torch.randn(2000, 3, generator=generator, dtype=torch.float64), dim=1)
     points = RADIUS * normals + torch.tensor([0, 0, HEIGHT]).double()
     direction = normalize(torch.tensor([0.3, -0.4, 0.8]).double(), dim=0)
-    field = lamps([direction.tolist()], True)
+    field = point_lights([direction.tolist()], True)
     # Points lie off the faces by up to 0.0005: without any lift some would shade themselves.
     found = cast_shadows(field, ball_over_plane, points, normals, 1e-3, guard=1e-3)
     facing = normals @ direction
@@ -94,27 +98,34 @@ def test_the_ball_s_own_shadow_ends_where_it_turns_from_the_lamp(ball_over_plane
 
 def test_edges_nearer_than_the_guard_make_unsure_and_no_others(ball_over_plane, plane):
     points, normals = plane
-    lamp_height, guard = 3.0, 0.1
+    point_light_height, guard = 3.0, 0.1
     found = cast_shadows(
-        lamps([(0, 0, lamp_height)]), ball_over_plane, points, normals, 1e-4, guard=guard
+        point_lights([(0, 0, point_light_height)]),
+        ball_over_plane,
+        points,
+        normals,
+        1e-4,
+        guard=guard,
     )
-    contour = points[..., :2].norm(dim=-1) - lamp_height * math.tan(
-        math.asin(RADIUS / (lamp_height - HEIGHT))
+    contour = points[..., :2].norm(dim=-1) - point_light_height * math.tan(
+        math.asin(RADIUS / (point_light_height - HEIGHT))
     )
     sure = found.sure[..., 0]
     near, far = contour.abs() < 0.95 * guard, contour.abs() > 1.2 * guard  # the edge is curved
     assert near.any()
     assert not sure[near].any()
     assert sure[far].all()
-    plain = cast_shadows(lamps([(0, 0, lamp_height)]), ball_over_plane, points, normals, 1e-4)
+    plain = cast_shadows(
+        point_lights([(0, 0, point_light_height)]), ball_over_plane, points, normals, 1e-4
+    )
     assert plain.sure.all()
     assert (plain.lit == found.lit).all()
 
 
-def test_a_view_without_a_lamp_is_lit_everywhere(ball_over_plane, plane):
+def test_a_view_without_a_point_light_is_lit_everywhere(ball_over_plane, plane):
     points, normals = plane
-    dark = lamps([(0.5, 0.2, 0.9), (0, 0, 3)])
-    dark = dark.replace(lamp=dark.lamp * torch.tensor([[1.0], [0.0]]))
+    dark = point_lights([(0.5, 0.2, 0.9), (0, 0, 3)])
+    dark = dark.replace(point_light=dark.point_light * torch.tensor([[1.0], [0.0]]))
     found = cast_shadows(dark, ball_over_plane, points, -normals, 1e-4)
     assert not found.lit[..., 0].any()
     assert found.lit[..., 1].all()
@@ -123,7 +134,7 @@ def test_a_view_without_a_lamp_is_lit_everywhere(ball_over_plane, plane):
 @pytest.mark.parametrize("stride", [1, 3, 4])
 def test_sparse_rays_answer_for_their_neighbours_except_near_edges(ball_over_plane, plane, stride):
     points, normals = plane
-    field = lamps([(1.0, 0.4, 2.5), (-0.5, 0.2, 4.0)])
+    field = point_lights([(1.0, 0.4, 2.5), (-0.5, 0.2, 4.0)])
     raster = points[None, :, :150], normals[None, :, :150]  # no multiple of the stride
     spacing = torch.tensor([0.02]).double()
     dense = cast_shadows(field, ball_over_plane, *raster, 1e-4)
@@ -139,7 +150,7 @@ def test_sparse_rays_answer_for_their_neighbours_except_near_edges(ball_over_pla
 
 def test_rays_are_cast_only_where_asked(ball_over_plane, plane):
     points, normals = plane
-    field = lamps([(0, 0, 3.0)])
+    field = point_lights([(0, 0, 3.0)])
     asked = torch.zeros(1, *points.shape[:2], dtype=torch.bool)
     asked[0, 90:110] = True
     spacing = torch.tensor([0.02]).double()
@@ -154,7 +165,7 @@ def test_rays_are_cast_only_where_asked(ball_over_plane, plane):
 
 def test_rays_are_cast_only_in_views_that_show_the_sample(ball_over_plane, plane):
     points, normals = plane
-    field = lamps([(0, 0, 3.0), (0.5, 0, 3.0)])
+    field = point_lights([(0, 0, 3.0), (0.5, 0, 3.0)])
     spacing = torch.tensor([0.02]).double()
     seen = torch.zeros(1, 2, *points.shape[:2], dtype=torch.bool)
     seen[:, 0, 90:110] = True

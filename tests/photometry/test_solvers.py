@@ -30,8 +30,8 @@ SOLVERS = pytest.mark.parametrize(
 def error(found, truth, weight, least=7):
     """Largest error of shading vectors seen often enough, the ambiguity undone."""
     often = (weight.sum(dim=1) >= least).double()
-    turn = align_factorizations(found, truth, often)
-    return ((turn.on_shading(found) - truth).abs().amax(dim=1) * often).max()
+    rotation = align_factorizations(found, truth, often)
+    return ((rotation.on_shading(found) - truth).abs().amax(dim=1) * often).max()
 
 
 @SOLVERS
@@ -57,9 +57,13 @@ def test_factors_are_recovered_when_whole_blocks_are_missing(problem):
 
 def test_balm_and_descent_agree_on_clean_data(problem):
     given, _, _ = problem(missing=0.3)
-    pull = torch.full_like(given.pull, 3.0)  # a hold on the gauge, so that factors compare
+    regularization = torch.full_like(
+        given.regularization, 3.0
+    )  # a hold on the gauge, so that factors compare
     _, normals = given.manifold.split(given.shading.mT)
-    given = given.replace(pull=pull, prior=0.1 * given.manifold.bend(normals.mT))
+    given = given.replace(
+        regularization=regularization, prior=0.1 * given.manifold.bend(normals.mT)
+    )
     balm, descent = solve_balm(given, 800, 1e-8), solve_descent(given, 800, 1e-8)
     assert_close(balm.shading, descent.shading, rtol=0, atol=2e-4)
     assert_close(balm.lights, descent.lights, rtol=0, atol=2e-4)
@@ -72,7 +76,7 @@ def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
     given, _, _ = problem(patches=2, samples=40, missing=0.3)
     _, normals = given.manifold.split(given.shading.mT)
     given = given.replace(
-        pull=torch.full_like(given.pull, 3.0),
+        regularization=torch.full_like(given.regularization, 3.0),
         anchor=given.anchor + 0.1,
         prior=0.1 * given.manifold.bend(normals.mT),
     )
@@ -98,7 +102,7 @@ def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
 @SOLVERS
 def test_lights_that_are_held_stay(problem, solve):
     given, _, _ = problem()
-    held = given.replace(pull=torch.full_like(given.pull, 1e9))
+    held = given.replace(regularization=torch.full_like(given.regularization, 1e9))
     assert_close(solve(held, 40, 1e-6).lights, given.anchor, rtol=0, atol=1e-5)
     assert (solve(given, 40, 1e-6).lights - given.anchor).abs().max() > 1e-2
 
@@ -111,7 +115,7 @@ def test_robust_weights_keep_outliers_out(problem, solve, generator):
         radiance=torch.where(gross, given.radiance + 1.5, given.radiance),
         lights=lights,
         anchor=lights,
-        pull=torch.full_like(given.pull, 1e9),
+        regularization=torch.full_like(given.regularization, 1e9),
     )
     plain = (solve(given, 100, 1e-6).shading - shading).norm(dim=1).median()
     robust = solve(given.replace(loss=Cauchy()), 200, 1e-6)
@@ -137,7 +141,9 @@ def test_a_patch_is_solved_as_if_it_were_alone(problem, solve):
 
 def test_the_last_step_reaches_the_minimum_of_every_sample_and_differentiates_it(problem):
     given, lights, _ = problem(patches=1, samples=12, off=0.02)
-    given = given.replace(lights=lights, anchor=lights, pull=torch.full_like(given.pull, 1e9))
+    given = given.replace(
+        lights=lights, anchor=lights, regularization=torch.full_like(given.regularization, 1e9)
+    )
     noisy = given.radiance + 0.01 * torch.sin(torch.arange(240.0)).double().reshape(1, 20, 12)
     given = given.replace(radiance=noisy)
     found = solve_balm(given, 300, 1e-7)

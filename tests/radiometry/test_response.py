@@ -55,8 +55,8 @@ def test_a_table_is_met_at_its_entries_and_straight_between():
     curve = RESPONSES["curve"]
     wanted = (3 + 50 * (LEVELS / 255) ** 2) / 53
     assert_close(curve.linear_from_encoded(LEVELS / 255), wanted)
-    middle = curve.linear_from_encoded((LEVELS[:-1] + 0.5) / 255)
-    assert_close(middle, (wanted[1:] + wanted[:-1]) / 2)
+    centre = curve.linear_from_encoded((LEVELS[:-1] + 0.5) / 255)
+    assert_close(centre, (wanted[1:] + wanted[:-1]) / 2)
     assert curve.bits == 8
 
 
@@ -76,8 +76,8 @@ def test_data_of_fourteen_bits_saturate_where_the_table_ends():
     assert curve.bits == 16
     at = torch.tensor([16383, 16384, 65535], dtype=torch.float64) / 65535
     assert_close(curve.linear_from_encoded(at), torch.ones(3, dtype=torch.float64))
-    shares = curve_from_table(levels / 16383, levels[None])
-    assert shares.bits is None
+    fractions = curve_from_table(levels / 16383, levels[None])
+    assert fractions.bits is None
 
 
 def broken(change):

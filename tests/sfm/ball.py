@@ -19,10 +19,10 @@ def cameras_on_an_arc(count: int = 6) -> Cameras:
     poses = []
     for angle in torch.linspace(-0.5, 0.5, count, dtype=torch.float64):
         tilt = 0.15 * torch.sin(7 * angle)
-        turn = torch.linalg.matrix_exp(
+        rotation = torch.linalg.matrix_exp(
             torch.tensor([[0, 0.0, -angle], [0.0, 0, -tilt], [angle, tilt, 0]], dtype=torch.float64)
         )
-        poses.append(rigid(turn[None], torch.tensor([[0, 0, 5.0]], dtype=torch.float64))[0])
+        poses.append(rigid(rotation[None], torch.tensor([[0, 0, 5.0]], dtype=torch.float64))[0])
     K = torch.tensor(
         [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64
     )
@@ -56,8 +56,8 @@ def photographs(cameras: Cameras, *, lit: bool = True, wall: bool = False) -> Vi
         points = centre + depth[:, None] * rays
         light = torch.ones(4, dtype=torch.float64) * torch.tensor([1.0, 0, 0, 0])
         if lit:
-            turn = torch.tensor(2.4 * view)
-            light[1:] = 0.7 * torch.stack([turn.cos(), turn.sin(), -0.5 * torch.ones(())])
+            rotation = torch.tensor(2.4 * view)
+            light[1:] = 0.7 * torch.stack([rotation.cos(), rotation.sin(), -0.5 * torch.ones(())])
             light *= 1 + 0.3 * view
         shading = (light[0] + points @ light[1:]).clamp_min(0)
         images.append(torch.where(root > 0, 0.1 * albedo(points) * shading, 0.01))
@@ -90,11 +90,11 @@ def model_of(
     points: Tensor,
     generator: torch.Generator,
     noise_px: float,
-    share: float = 1.0,
+    fraction: float = 1.0,
 ) -> SparseModel:
-    """Observe points with noise, in a share of the views."""
+    """Observe points with noise, in a fraction of the views."""
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
-    seen = torch.rand(len(points), cameras.num_views, generator=generator) < share
+    seen = torch.rand(len(points), cameras.num_views, generator=generator) < fraction
     seen[:, :2] = True
     point, view = torch.nonzero(seen, as_tuple=True)
     noise = torch.randn(len(point), 2, generator=generator, dtype=torch.float64)

@@ -6,7 +6,7 @@ from torch import Tensor
 from pimper_torch.evidence.scenes.cameras import FRONT, UP, arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras
-from pimper_torch.sfm.at_rest import Pair, Rest, find_rest
+from pimper_torch.sfm.static_background import Pair, StaticBackground, find_static_background
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0
 
@@ -44,9 +44,9 @@ class Captured:
         one, other = pair.matches.unbind(dim=1)
         return self.thing[pair.first][one] == self.thing[pair.second][other]
 
-    def rest(self) -> Rest:
+    def rest(self) -> StaticBackground:
         """Find what is at rest."""
-        return find_rest(
+        return find_static_background(
             self.keypoints, self.pairs, self.right, still_px=1.0, max_error_px=2.0, fewest=15
         )
 

@@ -32,8 +32,8 @@ def model(generator: torch.Generator, lens: Lens) -> SparseModel:
     )
     lenses = (lens, other, lens, other, lens)
     points = torch.rand(40, 3, generator=generator, dtype=torch.float64) - 0.5
-    turns = 0.2 * torch.randn(5, 3, 3, generator=generator, dtype=torch.float64)
-    rotation = torch.linalg.matrix_exp(turns - turns.mT)
+    rotations = 0.2 * torch.randn(5, 3, 3, generator=generator, dtype=torch.float64)
+    rotation = torch.linalg.matrix_exp(rotations - rotations.mT)
     shift = 0.1 * torch.randn(5, 3, generator=generator, dtype=torch.float64)
     poses = rigid(rotation, shift + torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64))
     seen = torch.rand(40, 5, generator=generator) < 0.7

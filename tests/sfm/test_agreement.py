@@ -37,11 +37,11 @@ def scene(generator):
     return model, points
 
 
-def turned(model, view, angle=0.6):
+def rotated(model, view, angle=0.6):
     """Put a view elsewhere on the arc: it looks at the ball as before."""
-    turn = torch.zeros(3, 3, dtype=torch.float64)
-    turn[0, 2], turn[2, 0] = angle, -angle
-    moved = rigid(torch.linalg.matrix_exp(turn)[None], torch.zeros(1, 3).double())[0]
+    rotation = torch.zeros(3, 3, dtype=torch.float64)
+    rotation[0, 2], rotation[2, 0] = angle, -angle
+    moved = rigid(torch.linalg.matrix_exp(rotation)[None], torch.zeros(1, 3).double())[0]
     poses = model.cam_from_world.clone()
     poses[view] = poses[view] @ moved
     return model.replace(cam_from_world=poses)
@@ -67,8 +67,8 @@ def test_exact_matches_agree_with_their_model_through_a_bent_lens(generator):
 def test_a_view_put_elsewhere_is_told_from_its_neighbours(generator):
     model, points = scene(generator)
     pairs = pairs_of(model, points)
-    found = misplaced_views(turned(model, 3), model.names, pairs, 4.0)
-    judges = [agreement(turned(model, 3), pair, 4.0) for pair in pairs if 3 in pair.views]
+    found = misplaced_views(rotated(model, 3), model.names, pairs, 4.0)
+    judges = [agreement(rotated(model, 3), pair, 4.0) for pair in pairs if 3 in pair.views]
     assert found.keys() == {"3.png"}
     assert min(judges) <= found["3.png"] <= max(judges) < 0.5
 
@@ -92,4 +92,4 @@ def test_photographs_that_the_model_lacks_do_not_judge(generator):
     ]
     stray = pairs[0].replace(views=(0, 1), first=pairs[0].first.flip(0))
     assert misplaced_views(model, files, [stray, *pairs], 4.0) == {}
-    assert misplaced_views(turned(model, 5), files, [stray, *pairs], 4.0).keys() == {"5.png"}
+    assert misplaced_views(rotated(model, 5), files, [stray, *pairs], 4.0).keys() == {"5.png"}

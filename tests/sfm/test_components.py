@@ -59,9 +59,9 @@ def test_cameras_in_one_place_are_refused_with_what_happened_and_what_to_do():
 def test_a_view_counts_if_enough_of_its_points_are_seen_from_aside(model):
     assert count_spread_views(model, 10) == 5
     assert count_spread_views(model, 41) == 0  # more than there are
-    turned = model.cam_from_world[:, :3, :3]
+    rotated = model.cam_from_world[:, :3, :3]
     behind = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64).expand(5, 3)
-    one_place = rigid(turned, (turned @ behind[..., None])[..., 0])
+    one_place = rigid(rotated, (rotated @ behind[..., None])[..., 0])
     assert count_spread_views(model.replace(cam_from_world=one_place), 10) == 0
     # Four views in one place and one aside: only what the one sees has an angle.
     aside = one_place.clone()

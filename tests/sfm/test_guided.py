@@ -32,10 +32,10 @@ ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
 
 def features(pixels, descriptors):
     """Make features whose descriptors are angles about one axis, in degrees."""
-    turned = torch.deg2rad(torch.tensor(descriptors, dtype=torch.float64))
+    rotated = torch.deg2rad(torch.tensor(descriptors, dtype=torch.float64))
     return Features(
         pixels=torch.tensor(pixels, dtype=torch.float64),
-        descriptors=torch.stack([turned.cos(), turned.sin()], dim=1).float(),
+        descriptors=torch.stack([rotated.cos(), rotated.sin()], dim=1).float(),
     )
 
 
@@ -97,8 +97,8 @@ def test_the_kernel_finds_what_torch_finds(generator, length, planar):
     if planar:
         near = NearMappedPoints(torch.diag(torch.tensor([1.1, 0.9, 1.0]).double()), 20.0)
     else:
-        turned = torch.tensor([[1e-6, -3e-6, 0.001], [2e-6, 1e-6, -0.01], [-0.002, 0.01, 0.05]])
-        near = NearEpipolarLines(turned.double(), 5.0)
+        rotated = torch.tensor([[1e-6, -3e-6, 0.001], [2e-6, 1e-6, -0.01], [-0.002, 0.01, 0.05]])
+        near = NearEpipolarLines(rotated.double(), 5.0)
     for mine, theirs in zip(
         compiled_likeness(first, second, near), likeness(first, second, near), strict=True
     ):

@@ -111,9 +111,9 @@ def test_photographs_of_one_camera_resized_differently_no_longer_share_it(scene,
 
 def test_a_model_of_turned_photographs_is_refused(scene, views, tmp_path):
     write_model(scene, tmp_path)
-    turned = views.replace(images=views.images.mT.contiguous(), sizes_px=views.sizes_px.flip(1))
+    rotated = views.replace(images=views.images.mT.contiguous(), sizes_px=views.sizes_px.flip(1))
     with pytest.raises(InputError, match=r"b\.jpg is 60x80.*80x60.*neither cropped nor turned"):
-        Reconstruct()(turned, tmp_path)
+        Reconstruct()(rotated, tmp_path)
 
 
 def test_a_folder_without_a_model_is_refused(views, tmp_path):

@@ -8,17 +8,17 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.sfm.bundling import bundle
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.reprojection import observation_errors
-from pimper_torch.sfm.sightings import SightingSettings
+from pimper_torch.sfm.track_observations import SightingSettings
 from tests.sfm import ball
 
 SETTINGS = TrackSettings(
-    rounds=1, fewest_points=30, threads=1, sightings=SightingSettings(radius_px=8)
+    iterations=1, fewest_points=30, threads=1, track_observations=SightingSettings(radius_px=8)
 )
 
 
 def shape_error(points, truth):
-    carried = transform(similarity_between_points(points, truth), points)
-    return (carried - truth).norm(dim=1).median()
+    transferred = transform(similarity_between_points(points, truth), points)
+    return (transferred - truth).norm(dim=1).median()
 
 
 def camera_error(model, points):
@@ -35,11 +35,11 @@ def camera_error(model, points):
     return shape_error(bundle(exact, 0.5, 1, cameras=False).points_world, points)
 
 
-def found_by_features(generator, noise_px=0.5, share=0.6):
+def found_by_features(generator, noise_px=0.5, fraction=0.6):
     """Adjust the truth to noisy features: what structure from motion would give."""
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(200, generator)
-    model = ball.model_of(cameras, points, generator, noise_px, share)
+    model = ball.model_of(cameras, points, generator, noise_px, fraction)
     return cameras, points, bundle(model, 1.0, 1)
 
 
@@ -52,14 +52,14 @@ def test_cameras_come_five_times_nearer_to_the_truth_under_changing_light(genera
 def test_focal_length_comes_nearer_to_the_truth(generator):
     cameras, _, model = found_by_features(generator, noise_px=0.8)
     better = refine_tracks(
-        ball.photographs(cameras), model, dataclasses.replace(SETTINGS, rounds=2)
+        ball.photographs(cameras), model, dataclasses.replace(SETTINGS, iterations=2)
     )
     before, after = (abs(one.lenses[0].params[0] / ball.FOCAL - 1) for one in (model, better))
     assert after < before / 2
 
 
 def test_views_that_missed_a_point_are_found_to_show_it(generator):
-    cameras, _, model = found_by_features(generator, share=0.3)
+    cameras, _, model = found_by_features(generator, fraction=0.3)
     better = refine_tracks(ball.photographs(cameras), model, SETTINGS)
     assert len(better.observation_point) > 1.3 * len(model.observation_point)
     assert better.names == model.names
@@ -75,8 +75,8 @@ def test_a_view_that_shows_nothing_of_the_others_keeps_its_features_and_place(ge
     assert (better.observation_view == 4).sum() > 60
     others = [0, 1, 2, 3, 5]
     before, after = (torch.linalg.inv(one.cam_from_world)[:, :3, 3] for one in (model, better))
-    carried = transform(similarity_between_points(after[others], before[others]), after)
-    assert (carried[4] - before[4]).norm() < 0.1
+    transferred = transform(similarity_between_points(after[others], before[others]), after)
+    assert (transferred[4] - before[4]).norm() < 0.1
 
 
 def test_without_texture_everything_stays_as_it_was(generator):
@@ -88,7 +88,9 @@ def test_without_texture_everything_stays_as_it_was(generator):
 
 def test_no_rounds_leave_the_model_alone(generator):
     cameras, _, model = found_by_features(generator)
-    same = refine_tracks(ball.photographs(cameras), model, dataclasses.replace(SETTINGS, rounds=0))
+    same = refine_tracks(
+        ball.photographs(cameras), model, dataclasses.replace(SETTINGS, iterations=0)
+    )
     assert same is model
 
 
@@ -96,8 +98,10 @@ def test_bundling_leads_exact_observations_back_to_the_truth(generator):
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(100, generator)
     exact = ball.model_of(cameras, points, generator, noise_px=0.0)
-    turns = 0.01 * torch.randn(6, 3, 3, generator=generator, dtype=torch.float64)
-    off = rigid(torch.linalg.matrix_exp(turns - turns.mT), torch.full((6, 3), 0.02).double())
+    rotations = 0.01 * torch.randn(6, 3, 3, generator=generator, dtype=torch.float64)
+    off = rigid(
+        torch.linalg.matrix_exp(rotations - rotations.mT), torch.full((6, 3), 0.02).double()
+    )
     moved = exact.replace(
         cam_from_world=off @ exact.cam_from_world,
         points_world=points + 0.02 * torch.randn(points.shape, generator=generator).double(),

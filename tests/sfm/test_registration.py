@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from pimper_torch.sfm import registration
-from pimper_torch.sfm.at_rest import Rest
 from pimper_torch.sfm.mapping import MapSettings
 from pimper_torch.sfm.matching import MatchSettings, VerifiedPair, all_pairs
 from pimper_torch.sfm.model import select_views
 from pimper_torch.sfm.registration import RegistrationSettings, register
+from pimper_torch.sfm.static_background import StaticBackground
 from pimper_torch.sfm.workspace import Workspace
 
 MATCHING = MatchSettings(max_ratio=0.8, max_error_px=2.0, min_inliers=15, seed=0, threads=1)
@@ -45,7 +45,9 @@ def told(model, monkeypatch):
 
     def tell(numbers, misplaced=()):
         answers = Told([select_views(model, some) for some in numbers], misplaced)
-        rest = Rest(features=(), still_share=0.0, moving_pairs=0, violating_share=0.0)
+        rest = StaticBackground(
+            features=(), still_fraction=0.0, moving_pairs=0, violating_fraction=0.0
+        )
         pairs = [
             VerifiedPair(
                 views=pair,

@@ -35,8 +35,8 @@ def test_steps_lie_in_the_plane_and_are_about_a_pixel_of_the_reference(generator
         cameras.cam_from_world,
         cameras.intrinsics,
     )
-    middle, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
-    sides = moved.reshape(6, -1, 2, 2) - middle[:, :, None]
+    centre, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    sides = moved.reshape(6, -1, 2, 2) - centre[:, :, None]
     sides = sides[planes.reference, torch.arange(len(points))]
     area = torch.linalg.det(sides).abs()
     assert ((area > 0.7) & (area < 1.3)).all()

@@ -18,7 +18,7 @@ QUICK = ReconstructConfig(
     affine_shape=False,
     guided_pairs=0,
     starts=0,
-    track_rounds=0,
+    track_iterations=0,
     threads=1,
 )
 
@@ -50,7 +50,7 @@ def photographs(scene, chosen):
 
 def furnished(solid, **changes):
     settings = {"num_views": 24, "width": 320, "height": 240, "path": "turntable"}
-    fixed = {"fixed_lamp": True, "fixed_room": True}
+    fixed = {"fixed_point_light": True, "fixed_room": True}
     return build_scene(solid, SceneConfig(**(settings | fixed | changes)))
 
 

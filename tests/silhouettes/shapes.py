@@ -36,7 +36,7 @@ def silhouettes_of(
         masks.append(nearest_to(distance, cameras.centers_world[view], rays, reach)[0] < 0)
     return Silhouettes(
         inside=torch.stack(masks).reshape(-1, HEIGHT, WIDTH).double(),
-        trusted=torch.ones(len(masks), dtype=torch.bool),
+        reliable=torch.ones(len(masks), dtype=torch.bool),
         source="masks",
     )
 
@@ -46,10 +46,10 @@ def nearest_to(
 ) -> tuple[Tensor, Tensor]:
     """Give the smallest distance along rays within a ball about the origin, and where it is."""
     rays = normalize(rays, dim=-1)
-    middle = -(centers * rays).sum(dim=-1)
+    centre = -(centers * rays).sum(dim=-1)
     best, place = None, None
     for step in torch.linspace(-reach, reach, 121).to(rays):
-        points = centers + (middle + step)[:, None] * rays
+        points = centers + (centre + step)[:, None] * rays
         found = distance(points)
         if best is None or place is None:
             best, place = found, points

@@ -79,4 +79,4 @@ def test_the_agreement_counts_pixels():
     assert_close(found.overlap[:3], torch.tensor([1 / 3, 0, 1], dtype=torch.float64))
     assert_close(found.covered[:3], torch.tensor([0.5, 0, 1], dtype=torch.float64))
     assert_close(found.extent[:3], torch.tensor([0.2, 0, 0.2], dtype=torch.float64))
-    assert found.trusted(0.9).tolist() == [False, False] + [True] * 6
+    assert found.reliable(0.9).tolist() == [False, False] + [True] * 6

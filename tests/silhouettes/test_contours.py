@@ -23,7 +23,7 @@ def test_contours_of_a_ball_touch_it(cameras):
     found = contours.touching(points, points)
     assert len(found.points_world) > 0.9 * len(contours.rays.view)
     assert (found.points_world.norm(dim=1) - 1).abs().median() < 0.5 * PIXEL
-    # Deep in the middle, and out of it beside the ball.
+    # Deep in the centre, and out of it beside the ball.
     depth = contours.hull.depth_of(torch.tensor([[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]]))
     assert depth[0] > 0.9
     assert depth[1] < -0.1

@@ -14,7 +14,7 @@ from pimper_torch.silhouettes.find import (
     SilhouetteDetails,
     masked,
 )
-from pimper_torch.silhouettes.ground import Plane, gaze, supporting_plane
+from pimper_torch.silhouettes.ground import Plane, fixation, supporting_plane
 from pimper_torch.silhouettes.parallax import plane_agreement
 from pimper_torch.silhouettes.pictures import working_pictures
 
@@ -29,7 +29,7 @@ def test_a_ball_on_a_table_is_found_in_every_view(staged):
     silhouettes = FindSilhouettes(*SMALL)(staged.scene)
     assert silhouettes is not None
     assert silhouettes.source == "found"
-    assert silhouettes.trusted.all()
+    assert silhouettes.reliable.all()
     # A pixel more all round the ball of 50 pixels is 0.96; the table or its shadow is far less.
     assert overlap(silhouettes.masks, staged.truth).min() > 0.95
 
@@ -65,7 +65,7 @@ def test_masks_that_are_given_are_believed(staged):
     silhouettes = FindSilhouettes()(scene)
     assert silhouettes is not None
     assert silhouettes.source == "masks"
-    assert silhouettes.trusted.all()
+    assert silhouettes.reliable.all()
     assert torch.equal(silhouettes.masks, drawn)
     assert masked(scene, silhouettes) is scene
     assert FindSilhouettes(SilhouetteConfig(object="everything"))(scene).source == "everything"
@@ -85,16 +85,18 @@ def test_silhouettes_that_contradict_one_another_are_not_trusted(staged):
         assert FindSilhouettes(*SMALL)(scene).source == "everything"
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(staged, monkeypatch, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.5])
+def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
+    staged, monkeypatch, fraction
+):
     """Cuts that meet the hull's projections by chance, or not at all, are no silhouettes."""
     projections = torch.full(staged.truth.shape, -5.0)
     projections[:, 60:120, 60:180] = 5.0
     masks = torch.zeros_like(staged.truth)
-    masks[:, 60:120, 180 - int(share * 120) : 240] = True
+    masks[:, 60:120, 180 - int(fraction * 120) : 240] = True
     nonsense = Cuts(masks=masks, margins_px=projections, on_plane=True)
-    monkeypatch.setattr(find, "cut_in_rounds", lambda *_, **__: nonsense)
-    overlap_percent = 100 * (share * 120 * 60) / ((240 - 60) * 60)
+    monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: nonsense)
+    overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
     with pytest.warns(PimperWarning, match=f"by {overlap_percent:.0f}% in the median"):
         assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
 
@@ -106,7 +108,7 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
     masks = projections > 0
     masks[:7, 60:120, 60:205] = True  # overlap 0.83, of which 0.83 is inside
     cuts = Cuts(masks=masks, margins_px=projections, on_plane=False)
-    monkeypatch.setattr(find, "cut_in_rounds", lambda *_, **__: cuts)
+    monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: cuts)
     with pytest.warns(PimperWarning, match="only 5 of 12 silhouettes agree"):
         assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
 
@@ -124,11 +126,11 @@ def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
     images = torch.where(hidden[:, None], other, views.images)
     pictures = working_pictures(views.replace(images=images), cameras, 240)
     plane = Plane(normal_world=torch.tensor([0.0, 0, 1]), offset=torch.tensor(0.0))
-    looked_at = gaze(pictures.cameras)
+    looked_at = fixation(pictures.cameras)
     before = plane_agreement(pictures, plane, looked_at)
     after = plane_agreement(pictures, plane, looked_at, hidden)
-    middle = (away < 8) & after.isfinite()  # not where the table is flat
-    seen, covered = middle & (torch.arange(12) >= 8)[:, None, None], middle & hidden
+    centre = (away < 8) & after.isfinite()  # not where the table is flat
+    seen, covered = centre & (torch.arange(12) >= 8)[:, None, None], centre & hidden
     assert seen.sum() > 400
     assert (before[seen] > 0.75).float().mean() < 0.4  # what hides it counts for it
     assert (after[seen] > 0.75).float().mean() > 0.9
@@ -173,6 +175,6 @@ def test_points_without_a_plane_have_none(generator):
 
 
 def test_cameras_look_where_they_are_aimed(staged):
-    found = gaze(staged.scene.cameras)
+    found = fixation(staged.scene.cameras)
     assert_close(found.fixation_world, torch.tensor([0.0, 0.0, 0.4]), atol=0.01, rtol=0)
     assert_close(found.distance, torch.tensor(3.0), atol=0.01, rtol=0)

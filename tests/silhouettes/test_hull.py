@@ -33,7 +33,7 @@ def ball_silhouettes(cameras: Cameras, radius: float = 1.0) -> Silhouettes:
     passing = torch.linalg.cross(rays, eyes.expand_as(rays)).norm(dim=-1)
     inside = (passing < radius).float().reshape(-1, height, width)
     return Silhouettes(
-        inside=inside, trusted=torch.ones(len(inside), dtype=torch.bool), source="masks"
+        inside=inside, reliable=torch.ones(len(inside), dtype=torch.bool), source="masks"
     )
 
 
@@ -95,9 +95,9 @@ def test_a_view_that_is_wrong_is_outvoted_or_left_out(cameras):
     voted = visual_hull(
         silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=32**3, disagreeing=0.05
     )
-    trusted = silhouettes.trusted.clone()
-    trusted[3] = False
-    untrusted = silhouettes.replace(inside=wrong, trusted=trusted)
+    reliable = silhouettes.reliable.clone()
+    reliable[3] = False
+    untrusted = silhouettes.replace(inside=wrong, reliable=reliable)
     left_out = visual_hull(untrusted, cameras, BOX, num_voxels=32**3, disagreeing=0.0)
     assert left_out is not None
     assert voted is not None

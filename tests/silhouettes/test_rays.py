@@ -38,9 +38,9 @@ def test_normals_lie_across_their_rays(of_ball):
 def test_the_inner_silhouette_of_a_ring_faces_into_its_hole(cameras):
     above = torch.tensor([cameras.centers_world[:, 2].argmax()])
     silhouettes = silhouettes_of(ring, cameras)
-    only = torch.zeros_like(silhouettes.trusted)
+    only = torch.zeros_like(silhouettes.reliable)
     only[above] = True
-    rays = contour_rays(silhouettes.replace(trusted=only), cameras)
+    rays = contour_rays(silhouettes.replace(reliable=only), cameras)
     assert bool((rays.view == above).all())
     centers = cameras.centers_world[rays.view]
     _, touching = nearest_to(ring, centers, rays.rays_world)
@@ -66,11 +66,11 @@ def test_borders_specks_corners_and_untrusted_views_have_no_rays(cameras):
     inside = torch.zeros_like(blank.inside)
     inside[:, :50, 40:80] = 1  # runs out of the picture at the top
     inside[:, 70:73, 100:103] = 1  # a speck
-    rays = contour_rays(blank.replace(inside=inside, trusted=blank.trusted & False), cameras)
+    rays = contour_rays(blank.replace(inside=inside, reliable=blank.reliable & False), cameras)
     assert len(rays.view) == 0
-    trusted = blank.trusted.clone()
-    trusted[1:] = False
-    rays = contour_rays(blank.replace(inside=inside, trusted=trusted), cameras)
+    reliable = blank.reliable.clone()
+    reliable[1:] = False
+    rays = contour_rays(blank.replace(inside=inside, reliable=reliable), cameras)
     u, v = rays.pixels.unbind(dim=1)
     assert bool((v >= 3).all())
     assert float(u.max()) < 90
@@ -79,7 +79,7 @@ def test_borders_specks_corners_and_untrusted_views_have_no_rays(cameras):
     concave = torch.zeros_like(inside)
     concave[:, 20:80, 30:90] = 1
     concave[:, 20:50, 30:60] = 0
-    rays = contour_rays(blank.replace(inside=concave, trusted=trusted), cameras)
+    rays = contour_rays(blank.replace(inside=concave, reliable=reliable), cameras)
     from_corner = (rays.pixels - torch.tensor([60.0, 50.0]).double()).norm(dim=1)
     assert from_corner.min() > 3
     assert from_corner.min() < 8

@@ -44,11 +44,13 @@ def test_contour_points_of_a_ball_are_its_contour(cameras):
 
 
 def test_contour_points_of_a_ring_lie_on_it_also_inside_its_hole(cameras):
-    turn, roll = (
+    rotation, roll = (
         2 * torch.pi * torch.rand(2, 4000, generator=torch.Generator().manual_seed(2)).double()
     )
-    outward = torch.stack([turn.cos() * roll.cos(), turn.sin() * roll.cos(), roll.sin()], dim=1)
-    core = 0.9 * torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], dim=1)
+    outward = torch.stack(
+        [rotation.cos() * roll.cos(), rotation.sin() * roll.cos(), roll.sin()], dim=1
+    )
+    core = 0.9 * torch.stack([rotation.cos(), rotation.sin(), torch.zeros_like(rotation)], dim=1)
     rays, found = touched(ring, cameras, core + 0.35 * outward, outward)
     assert len(found.ray) > 0.9 * len(rays.view)
     assert ring(found.points_world).abs().quantile(0.95) < 1.5 * PIXEL

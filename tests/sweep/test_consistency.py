@@ -54,7 +54,7 @@ def test_one_view_in_shadow_hardly_shifts_the_others_cost(shading):
     scale = torch.full((5,), 0.02, dtype=torch.float64)
     radiance = 0.5 * shading[..., None].repeat(1, 1, 1)
     radiance[:, 0] = 0
-    robust = inconsistency(radiance, shading, all_seen(), scale, rounds=8)
+    robust = inconsistency(radiance, shading, all_seen(), scale, iterations=8)
     alone = inconsistency(radiance[:, :1], shading[:, :1], all_seen()[:, :1], scale)
     assert (robust > 1).all()  # the shadow itself costs
     assert (alone < 1e-9).all()  # a view alone always agrees with itself
@@ -75,5 +75,5 @@ def test_costs_can_be_differentiated(generator, shading):
     radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64).requires_grad_()
     scale = torch.full((5,), 0.2, dtype=torch.float64)
     assert torch.autograd.gradcheck(
-        lambda x: inconsistency(x, shading, all_seen(), scale, rounds=200), radiance
+        lambda x: inconsistency(x, shading, all_seen(), scale, iterations=200), radiance
     )

@@ -35,9 +35,9 @@ def test_depth_and_normals_of_a_plane_are_those_of_the_formula(plane, front):
 
 
 def test_a_mesh_shows_what_it_carries(plane, front):
-    carried = torch.nn.functional.normalize(torch.tensor([0.0, 0.6, 0.8]), dim=0).expand(4, 3)
+    transferred = torch.nn.functional.normalize(torch.tensor([0.0, 0.6, 0.8]), dim=0).expand(4, 3)
     height = plane.vertices_world[:, 1:2]
-    mesh = plane.replace(normals_world=carried, albedo=height, confidence=height[:, 0])
+    mesh = plane.replace(normals_world=transferred, albedo=height, confidence=height[:, 0])
     maps = view_maps(mesh, front, 0)
     assert_close(maps.normals_cam[6, 8], torch.tensor([0.0, -0.6, -0.8]))
     assert maps.albedo.shape == (12, 16, 1)

@@ -43,8 +43,8 @@ def test_a_grey_result_without_normals_and_albedo_is_drawn_too(reconstruction, t
 def test_silhouettes_are_drawn_over_the_photograph_and_all_views_below(reconstruction, tmp_path):
     inside = torch.zeros(3, 40, 60)
     inside[:, 10:30, 20:40] = 1.0
-    trusted = torch.tensor([True, False, True])
-    silhouettes = Silhouettes(inside=inside, trusted=trusted, source="found")
+    reliable = torch.tensor([True, False, True])
+    silhouettes = Silhouettes(inside=inside, reliable=reliable, source="found")
     outlined = reconstruction.replace(silhouettes=silhouettes)
     shown = panels(outlined, 60)[0]
     assert shown.inside.shape == shown.picture.shape[:2]
@@ -64,7 +64,7 @@ def test_silhouettes_are_drawn_over_the_photograph_and_all_views_below(reconstru
 def test_an_silhouette_without_border_is_not_drawn(reconstruction, tmp_path):
     """Matplotlib would warn of a contour that is not there."""
     silhouettes = Silhouettes(
-        inside=torch.ones(3, 40, 60), trusted=torch.ones(3, dtype=torch.bool), source="masks"
+        inside=torch.ones(3, 40, 60), reliable=torch.ones(3, dtype=torch.bool), source="masks"
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Mesh
-from pimper_torch.viz.render import bounding_box, frame, shade, turn
+from pimper_torch.viz.render import bounding_box, frame, rotation, shade
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def square(tilt_x=0.0, tilt_y=0.0):
     )
 
 
-def test_the_lamp_is_up_on_the_left(front):
+def test_the_point_light_is_up_on_the_left(front):
     def tone(mesh):
         return shade(mesh, front)[12, 16, 0]
 
@@ -32,7 +32,7 @@ def test_the_lamp_is_up_on_the_left(front):
     assert tone(square(tilt_y=-0.4)) > tone(square()) > tone(square(tilt_y=0.4))
 
 
-def test_carried_normals_do_not_pretend_relief(front):
+def test_transferred_normals_do_not_pretend_height_field(front):
     flat = square()
     bumpy = flat.replace(normals_world=torch.eye(4, 3) + 0.1)
     assert torch.equal(shade(bumpy, front), shade(flat, front))
@@ -60,14 +60,14 @@ def test_flat_shading_shows_edges_that_smooth_shading_hides(front):
 
 def test_walking_to_the_right_shows_the_right_side_and_keeps_the_centre(front):
     center = torch.tensor([0.2, 0.1, -0.3])
-    turned = turn(front, center, 40.0)
+    rotated = rotation(front, center, 40.0)
     before, depth_before = project(center[None], front.cam_from_world[0], front.intrinsics[0])
-    after, depth_after = project(center[None], turned.cam_from_world[0], front.intrinsics[0])
+    after, depth_after = project(center[None], rotated.cam_from_world[0], front.intrinsics[0])
     assert_close(after, before, rtol=0, atol=1e-4)
     assert_close(depth_after, depth_before)
-    assert turned.centers_world[0, 0] > front.centers_world[0, 0] + 1
-    assert_close(turned.centers_world[0, 1], front.centers_world[0, 1])
-    assert_close(turn(turned, center, -40.0).cam_from_world, front.cam_from_world)
+    assert rotated.centers_world[0, 0] > front.centers_world[0, 0] + 1
+    assert_close(rotated.centers_world[0, 1], front.centers_world[0, 1])
+    assert_close(rotation(rotated, center, -40.0).cam_from_world, front.cam_from_world)
 
 
 def test_a_frame_holds_the_points_at_the_size_asked_for(front):

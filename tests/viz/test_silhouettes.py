@@ -3,7 +3,7 @@ from torch.testing import assert_close
 
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes, Views
-from pimper_torch.viz.silhouettes import DOUBTED, TRUSTED, border, thumbnails
+from pimper_torch.viz.silhouettes import DOUBTED, RELIABLE, border, thumbnails
 
 
 def test_the_border_of_a_square_is_its_outermost_pixels():
@@ -21,7 +21,7 @@ def test_every_view_has_its_tile_and_its_silhouette():
     for view in range(3):
         inside[view, 10:30, 20 : 30 + 10 * view] = 0.9
     silhouettes = Silhouettes(
-        inside=inside, trusted=torch.tensor([True, True, False]), source="found"
+        inside=inside, reliable=torch.tensor([True, True, False]), source="found"
     )
     views = Views(
         images=images,
@@ -32,7 +32,7 @@ def test_every_view_has_its_tile_and_its_silhouette():
     sheet = thumbnails(views, silhouettes, width_px=60, across=2)
     assert sheet.shape == (40, 60, 3)  # two rows of two tiles of 30 x 20
     assert_close(sheet[20:, 30:], torch.ones(20, 30, 3))
-    for view, colour in enumerate((TRUSTED, TRUSTED, DOUBTED)):
+    for view, colour in enumerate((RELIABLE, RELIABLE, DOUBTED)):
         top, left = 20 * (view // 2), 30 * (view % 2)
         tile = sheet[top : top + 20, left : left + 30]
         drawn = (tile - torch.tensor(colour)).abs().amax(dim=-1) < 1e-6

@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.evidence.baselines.template import Template
 from pimper_torch.geometry.frames import transform
-from pimper_torch.geometry.reliefs import sample_raster
+from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.geometry.surfaces import side_lengths
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
 from pimper_torch.records import CoarseMesh
@@ -26,10 +26,10 @@ from pimper_torch.records import CoarseMesh
 BESIDE = 0.25
 
 # Least squares re-weighted this often; the weights have settled long before.
-ROUNDS = 20
+ITERATIONS = 20
 
 # A direction that the points do not tell (all relief on one plane) is left as it is: the
-# ridge is this share of what points of unit spread would say.
+# ridge is this fraction of what points of unit spread would say.
 RIDGE = 1e-4
 
 
@@ -96,7 +96,7 @@ def bas_relief_through(
     ridge = torch.diag(design.new_tensor([RIDGE, RIDGE, RIDGE, 0])) * known.sum()
     ridge[3, 3] = 1e-12
     found = design.new_zeros(4)
-    for step in range(ROUNDS):
+    for step in range(ITERATIONS):
         residual = target - design @ found
         scale = CAUCHY_TUNING * spread(residual, known > 0)
         weight = known if step == 0 else known * cauchy_weights(residual, scale)
@@ -114,7 +114,7 @@ def apply_bas_relief(
     return template.points(relief) @ bas_relief[:3] + bas_relief[3]
 
 
-def turn_normals(
+def rotation_normals(
     bas_relief: Float[Tensor, " 4"], normals: Float[Tensor, "sample 3"]
 ) -> Float[Tensor, "sample 3"]:
     """Follow :func:`apply_bas_relief` with viewer-facing normals."""

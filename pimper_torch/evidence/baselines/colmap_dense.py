@@ -191,7 +191,7 @@ def trim_depth(num_points: int) -> float:
 
     COLMAP's own default, 10, suits clouds of ten million points; of a small one it trims all
     away. A surface has a quarter of the points on each level up, so that the same density, as
-    a share of the cloud's own, lies at 10 less the quaternary logarithm of what is missing.
+    a fraction of the cloud's own, lies at 10 less the quaternary logarithm of what is missing.
 
     >>> trim_depth(10_000_000)
     10.0

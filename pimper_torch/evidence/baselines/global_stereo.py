@@ -15,7 +15,7 @@ from pimper_torch.evidence.baselines.anchoring import (
     bas_relief_through,
     look_up,
     points_on,
-    turn_normals,
+    rotation_normals,
 )
 from pimper_torch.evidence.baselines.one_matrix import Whole, as_problem, chunks, solve_whole
 from pimper_torch.evidence.baselines.template import (
@@ -133,9 +133,9 @@ class GlobalStereo(Stage):
        bring the relief nearest to the sparse points (the published alignment gives every
        patch that freedom, so the whole object gets it too).
 
-    What limits it: one light for the whole object is wrong under a near lamp, and shadows and
-    highlights are not weighed; lights that are free to follow such errors do. (On a rendered
-    glossy jar under a near lamp, normals under lights fitted to the mesh are 11 degrees off
+    What limits it: one light for the whole object is wrong under a near point light, and shadows
+    and highlights are not weighed; lights that are free to follow such errors do. (On a rendered
+    glossy jar under a near point light, normals under lights fitted to the mesh are 11 degrees off
     the truth; while the factorization lowers its residual from 0.060 to 0.054 they go to 22,
     and stay there with the Lorentz transformation that fits the truth best.) All views are
     registered on flat facets and never again; integration runs over depth discontinuities.
@@ -198,7 +198,7 @@ class GlobalStereo(Stage):
             steps = config.integration_steps if last else 0
             relief = _integrated(template, found, config.max_tilt_deg, steps)
             through = bas_relief_through(points, look_up(template, relief, points))
-            normals = turn_normals(through, found.normals)
+            normals = rotation_normals(through, found.normals)
         depth = apply_bas_relief(through, template, relief)
         return found.replace(normals=normals), depth
 
@@ -231,7 +231,7 @@ def fit_distant_lights(
     See :func:`~pimper_torch.photometry.lights.fit_light_field`.
 
     Returns:
-        First-order lights in the frame of the normals, of what faces the lamp.
+        First-order lights in the frame of the normals, of what faces the point light.
     """
     field = fit_light_field(radiance, seen, normals)
     return field.lights_at(field.origin[None])[0]

@@ -41,7 +41,7 @@ from pimper_torch.evidence.baselines.template import (
     registered_views,
     surface_of,
 )
-from pimper_torch.geometry.reliefs import sample_raster
+from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.paper.integrate import integrate_normals
 from pimper_torch.patches.warp import WarpConfig
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, Record, SparseScene
@@ -94,14 +94,14 @@ class Lim(Stage):
     """Photometric stereo on views registered by the surface, and the surface from it, in turn.
 
     A round registers all views on the present surface (first the facets through the sparse
-    points), factorizes what it sees under one distant lamp a view (rank three: no ambient
+    points), factorizes what it sees under one distant point light a view (rank three: no ambient
     light), finds the factors' 3 x 3 ambiguity, integrates the normals, and takes the relief
     for the next surface. The depths of the sparse points fix the ambiguity, and the distance.
 
     Where the paper leaves room, this is our reading:
 
     - the surface is a relief over the reference view, orthographic along the line of sight to
-      its middle, with one vertex a sample, instead of facets of a triangulation;
+      its centre, with one vertex a sample, instead of facets of a triangulation;
     - views contribute where the surface's visibility test, dark and saturation levels and a
       limit of tilt let them (the published short baselines need none of it), and the factors
       are fitted to these by alternating least squares; samples seen too seldom are filled in
@@ -117,7 +117,7 @@ class Lim(Stage):
       real clouds may be wrong;
     - rounds go from a quarter of the resolution to the whole.
 
-    What limits it: ambient light, a near lamp and interreflection are no rank-three matrix;
+    What limits it: ambient light, a near point light and interreflection are no rank-three matrix;
     cast shadows and highlights are not foreseen; integration runs over depth discontinuities.
 
     Not differentiable. Peak memory is 5 bytes for every sample and view beside the views.
@@ -149,7 +149,7 @@ class Lim(Stage):
             points = points_on(template, scene.points_world, coarse)
             occluder = coarse.mesh
             if found is not None:
-                template = carried(found, template)
+                template = transferred(found, template)
                 occluder = thinned(template)
             seen = (template, scene.views, scene.cameras, occluder, config.warp)
             matrix = register(*seen)
@@ -267,7 +267,7 @@ def facing(factors: Rank3, often: Bool[Tensor, " sample"]) -> Rank3:
     return Rank3(lights=sign * factors.lights, vectors=sign * factors.vectors)
 
 
-def carried(found: Round, template: Template) -> Template:
+def transferred(found: Round, template: Template) -> Template:
     """Carry a relief over to the raster of the next round, which has the same frame."""
     places = template.points(template.depth).reshape(-1, 3)
     depth = look_up(found.template, found.depth, places).reshape(template.depth.shape)

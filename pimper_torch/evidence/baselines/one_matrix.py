@@ -61,7 +61,7 @@ def as_problem(
         lights=lights[None],
         anchor=lights[None],
         shading=shading[None],
-        pull=views,
+        regularization=views,
     )
 
 
@@ -84,7 +84,7 @@ def solve_whole(
         shading: Where ``N`` starts, columns on the cone.
         max_iterations: Steps at most.
         tolerance: It is done when in one step neither ``N`` nor its distance from the cone
-            changed or remained by more than this share of its length.
+            changed or remained by more than this fraction of its length.
         steps_before: Taken on a part of the samples; the penalty goes on from there.
     """
     shading, multiplier = shading.clone(), torch.zeros_like(shading)
@@ -92,7 +92,7 @@ def solve_whole(
     num_seen = max(int(matrix.seen.any(dim=0).sum()), 1)
     size = (lights**2).sum()
     for step in range(max_iterations):
-        share = min(PENALTY_START * PENALTY_GROWTH ** (steps_before + step), PENALTY_CAP)
+        fraction = min(PENALTY_START * PENALTY_GROWTH ** (steps_before + step), PENALTY_CAP)
         # The mean trace of the samples' equations, without a walk through the samples.
         trace = (count * (lights.double() ** 2).sum(dim=1)).sum() / (4 * num_seen)
         packed = lights.new_zeros(1, 10, len(lights), dtype=torch.float64)
@@ -101,7 +101,7 @@ def solve_whole(
         for part in chunks(shading.shape[1]):
             problem = as_problem(matrix.columns(part), lights, shading[:, part])
             A, b = equations_of_samples(problem, problem.lights, problem.weight)
-            penalty = float(share * trace)
+            penalty = float(fraction * trace)
             A[:, diagonal(4)] += penalty
             old, held = problem.shading, multiplier[None, :, part]
             free = solve_packed(A, b + penalty * (old - held))

@@ -154,7 +154,7 @@ def projections(cameras: Cameras, level: int) -> Float[Tensor, "view 3 4"]:
 
     PMVS2 counts pixels from the centre of the top-left one. Climbing its pyramid it halves
     coordinates, as if centres stayed centres, while it averages pixels :math:`2x-1` to
-    :math:`2x+2`, whose middle is :math:`2x + 1/2`. Pixel :math:`u`, counted from the corner,
+    :math:`2x+2`, whose centre is :math:`2x + 1/2`. Pixel :math:`u`, counted from the corner,
     lies at :math:`u / 2^l - 1/2` on level ``l``; so :math:`u - 2^l / 2` is written, to be right
     on the level that it works on.
     """

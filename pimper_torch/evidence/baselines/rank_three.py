@@ -1,6 +1,6 @@
 r"""Rank-three photometric stereo: factors of a masked matrix, and what integrability tells.
 
-A distant lamp a view and no ambient light make :math:`J = L B` with L F x 3 and the columns
+A distant point light a view and no ambient light make :math:`J = L B` with L F x 3 and the columns
 of B albedo times normal. The factors are found up to an invertible 3 x 3 matrix
 :math:`B = A \hat B`; that the normals are those of a surface leaves of it a generalised
 bas-relief transformation, which known depths fix.
@@ -76,9 +76,9 @@ def factorize_rank_three(
         ridge = 1e-9 * packed[diagonal(3)].sum(dim=0).amax()
         packed[diagonal(3)] += ridge
         lights = solve_packed(packed, ((weight * J) @ vectors.mT).mT).mT
-        turned = torch.linalg.qr(lights).Q
-        change = (turned - basis @ (basis.mT @ turned)).norm()
-        basis = turned
+        rotated = torch.linalg.qr(lights).Q
+        change = (rotated - basis @ (basis.mT @ rotated)).norm()
+        basis = rotated
         if change < tolerance:
             break
     return basis.to(radiance)
@@ -144,12 +144,12 @@ def ambiguity_between_points(
     b, valid = spans.vectors.double(), spans.valid.double()
     b = b / b.norm(dim=-1, keepdim=True).clamp_min(1e-30)
     step = spans.step.double()
-    share = valid / valid.sum(dim=1, keepdim=True).clamp_min(1)
+    fraction = valid / valid.sum(dim=1, keepdim=True).clamp_min(1)
     known = valid.sum(dim=1) >= valid.shape[1] / 2
     matrix = start.double()
     towards = (valid * (b @ matrix[2])).sum()
     matrix = matrix / matrix.norm() * (-1 if towards > 0 else 1)
-    return _descended(matrix, b, share, step, known, iterations).to(spans.vectors)
+    return _descended(matrix, b, fraction, step, known, iterations).to(spans.vectors)
 
 
 def matrix_between_lights(
@@ -167,7 +167,7 @@ def matrix_between_lights(
 def _descended(
     matrix: Float[Tensor, "3 3"],
     b: Float[Tensor, "span place 3"],
-    share: Float[Tensor, "span place"],
+    fraction: Float[Tensor, "span place"],
     step: Float[Tensor, "span 3"],
     known: Bool[Tensor, " span"],
     iterations: int,
@@ -175,7 +175,7 @@ def _descended(
     """Take Levenberg and Marquardt's steps."""
     damping = 1e-3
     for round_ in range(iterations):
-        residual, slope = _residual(matrix, b, share, step, known)
+        residual, slope = _residual(matrix, b, fraction, step, known)
         if round_ % 5 == 0:
             scale = CAUCHY_TUNING * spread(residual, known)
         weight = known * cauchy_weights(residual, scale)
@@ -184,7 +184,7 @@ def _descended(
         descent = torch.linalg.solve(normal + torch.diag(ridge), slope.mT @ (weight * residual))
         moved = matrix - descent.reshape(3, 3)
         moved = moved / moved.norm()
-        after, _ = _residual(moved, b, share, step, known)
+        after, _ = _residual(moved, b, fraction, step, known)
         if (weight * after**2).sum() < (weight * residual**2).sum():
             matrix, damping = moved, max(damping / 5, 1e-9)
         else:
@@ -195,21 +195,21 @@ def _descended(
 def _residual(
     matrix: Float[Tensor, "3 3"],
     b: Float[Tensor, "span place 3"],
-    share: Float[Tensor, "span place"],
+    fraction: Float[Tensor, "span place"],
     step: Float[Tensor, "span 3"],
     known: Bool[Tensor, " span"],
 ) -> tuple[Float[Tensor, " span"], Float[Tensor, "span 9"]]:
     """Give what the slopes miss the points' depths by, and its derivative by A."""
-    turned = b @ matrix.mT
+    rotated = b @ matrix.mT
     # A place without a vector has no slope; its share is 0, but it must stay finite.
-    steepest = -(turned.norm(dim=-1) / STEEPEST).clamp_min(1e-12)
-    limited = turned[..., 2] > steepest
-    z = torch.where(limited, steepest, turned[..., 2])
-    run = (step[:, None, :2] * turned[..., :2]).sum(dim=-1)
+    steepest = -(rotated.norm(dim=-1) / STEEPEST).clamp_min(1e-12)
+    limited = rotated[..., 2] > steepest
+    z = torch.where(limited, steepest, rotated[..., 2])
+    run = (step[:, None, :2] * rotated[..., :2]).sum(dim=-1)
     rise = -run / z
-    residual = known * ((share * rise).sum(dim=1) - step[:, 2])
-    per_run = -(share / z)[..., None] * b
-    by_third = torch.where(limited[..., None], 0, (share * run / z**2)[..., None] * b).sum(dim=1)
+    residual = known * ((fraction * rise).sum(dim=1) - step[:, 2])
+    per_run = -(fraction / z)[..., None] * b
+    by_third = torch.where(limited[..., None], 0, (fraction * run / z**2)[..., None] * b).sum(dim=1)
     by_rows = step[:, :2, None] * per_run.sum(dim=1)[:, None]
     slope = torch.cat([by_rows.flatten(1), by_third], dim=1)
     return residual, known[:, None] * slope

@@ -5,7 +5,7 @@ domain, the places S minimise
 
 .. math:: \int |\Delta S|^2 + e \oint |S''|^2 + \frac{w}{e^2} \sum_v |S(v) - V_v|^2
 
-over the mesh's lattice, with e the median edge. The first term is that of a thin plate and
+over the mesh's subdivided mesh, with e the median edge. The first term is that of a thin plate and
 only knows lengths within the facets, so that creases between them cost nothing to undo; the
 second is the bending of the rim, without which harmonic functions would be free; the last
 holds the vertices. In linear finite elements: cotangents and lumped masses.
@@ -24,7 +24,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.lattice import Lattice, subdivide
+from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import (
     boundary_vertices,
     face_normals,
@@ -35,7 +35,7 @@ from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 from pimper_torch.stage import Stage
 
-# A needle's area is taken as at least this share of its longest edge squared.
+# A needle's area is taken as at least this fraction of its longest edge squared.
 _MIN_SHAPE = 1e-3
 
 # Rows, columns and values of a sparse matrix.
@@ -94,16 +94,16 @@ class Smoothed(Stage):
                 "needed. Relax the filters of `triangulate`, or bring a mesh of your own."
             )
         area = face_normals(mesh.vertices_world, mesh.faces).norm(dim=-1).sum() / 2
-        # A triangular lattice with edges s has a vertex on every sqrt(3)/2 s^2.
+        # A triangular subdivided mesh with edges s has a vertex on every sqrt(3)/2 s^2.
         spacing = (area / self.config.num_vertices * 2 / 3**0.5).sqrt()
-        lattice = subdivide(mesh.vertices_world, mesh.faces, spacing.expand(len(mesh.faces)))
+        subdivision = subdivide(mesh.vertices_world, mesh.faces, spacing.expand(len(mesh.faces)))
         weights = torch.where(coarse.is_point, self.config.fidelity, self.config.filled_fidelity)
-        vertices = thin_plate(lattice, mesh, weights.to(mesh.vertices_world))
+        vertices = thin_plate(subdivision, mesh, weights.to(mesh.vertices_world))
         return Estimate(
             mesh=Mesh(
                 vertices_world=vertices,
-                faces=lattice.faces,
-                normals_world=vertex_normals(vertices, lattice.faces),
+                faces=subdivision.faces,
+                normals_world=vertex_normals(vertices, subdivision.faces),
             ),
             names=scene.views.names,
             cameras=scene.cameras,
@@ -112,52 +112,52 @@ class Smoothed(Stage):
 
 
 def thin_plate(
-    lattice: Lattice, mesh: Mesh, weights: Float[Tensor, " corner"]
+    subdivision: Subdivision, mesh: Mesh, weights: Float[Tensor, " corner"]
 ) -> Float[Tensor, "vertex 3"]:
-    """Give the lattice's vertices their places on the surface of least bending.
+    """Give the subdivided mesh's vertices their places on the surface of least bending.
 
     Args:
-        lattice: Of the coarse mesh.
+        subdivision: Of the coarse mesh.
         mesh: The coarse mesh.
         weights: ``w`` of its vertices; one at least, in every piece, above 0.
 
     Raises:
         SingularSystemError: A piece of the mesh is held by less than it takes.
     """
-    points = lattice.points.double()
+    points = subdivision.points.double()
     corners = mesh.vertices_world.double()[mesh.faces]
     edge = side_lengths(corners).median()
-    rim = boundary_vertices(lattice.faces, len(points))
-    operator, mass = _laplacian(lattice)
+    rim = boundary_vertices(subdivision.faces, len(points))
+    operator, mass = _laplacian(subdivision)
     keep = torch.where(rim, 0, 1 / mass.sqrt())
     rows, cols, values = operator
     count = len(points)
     parts = [
         _gram((rows, cols, values * keep[rows]), count, count),
-        _gram(_rim_differences(lattice, edge), count, count),
+        _gram(_rim_differences(subdivision, edge), count, count),
     ]
-    held, target = _holders(lattice, mesh)
-    pull = weights.double()[target] / edge**2
-    diagonal = torch.zeros_like(mass).index_add(0, held, pull)
+    held, target = _holders(subdivision, mesh)
+    regularization = weights.double()[target] / edge**2
+    diagonal = torch.zeros_like(mass).index_add(0, held, regularization)
     rhs = torch.zeros_like(points).index_add(
-        0, held, pull[:, None] * mesh.vertices_world.double()[target]
+        0, held, regularization[:, None] * mesh.vertices_world.double()[target]
     )
     index = torch.arange(len(points), device=points.device)
     factor = SparseCholesky(
         torch.cat([*(rows for rows, _, _ in parts), index]),
         torch.cat([*(cols for _, cols, _ in parts), index]),
         # A thousandth of a millionth of what holds the points keeps loose rims definite.
-        torch.cat([*(values for _, _, values in parts), diagonal + 1e-9 * pull.mean()]),
+        torch.cat([*(values for _, _, values in parts), diagonal + 1e-9 * regularization.mean()]),
         size=len(points),
         what="the smoothing of the coarse mesh",
     )
-    return factor.solve(rhs + 1e-9 * pull.mean() * points).to(lattice.points)
+    return factor.solve(rhs + 1e-9 * regularization.mean() * points).to(subdivision.points)
 
 
-def _laplacian(lattice: Lattice) -> tuple[Entries, Float[Tensor, " vertex"]]:
+def _laplacian(subdivision: Subdivision) -> tuple[Entries, Float[Tensor, " vertex"]]:
     """Give the cotangent Laplacian of the flat facets, integrated, and the lumped masses."""
-    corners = lattice.points.double()[lattice.faces]
-    doubled = face_normals(lattice.points.double(), lattice.faces)
+    corners = subdivision.points.double()[subdivision.faces]
+    doubled = face_normals(subdivision.points.double(), subdivision.faces)
     opposite = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
     least = _MIN_SHAPE * opposite.square().sum(dim=-1).amax(dim=1)
     area = torch.maximum(doubled.norm(dim=-1) / 2, least)
@@ -165,10 +165,12 @@ def _laplacian(lattice: Lattice) -> tuple[Entries, Float[Tensor, " vertex"]]:
         normalize(doubled, dim=-1)[:, None].expand_as(opposite), opposite
     )
     blocks = (gradients @ gradients.mT) / (4 * area)[:, None, None]
-    rows = lattice.faces[:, :, None].expand_as(blocks).flatten()
-    cols = lattice.faces[:, None, :].expand_as(blocks).flatten()
-    share = (area / 3).repeat_interleave(3)
-    mass = share.new_zeros(len(lattice.points)).index_add(0, lattice.faces.flatten(), share)
+    rows = subdivision.faces[:, :, None].expand_as(blocks).flatten()
+    cols = subdivision.faces[:, None, :].expand_as(blocks).flatten()
+    fraction = (area / 3).repeat_interleave(3)
+    mass = fraction.new_zeros(len(subdivision.points)).index_add(
+        0, subdivision.faces.flatten(), fraction
+    )
     return (rows, cols, blocks.flatten()), mass
 
 
@@ -187,23 +189,23 @@ def _gram(
     )
 
 
-def _rim_differences(lattice: Lattice, edge: Float[Tensor, ""]) -> Entries:
+def _rim_differences(subdivision: Subdivision, edge: Float[Tensor, ""]) -> Entries:
     """Give the second differences along the rim, scaled to the plate's units."""
-    ends = _rim_edges(lattice.faces)
-    count = len(lattice.points)
+    ends = _rim_edges(subdivision.faces)
+    count = len(subdivision.points)
     # Every vertex of the rim with one edge in and one out has a second difference.
     following = torch.full((count,), -1, device=ends.device).index_put((ends[:, 0],), ends[:, 1])
     preceding = torch.full((count,), -1, device=ends.device).index_put((ends[:, 1],), ends[:, 0])
     degree = torch.bincount(ends.flatten(), minlength=count)
-    (middle,) = ((degree == 2) & (following >= 0) & (preceding >= 0)).nonzero(as_tuple=True)
-    before, after = preceding[middle], following[middle]
-    points = lattice.points.double()
-    back = (points[middle] - points[before]).norm(dim=-1)
-    ahead = (points[after] - points[middle]).norm(dim=-1)
+    (centre,) = ((degree == 2) & (following >= 0) & (preceding >= 0)).nonzero(as_tuple=True)
+    before, after = preceding[centre], following[centre]
+    points = subdivision.points.double()
+    back = (points[centre] - points[before]).norm(dim=-1)
+    ahead = (points[after] - points[centre]).norm(dim=-1)
     root = (edge * 2 / (back + ahead)).sqrt()
     values = torch.stack([root / back, -root * (1 / back + 1 / ahead), root / ahead])
-    columns = torch.stack([before, middle, after])
-    return middle.expand(3, -1).flatten(), columns.flatten(), values.flatten()
+    columns = torch.stack([before, centre, after])
+    return centre.expand(3, -1).flatten(), columns.flatten(), values.flatten()
 
 
 def _rim_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
@@ -215,8 +217,10 @@ def _rim_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
     return directed[counts[index] == 1]
 
 
-def _holders(lattice: Lattice, mesh: Mesh) -> tuple[Int[Tensor, " held"], Int[Tensor, " held"]]:
-    """Find the lattice's vertices that are vertices of the coarse mesh, and which."""
-    (held,) = (lattice.barycentric == 1).any(dim=1).nonzero(as_tuple=True)
-    slot = lattice.barycentric[held].argmax(dim=1)
-    return held, mesh.faces[lattice.facet[held], slot]
+def _holders(
+    subdivision: Subdivision, mesh: Mesh
+) -> tuple[Int[Tensor, " held"], Int[Tensor, " held"]]:
+    """Find the subdivided mesh's vertices that are vertices of the coarse mesh, and which."""
+    (held,) = (subdivision.barycentric == 1).any(dim=1).nonzero(as_tuple=True)
+    slot = subdivision.barycentric[held].argmax(dim=1)
+    return held, mesh.faces[subdivision.facet[held], slot]

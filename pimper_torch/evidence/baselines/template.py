@@ -2,7 +2,7 @@
 
 The baselines that factorize the whole object as one matrix need one raster instead of one a
 facet. It is orthographic and faces the reference camera: x and y as in its image, z along the
-line from the camera to the middle of the mesh, so that slopes, integration and registration
+line from the camera to the centre of the mesh, so that slopes, integration and registration
 are those of the facets' templates. Samples that one another hide are not there twice: each
 ray along z keeps its first hit, as in a z-buffer.
 """
@@ -139,7 +139,7 @@ class Matrix(Record):
     normals: Float[Tensor, "sample 3"]
 
     @property
-    def missing_share(self) -> float:
+    def missing_fraction(self) -> float:
         """How much of J is missing."""
         return 1 - float(self.seen.sum(dtype=torch.int64)) / self.seen.numel()
 
@@ -315,12 +315,12 @@ def raster_faces(
 def _frame(
     vertices: Float[Tensor, "vertex 3"], cameras: Cameras, reference: int
 ) -> Float[Tensor, "4 4"]:
-    middle = (vertices.amax(dim=0) + vertices.amin(dim=0)) / 2
-    z = normalize(middle - cameras.centers_world[reference], dim=0)
+    centre = (vertices.amax(dim=0) + vertices.amin(dim=0)) / 2
+    z = normalize(centre - cameras.centers_world[reference], dim=0)
     x_cam = cameras.cam_from_world[reference, 0, :3]
     x = normalize(x_cam - (x_cam @ z) * z, dim=0)
     rotation = torch.stack([x, torch.linalg.cross(z, x), z])
-    return rigid(rotation, -(rotation @ middle))
+    return rigid(rotation, -(rotation @ centre))
 
 
 def _tiles(template: Template) -> list[tuple[Templates, slice, slice]]:

@@ -48,13 +48,13 @@ def _with_common(row: Row, path: Path, common: Covered, maps: Capture) -> Row:
     met = meet_truth(mesh, identity, maps, 0)
     assert met is not None  # as when it was measured
     met = met.only(common)
-    share = 100 * met.coverage
+    fraction = 100 * met.coverage
     if not met.both.any():
-        return row.replace(common_percent=share)
+        return row.replace(common_percent=fraction)
     figures = figures_of(met, mesh, identity, maps, 0)
-    normals, shape = figures.carried_normals, figures.shape_normals
+    normals, shape = figures.transferred_normals, figures.shape_normals
     return row.replace(
-        common_percent=share,
+        common_percent=fraction,
         common_relative_error=figures.relative_error,
         common_mean_normal_deg=normals.mean_deg if normals else None,
         common_median_normal_deg=normals.median_deg if normals else None,

@@ -37,7 +37,7 @@ class BenchConfig:
             colmap-dense.
         masks: Give the methods the true masks of the object; without, they see the table too.
         cameras: found by structure from motion, once a scene and the same for all methods; by
-            its features alone (``reconstruct.track_rounds: 0``); or the true ones with a true
+            its features alone (``reconstruct.track_iterations: 0``); or the true ones with a true
             cloud.
         seed: Of scenes and samples.
         samples: On each surface, for distances between surfaces.

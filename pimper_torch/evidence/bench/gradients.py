@@ -75,10 +75,10 @@ class Probe:
 def small_scene(
     seed: int = 31, num_views: int = 6, width: int = 64, num_points: int = 24
 ) -> tuple[SparseScene, CoarseMesh]:
-    """Give photographs of a speckled sphere under wandering lamps, its cloud, and facets.
+    """Give photographs of a speckled sphere under wandering point lights, its cloud, and facets.
 
     Args:
-        seed: Of lamps, speckle and cloud.
+        seed: Of point lights, speckle and cloud.
         num_views: Photographs.
         width: Of them in pixels; three quarters as high.
         num_points: Of the cloud that become vertices of facets.
@@ -92,9 +92,11 @@ def small_scene(
         distance=3.0,
         span_deg=40.0,
     )
-    lamps = wandering_lights(num_views, generator, distance=5.0, spread_deg=35.0, irradiance=0.6)
+    point_lights = wandering_lights(
+        num_views, generator, distance=5.0, spread_deg=35.0, irradiance=0.6
+    )
     texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
-    rendered = render_shape(Sphere(), cameras, lamps.harmonics_world(), texture)
+    rendered = render_shape(Sphere(), cameras, point_lights.harmonics_world(), texture)
     scene = sparse_scene(rendered, 120, generator, dtype=torch.float64)
     coarse: CoarseMesh = Triangulate(TriangulateConfig(num_points=num_points))(scene)
     return scene, coarse
@@ -148,9 +150,9 @@ def probes(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str,
 
 def moved_cameras(cameras: Cameras, motion: Float[Tensor, "view 6"]) -> Cameras:
     """Turn and shift cameras: rotation vectors, then shifts, in the cameras' frames."""
-    turn, shift = motion[:, :3], motion[:, 3:]
-    none = torch.zeros_like(turn[:, 0])
-    x, y, z = turn.unbind(dim=1)
+    rotation, shift = motion[:, :3], motion[:, 3:]
+    none = torch.zeros_like(rotation[:, 0])
+    x, y, z = rotation.unbind(dim=1)
     rows = [[none, -z, y, shift[:, 0]], [z, none, -x, shift[:, 1]], [-y, x, none, shift[:, 2]]]
     rows.append([none] * 4)
     generator = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)

@@ -77,7 +77,7 @@ def prepare(folder: Path, config: BenchConfig, cache: Path | None = None) -> Inp
         scene, seconds = Reconstruct()(views, folder / "truth" / "sparse"), 0.0
     else:
         refined = ReconstructConfig()
-        settings = replace(refined, track_rounds=0) if config.cameras == "features" else refined
+        settings = replace(refined, track_iterations=0) if config.cameras == "features" else refined
         found = find_model(views, settings, ModelCache(folder=cache) if cache else None)
         began = time.perf_counter()
         scene = placed_scene(views, found.model)

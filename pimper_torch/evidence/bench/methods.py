@@ -33,7 +33,7 @@ class Outcome(Record):
         mesh_points: Vertices of the coarse mesh; ``None`` for methods that use none.
         triangles: Its facets.
         samples: Samples of all templates times views, missing ones included.
-        missing_share: Of the samples.
+        missing_fraction: Of the samples.
         external: A program of its own did the work, whose memory is not this process's.
     """
 
@@ -42,7 +42,7 @@ class Outcome(Record):
     mesh_points: int | None = None
     triangles: int | None = None
     samples: int | None = None
-    missing_share: float | None = None
+    missing_fraction: float | None = None
     external: bool = False
 
 
@@ -87,7 +87,7 @@ def _preset(name: str) -> Method:
             mesh_points=int(found["mesh_points"]),
             triangles=int(found["triangles"]),
             samples=int(found["samples"]),
-            missing_share=float(found["missing_share"]),
+            missing_fraction=float(found["missing_fraction"]),
         )
 
     return run

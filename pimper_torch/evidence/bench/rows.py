@@ -187,7 +187,7 @@ def write_json(table: Table, path: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    account = {
+    report = {
         "format": _FORMAT,
         "version": _VERSION,
         "date": table.date,
@@ -196,7 +196,7 @@ def write_json(table: Table, path: Path) -> None:
         "settings": dict(table.settings),
         "rows": [to_mapping(row) for row in table.rows],
     }
-    text = json.dumps(_finite(account), indent=1, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_finite(report), indent=1, ensure_ascii=False, allow_nan=False)
     try:
         path.write_text(text + "\n", encoding="utf-8")
     except OSError as error:
@@ -212,26 +212,26 @@ def read_json(path: Path | str) -> Table:
         InputError: No such file, no such table, or a value of another type.
     """
     try:
-        account = json.loads(Path(path).read_text(encoding="utf-8"))
+        report = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as JSON ({error}).") from error
-    if not isinstance(account, dict) or account.get("format") != _FORMAT:
+    if not isinstance(report, dict) or report.get("format") != _FORMAT:
         raise InputError(f"{path}: is no table of `pimper bench`; needed: its JSON file.")
-    if account.get("version") != _VERSION:
+    if report.get("version") != _VERSION:
         raise InputError(
-            f"{path}: is of version {account.get('version')}; this pimper reads version "
+            f"{path}: is of version {report.get('version')}; this pimper reads version "
             f"{_VERSION}. Run the bench again."
         )
     try:
         return Table(
             rows=tuple(
                 build(Row, _mapping(row, f"{path}, row {index}"), f"{path}, row {index}")
-                for index, row in enumerate(account["rows"])
+                for index, row in enumerate(report["rows"])
             ),
-            machine=build(Machine, _mapping(account["machine"], f"{path}"), f"{path}"),
-            date=str(account["date"]),
-            scale=str(account["scale"]),
-            settings=_mapping(account["settings"], f"{path}, settings"),
+            machine=build(Machine, _mapping(report["machine"], f"{path}"), f"{path}"),
+            date=str(report["date"]),
+            scale=str(report["scale"]),
+            settings=_mapping(report["settings"], f"{path}, settings"),
         )
     except (ConfigError, KeyError, TypeError) as error:
         raise InputError(f"{path}: is no whole table ({error}). Run the bench again.") from error

@@ -21,7 +21,7 @@ from pimper_torch.evidence.bench.methods import Method, Outcome, method_named
 from pimper_torch.evidence.bench.panels import ERROR_SCALE, method_panels, scene_row
 from pimper_torch.evidence.bench.rows import Row, Table, row_of_failure, with_published, write_json
 from pimper_torch.evidence.bench.table import markdown
-from pimper_torch.evidence.metrics.alignment import carry
+from pimper_torch.evidence.metrics.alignment import transfer
 from pimper_torch.evidence.metrics.evaluate import Evaluation, evaluate
 from pimper_torch.evidence.metrics.in_view import meet_truth
 from pimper_torch.io.folders import written_whole
@@ -183,7 +183,7 @@ def _cell(
         minutes = (time.perf_counter() - began) / 60
         row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
         return Measured(row=row, panels=MethodPanels(method=method, note=row.note))
-    mesh = carry(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
+    mesh = transfer(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
     write_ply(mesh, _mesh_file(staging, scene, method))
     heatmap = staging / "heatmaps" / f"{scene}_{method}.png"
     # Evaluated in a view, it has been met.
@@ -214,14 +214,16 @@ def row_of(
         mesh_points=outcome.mesh_points,
         triangles=outcome.triangles,
         samples=outcome.samples,
-        missing_percent=_percent(outcome.missing_share),
+        missing_percent=_percent(outcome.missing_fraction),
         minutes=outcome.seconds / 60,
         sfm_minutes=sfm_minutes,
         relative_error=view.relative_error if view else None,
         coverage_percent=100 * view.coverage if view else None,
-        mean_normal_deg=view.carried_normals.mean_deg if view and view.carried_normals else None,
+        mean_normal_deg=view.transferred_normals.mean_deg
+        if view and view.transferred_normals
+        else None,
         median_normal_deg=(
-            view.carried_normals.median_deg if view and view.carried_normals else None
+            view.transferred_normals.median_deg if view and view.transferred_normals else None
         ),
         mean_shape_normal_deg=view.shape_normals.mean_deg if view and view.shape_normals else None,
         median_shape_normal_deg=(
@@ -239,8 +241,8 @@ def row_of(
     )
 
 
-def _percent(share: float | None) -> float | None:
-    return None if share is None else 100 * share
+def _percent(fraction: float | None) -> float | None:
+    return None if fraction is None else 100 * fraction
 
 
 @contextmanager

@@ -191,7 +191,7 @@ def legend(table: Table) -> list[str]:
         "Samples count every template's pixels times the views, missing ones included. Minutes "
         "are of the method alone; structure from motion is shared and stands apart. The 3D error "
         "is `100 ||S - S_hat|| / ||S - mean S||` along the rays of the reference view, over the "
-        "share of the true pixels that is covered; rays that meet a surface on the table, through "
+        "fraction of the true pixels that is covered; rays that meet a surface on the table, by "
         "a hole in the object, are misses. There: over the pixels that all methods of the scene "
         "cover that gave a surface. Normals are those that the vertices carry; "
         "shape is the surface's own. Chamfer (the mean of accuracy and completeness), accuracy, "

@@ -18,7 +18,6 @@ from pimper_torch.errors import InputError, OutputError
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
 from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.metrics.account import account, rows
 from pimper_torch.evidence.metrics.alignment import Method
 from pimper_torch.evidence.metrics.evaluate import (
     EvaluateConfig,
@@ -27,6 +26,7 @@ from pimper_torch.evidence.metrics.evaluate import (
     evaluate,
 )
 from pimper_torch.evidence.metrics.icp import IcpConfig
+from pimper_torch.evidence.metrics.report import report, rows
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
@@ -64,7 +64,7 @@ class EvaluateOptions:
             camera see.
         samples: Points drawn on each surface.
         seed: Of every draw.
-        trimmed_share: Share of the result's samples that each step of `icp` leaves out.
+        trimmed_fraction: Fraction of the result's samples that each step of `icp` leaves out.
         icp_distance: What `icp` makes small: the distance to the true `plane` or `point`.
     """
 
@@ -76,7 +76,7 @@ class EvaluateOptions:
     seen_from: int = 3
     samples: int = 200_000
     seed: int = 0
-    trimmed_share: float = 0.2
+    trimmed_fraction: float = 0.2
     icp_distance: Literal["plane", "point"] = "plane"
 
     def config(self) -> EvaluateConfig:
@@ -92,7 +92,7 @@ class EvaluateOptions:
             seen_from=self.seen_from,
             samples=self.samples,
             seed=self.seed,
-            icp=IcpConfig(trimmed_share=self.trimmed_share, distance=self.icp_distance),
+            icp=IcpConfig(trimmed_fraction=self.trimmed_fraction, distance=self.icp_distance),
         )
 
 
@@ -303,7 +303,7 @@ def write_report(evaluation: Evaluation, job: Job) -> None:
         "result": str(job.result),
         "truth": str(job.truth),
         "settings": to_mapping(job.options),
-        **account(evaluation),
+        **report(evaluation),
     }
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     staging = job.out.with_name(f".{job.out.name}.new-{secrets.token_hex(4)}")

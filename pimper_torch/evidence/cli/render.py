@@ -82,7 +82,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         overwrite: Flag = False,
         config: Annotated[SceneConfig, tyro.conf.arg(name="")] = _DEFAULT,
     ) -> _Job:
-        """Render photographs of a scene under a lamp, and write the truth beside them.
+        """Render photographs of a scene under a point light, and write the truth beside them.
 
         Args:
             scene: One of mug, jar, balls, potatoes, pair, or the path of a mesh file.

@@ -309,7 +309,7 @@ def _taken(truth: Truth, chosen: list[int]) -> Truth:
         lit=of(truth.lit),
         highlight=of(truth.highlight),
         lights_world=of(truth.lights_world),
-        lamps_world=of(truth.lamps_world),
+        point_lights_world=of(truth.point_lights_world),
     )
 
 

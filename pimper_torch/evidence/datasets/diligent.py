@@ -38,7 +38,7 @@ class LampFiles(Record):
 
     Attributes:
         paths: One photograph a light.
-        directions: Unit, from the object to the lamp; x right, y up, z to the viewer.
+        directions: Unit, from the object to the point light; x right, y up, z to the viewer.
         intensities: Red, green, blue.
     """
 
@@ -102,7 +102,7 @@ def read_diligent(
     and Uncalibrated Photometric Stereo, PAMI 41(2), 2019.
     """
     root = Path(folder)
-    files = lamp_files(root, KIND)
+    files = point_light_files(root, KIND)
     count = len(files.paths)
     kept = choose_photographs(
         [1] * count,
@@ -125,8 +125,8 @@ def read_diligent(
     width, height = (int(side) for side in views.sizes_px[0])
     normals = read_normals(root, KIND)
     if normals is not None:
-        turned = nearest(normals, width, height)
-        normals = turned[None].expand(len(kept), -1, -1, -1)
+        rotated = nearest(normals, width, height)
+        normals = rotated[None].expand(len(kept), -1, -1, -1)
     strength = torch.ones(len(kept)) if divide_by_intensity else intensity.mean(dim=1)
     return Capture(
         views=views,
@@ -177,7 +177,7 @@ def read_normal_map(folder: Path | str) -> NormalMap:
     )
 
 
-def lamp_files(folder: Path, kind: str) -> LampFiles:
+def point_light_files(folder: Path, kind: str) -> LampFiles:
     """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``.
 
     Raises:
@@ -191,7 +191,7 @@ def lamp_files(folder: Path, kind: str) -> LampFiles:
     if listed.is_file():
         names = read_text(listed, kind).split()
     else:
-        names = [f"{lamp + 1:03d}.png" for lamp in range(len(directions))]
+        names = [f"{point_light + 1:03d}.png" for point_light in range(len(directions))]
     expect(
         len(names) == len(directions) == len(intensities) > 0,
         folder,
@@ -236,15 +236,15 @@ def decoded_normals(path: Path, kind: str) -> Float[Tensor, "height width 3"]:
 def directed_lights(
     directions_world: Float[Tensor, "view 3"], strength: Float[Tensor, " view"]
 ) -> Float[Tensor, "view 4"]:
-    """Give the first-order light of distant lamps without any ambient light."""
+    """Give the first-order light of distant point lights without any ambient light."""
     directed = strength[:, None] * directions_world
     return torch.cat([torch.zeros_like(directed[:, :1]), directed], dim=1).float()
 
 
 def _faced(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
-    turned = normals.nan_to_num(0) * FLIP.float()
+    rotated = normals.nan_to_num(0) * FLIP.float()
     known = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > _SHORTEST
-    return torch.where(known, normalize(turned, dim=-1), 0)
+    return torch.where(known, normalize(rotated, dim=-1), 0)
 
 
 def _rows_of_three(path: Path, kind: str) -> Float[Tensor, "row 3"]:

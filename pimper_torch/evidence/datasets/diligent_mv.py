@@ -9,7 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.datasets.diligent import FLIP, directed_lights, lamp_files, read_normals
+from pimper_torch.evidence.datasets.diligent import (
+    FLIP,
+    directed_lights,
+    point_light_files,
+    read_normals,
+)
 from pimper_torch.evidence.datasets.layout import expect
 from pimper_torch.evidence.datasets.matlab import read_toolbox_projections
 from pimper_torch.evidence.datasets.projections import decompose_projections
@@ -71,13 +76,15 @@ def read_diligent_mv(
     """
     root = Path(folder)
     places = _view_folders(root)
-    lamps = {place: lamp_files(path, KIND) for place, path in places.items()}
+    point_lights = {place: point_light_files(path, KIND) for place, path in places.items()}
     table = [
-        (place, lamp) for place, files in lamps.items() for lamp in range(1, len(files.paths) + 1)
+        (place, point_light)
+        for place, files in point_lights.items()
+        for point_light in range(1, len(files.paths) + 1)
     ]
     chosen = choose_photographs(
         [place for place, _ in table],
-        [lamp for _, lamp in table],
+        [point_light for _, point_light in table],
         positions=positions,
         lights=lights,
         light_seed=light_seed,
@@ -90,8 +97,10 @@ def read_diligent_mv(
         read_toolbox_projections(root / "Calib_Results.mat", order, KIND)
     )
     index = torch.tensor([order.index(place) for place, _ in kept])
-    paths = [lamps[place].paths[lamp - 1] for place, lamp in kept]
-    intensity = torch.stack([lamps[place].intensities[lamp - 1] for place, lamp in kept])
+    paths = [point_lights[place].paths[point_light - 1] for place, point_light in kept]
+    intensity = torch.stack(
+        [point_lights[place].intensities[point_light - 1] for place, point_light in kept]
+    )
     views = read_photographs(
         paths,
         [f"{path.parent.name}/{path.name}" for path in paths],
@@ -103,12 +112,14 @@ def read_diligent_mv(
     width, height = (int(side) for side in views.sizes_px[0])
     header = read_header(paths[0])
     K = scale_intrinsics(intrinsics_from_indices(K), width / header.width, height / header.height)
-    directions = torch.stack([lamps[place].directions[lamp - 1] for place, lamp in kept])
+    directions = torch.stack(
+        [point_lights[place].directions[point_light - 1] for place, point_light in kept]
+    )
     world_from_cam = pose[:, :3, :3].mT
     directions_world = (world_from_cam[index] @ (directions * FLIP)[..., None])[..., 0]
     strength = torch.ones(len(kept)) if divide_by_intensity else intensity.mean(dim=1)
     normals = [
-        _turned(read_normals(places[place], KIND), world_from_cam[row], width, height)
+        _rotated(read_normals(places[place], KIND), world_from_cam[row], width, height)
         for row, place in enumerate(order)
     ]
     return Capture(
@@ -125,7 +136,7 @@ def read_diligent_mv(
             lights_world=directed_lights(directions_world, strength),
         ),
         position=torch.tensor([place for place, _ in kept]),
-        light=torch.tensor([lamp for _, lamp in kept]),
+        light=torch.tensor([point_light for _, point_light in kept]),
     )
 
 
@@ -145,7 +156,7 @@ def _mesh(root: Path) -> Mesh | None:
     return read_mesh(path) if path.is_file() else None
 
 
-def _turned(
+def _rotated(
     normals: Float[Tensor, "height_in width_in 3"] | None,
     world_from_cam: Float[Tensor, "3 3"],
     width: int,

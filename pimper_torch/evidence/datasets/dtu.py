@@ -1,4 +1,4 @@
-"""What the two DTU sets share: one camera, one calibrated size, several lamps a place."""
+"""What the two DTU sets share: one camera, one calibrated size, several point lights a place."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ CALIBRATED_WIDTH = 1600  # of 1600 x 1200; copies of half the size exist
 def dtu_capture(
     paths: Sequence[Path],
     places: Sequence[int],
-    lamps: Sequence[int],
+    point_lights: Sequence[int],
     cameras: tuple[Float[Tensor, "place 3 3"], Float[Tensor, "place 4 4"]],
     truth: Truth,
     *,
@@ -30,7 +30,7 @@ def dtu_capture(
     Args:
         paths: Of the photographs.
         places: Of each.
-        lamps: Of each.
+        point_lights: Of each.
         cameras: Intrinsics, whose pixels count from the centre of the first one, and poses of
             the different places in ascending order.
         truth: Of the scene.
@@ -57,5 +57,5 @@ def dtu_capture(
         ),
         truth=truth,
         position=torch.tensor(places),
-        light=torch.tensor(lamps),
+        light=torch.tensor(point_lights),
     )

@@ -19,7 +19,7 @@ from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Capture, DtuProtocol, Truth
 
 KIND = "the DTU multi-view stereo set of 2014"
-ALL_LAMPS = 7  # our number for `max`, the brightest of the seven photographs at each pixel
+ALL_LIGHTS = 7  # our number for `max`, the brightest of the seven photographs at each pixel
 _NAME = re.compile(r"rect_(\d{3})_(?:(\d)_r5000|(max))\.png")
 
 
@@ -54,7 +54,7 @@ def read_dtu_mvs(
         folder: With ``Rectified``.
         scan: Number of the scan.
         positions: Read these places only, from 1.
-        lights: Read these lights only, 0 to 6, or :data:`ALL_LAMPS` for ``max``; ``None``
+        lights: Read these lights only, 0 to 6, or :data:`ALL_LIGHTS` for ``max``; ``None``
             reads 0 to 6.
         light_seed: Read one light a place, chosen by this seed; ``None`` reads all. Decided
             before anything is decoded.
@@ -71,27 +71,27 @@ def read_dtu_mvs(
     photographs = root / "Rectified" / f"scan{scan}"
     expect(photographs.is_dir(), root, KIND, f"photographs in Rectified/scan{scan}")
     named = sorted(
-        (int(match[1]), ALL_LAMPS if match[3] else int(match[2]), path)
+        (int(match[1]), ALL_LIGHTS if match[3] else int(match[2]), path)
         for path in photographs.iterdir()
         if (match := _NAME.fullmatch(path.name))
     )
     if lights is None:
-        named = [entry for entry in named if entry[1] != ALL_LAMPS]
+        named = [entry for entry in named if entry[1] != ALL_LIGHTS]
     expect(bool(named), photographs, KIND, "photographs such as rect_001_0_r5000.png")
     chosen = choose_photographs(
         [place for place, _, _ in named],
-        [lamp for _, lamp, _ in named],
+        [point_light for _, point_light, _ in named],
         positions=positions,
         lights=lights,
         light_seed=light_seed,
         place=photographs,
         kind=KIND,
     )
-    places, lamps, paths = zip(*(named[index] for index in chosen), strict=True)
+    places, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
     return dtu_capture(
         paths,
         places,
-        lamps,
+        point_lights,
         _read_cameras(root, sorted(set(places))),
         Truth(points_world=_scan(root, scan)),
         encoding=encoding,

@@ -1,4 +1,4 @@
-"""DTU robot image data, the point feature set: 60 scenes, 119 places, 19 lamps."""
+"""DTU robot image data, the point feature set: 60 scenes, 119 places, 19 point lights."""
 
 import re
 from collections.abc import Sequence
@@ -76,14 +76,14 @@ def read_dtu_points(
     expect(bool(named), photographs, KIND, "photographs such as Img001_01.bmp (place, LED)")
     chosen = choose_photographs(
         [place for place, _, _ in named],
-        [lamp for _, lamp, _ in named],
+        [point_light for _, point_light, _ in named],
         positions=positions,
         lights=lights,
         light_seed=light_seed,
         place=photographs,
         kind=KIND,
     )
-    places, lamps, paths = zip(*(named[index] for index in chosen), strict=True)
+    places, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
     calibration = first_of([root / name for name in _CALIBRATIONS])
     expect(calibration is not None, root, KIND, f"the calibration {' or '.join(_CALIBRATIONS)}")
     assert calibration is not None
@@ -91,7 +91,7 @@ def read_dtu_points(
     return dtu_capture(
         paths,
         places,
-        lamps,
+        point_lights,
         decompose_projections(projections),
         Truth(points_world=_scan(root, scan)),
         encoding=encoding,

@@ -28,8 +28,8 @@ def points_in_sight(
 ) -> float:
     """Tell how well points of the surface fall into the photographs, and fill the masks.
 
-    Without masks, the share of points in front of a camera and inside its photograph, in
-    the mean over the views. With masks, the share on the mask times the share of the mask's
+    Without masks, the fraction of points in front of a camera and inside its photograph, in
+    the mean over the views. With masks, the fraction on the mask times the fraction of the mask's
     cells (40 along the image) that contain one.
     """
     found = []
@@ -42,13 +42,13 @@ def points_in_sight(
             continue
         column, row = pixels[inside].long().unbind(dim=1)
         on = masks[view, row, column]
-        share = float(on.sum()) / len(points_world)
-        found.append(share * _coverage(row[on], column[on], masks[view, :height, :width]))
+        fraction = float(on.sum()) / len(points_world)
+        found.append(fraction * _coverage(row[on], column[on], masks[view, :height, :width]))
     return float(np.mean(found))
 
 
 def depth_agreement(cameras: Cameras, depth: Float[Tensor, "view height width"]) -> float:
-    """Tell which share of a view's depth map lies on its neighbour's.
+    """Tell which fraction of a view's depth map lies on its neighbour's.
 
     A point agrees when its depth in the other camera is within 3 % of the map's range of
     what the map has there; points that leave the image, fall on the background or are
@@ -101,7 +101,7 @@ def cones_touch(cameras: Cameras, masks: Bool[Tensor, "view height width"]) -> f
     """Tell how well the cones through the masks fit one body.
 
     A body touches every ray through the rim of its mask, and where it does the other masks
-    have it too. The share of rim rays on which some point is in all other masks (one pixel
+    have it too. The fraction of rim rays on which some point is in all other masks (one pixel
     of 120 spared) is near 1 for right cameras; cameras that look elsewhere leave none, and
     mirrored ones fewer. A body without features, or views from nearly one side, tell less.
 
@@ -114,13 +114,13 @@ def cones_touch(cameras: Cameras, masks: Bool[Tensor, "view height width"]) -> f
     ]
     if not all(bool(mask.any()) for mask in drawn):
         return 0.0
-    middle, radius = _common_place(small, drawn)
-    if middle is None:
+    centre, radius = _common_place(small, drawn)
+    if centre is None:
         return 0.0
     spared = [max_pool2d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0 for mask in drawn]
     found = []
     for view, mask in enumerate(drawn):
-        points = _along_rim(small, view, mask, middle, radius)
+        points = _along_rim(small, view, mask, centre, radius)
         if points is None:
             continue
         held = torch.ones(points.shape[:2], dtype=torch.bool)
@@ -140,10 +140,10 @@ def _along_rim(
     cameras: Cameras,
     view: int,
     mask: Bool[Tensor, "height width"],
-    middle: Float[Tensor, "3"],
+    centre: Float[Tensor, "3"],
     radius: float,
 ) -> Float[Tensor, "ray sample 3"] | None:
-    """Give points along rays through the mask's rim, round the depth of the middle."""
+    """Give points along rays through the mask's rim, round the depth of the centre."""
     outside = torch.zeros_like(mask)
     outside[1:-1, 1:-1] = max_pool2d((~mask)[None, None].float(), 3, 1, 0)[0, 0] > 0
     rows, columns = torch.nonzero(mask & outside, as_tuple=True)
@@ -152,7 +152,7 @@ def _along_rim(
     kept = torch.linspace(0, len(rows) - 1, min(len(rows), _RIM_RAYS)).long()
     pixels = torch.stack([columns[kept], rows[kept]], dim=1).to(cameras.intrinsics) + 0.5
     rays = rays_through(pixels, *_of(cameras, view))
-    depth = float(transform(cameras.cam_from_world[view], middle[None])[0, 2])
+    depth = float(transform(cameras.cam_from_world[view], centre[None])[0, 2])
     reach = torch.linspace(max(depth - 2 * radius, 0.0), depth + 2 * radius, _RIM_SAMPLES)
     return cameras.centers_world[view] + reach.to(rays)[:, None] * rays[:, None]
 
@@ -161,7 +161,7 @@ def epipolar_agreement(
     cameras: Cameras,
     matches: dict[tuple[int, int], tuple[Float[Tensor, "match 2"], Float[Tensor, "match 2"]]],
 ) -> float:
-    """Tell which share of matched features the cameras' epipolar geometry allows.
+    """Tell which fraction of matched features the cameras' epipolar geometry allows.
 
     A match agrees when its points lie within 0.4 % of the image's longer side of each
     other's epipolar lines and the rays through them meet in front of both cameras.
@@ -217,7 +217,7 @@ def silhouette_mismatch(
     view: int,
     surroundings: Mesh | None = None,
 ) -> float:
-    """Count pixels at the mask's rim where mesh and mask differ, as a share of the rim's length.
+    """Count pixels at the mask's rim where mesh and mask differ, as a fraction of the rim's length.
 
     About 0 for a mask that was made from the mesh, and 0.6 after a shift by half a pixel.
     """
@@ -330,7 +330,7 @@ def _lifted(
 def _coverage(
     row: Tensor, column: Tensor, mask: Bool[Tensor, "height width"], cells: int = _CELLS
 ) -> float:
-    """Give the share of a mask's cells that hold one of the pixels."""
+    """Give the fraction of a mask's cells that hold one of the pixels."""
     height, width = mask.shape
     factor = min(1.0, cells / max(height, width))
     high, wide = max(1, round(height * factor)), max(1, round(width * factor))
@@ -344,13 +344,13 @@ def _coverage(
 def _common_place(
     cameras: Cameras, masks: list[Bool[Tensor, "height width"]]
 ) -> tuple[Float[Tensor, "3"] | None, float]:
-    """Find the point nearest to the rays through the masks' middles, and a radius round it."""
+    """Find the point nearest to the rays through the masks' centres, and a radius round it."""
     normal, right, sizes = torch.zeros(3, 3).double(), torch.zeros(3).double(), []
     for view, mask in enumerate(masks):
         rows, columns = torch.nonzero(mask, as_tuple=True)
-        middle = torch.stack([columns.double().mean(), rows.double().mean()]) + 0.5
+        centre = torch.stack([columns.double().mean(), rows.double().mean()]) + 0.5
         pose, K = (matrix.double() for matrix in _of(cameras, view))
-        ray = rays_through(middle[None], pose, K)[0]
+        ray = rays_through(centre[None], pose, K)[0]
         across = torch.eye(3).double() - torch.outer(ray, ray) / (ray @ ray)
         normal = normal + across
         right = right + across @ cameras.centers_world[view].double()
@@ -384,10 +384,10 @@ def _epipolar(
     d, e = ray @ base, ray_other @ base
     determinant = (a * c - b * b).clamp_min(1e-12)
     reach, reach_other = (c * d - b * e) / determinant, (b * d - a * e) / determinant
-    middle = (center + reach[:, None] * ray + away + reach_other[:, None] * ray_other) / 2
+    centre = (center + reach[:, None] * ray + away + reach_other[:, None] * ray_other) / 2
     near = torch.ones_like(reach, dtype=torch.bool)
     for view, pixels in ((one, first), (other, second)):
-        seen, depth = project(middle, *_of(cameras, view))
+        seen, depth = project(centre, *_of(cameras, view))
         tolerance = 0.004 * float(cameras.sizes_px[view].max())
         near = near & ((seen - pixels).norm(dim=1) < tolerance) & (depth > 0)
     return near & (reach > 0) & (reach_other > 0)

@@ -27,8 +27,8 @@ from pimper_torch.records import Cameras, Capture, Views
 
 _KIND = "an IDR or NeuS set"
 _CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz", "cameras_large.npz")
-# The object takes this share of the unit sphere, so that nothing of it touches the rim.
-_SHARE = 0.9
+# The object takes this fraction of the unit sphere, so that nothing of it touches the rim.
+_FRACTION = 0.9
 
 
 def read_idr(
@@ -170,13 +170,13 @@ def unit_sphere(
     if points_world is not None:
         points = points_world.detach().cpu().double()
         center = (points.amin(dim=0) + points.amax(dim=0)) / 2
-        radius = float((points - center).norm(dim=-1).max()) / _SHARE
+        radius = float((points - center).norm(dim=-1).max()) / _FRACTION
     else:
         center = _looked_at(cameras)
         reaches = torch.tensor(
             [_reach(cameras, center, masks, v) for v in range(len(cameras.sizes_px))]
         )
-        radius = float(reaches.median() if masks is None else reaches.max() / _SHARE)
+        radius = float(reaches.median() if masks is None else reaches.max() / _FRACTION)
     if not radius > 0:
         raise InputError(
             "the sphere round the object has no size; needed: points on the object, or cameras "

@@ -11,7 +11,7 @@ from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.records import Cameras
 
-_OTHER_SIZE = 0.2  # principal points stray by less than this share of half the image
+_OTHER_SIZE = 0.2  # principal points stray by less than this fraction of half the image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,7 +123,7 @@ _POSES = (
         undo=_with_pose(lambda pose: _axes(1, 1, -1, pose) @ pose),
     ),
     CameraMistake(
-        name="photographs_turned",
+        name="photographs_rotated",
         meaning="the photographs are turned by 180 degrees, or both image axes of the cameras are",
         remedy="negate the first two rows of cam_from_world, or turn the photographs",
         undo=_with_pose(lambda pose: _axes(-1, -1, 1, pose) @ pose),
@@ -131,7 +131,7 @@ _POSES = (
     CameraMistake(
         name="world_axes_flipped",
         meaning="y and z of the world run the other way for the cameras than for the truth",
-        remedy="negate y and z of the mesh or points, or the middle columns of cam_from_world",
+        remedy="negate y and z of the mesh or points, or the centre columns of cam_from_world",
         undo=_with_pose(lambda pose: pose @ _axes(1, -1, -1, pose)),
     ),
 )

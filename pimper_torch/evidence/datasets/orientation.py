@@ -43,11 +43,11 @@ def check_mesh(
         if not bool(hit.any()):
             continue
         toward = -_rays(small, view)[hit]
-        faces.append(_share_facing(_face_normals_hit(mesh, hits)[hit], toward))
+        faces.append(_fraction_facing(_face_normals_hit(mesh, hits)[hit], toward))
         if mesh.normals_world is not None:
             interpolated = hits.interpolate(mesh.normals_world.to(toward), mesh.faces)
-            vertices.append(_share_facing(interpolated[hit], toward))
-    for shares, name, meaning, remedy in (
+            vertices.append(_fraction_facing(interpolated[hit], toward))
+    for fractions, name, meaning, remedy in (
         (
             faces,
             "mesh_inside_out",
@@ -56,15 +56,19 @@ def check_mesh(
         ),
         (vertices, "mesh_normals_inward", "the mesh's vertex normals point inward", "negate them"),
     ):
-        if not shares:
+        if not fractions:
             continue
-        share = float(np.mean(shares))
+        fraction = float(np.mean(fractions))
         comparisons.append(
-            Comparison(evidence=name, hypotheses=("as given", name), scores=(share, 1 - share))
+            Comparison(
+                evidence=name, hypotheses=("as given", name), scores=(fraction, 1 - fraction)
+            )
         )
-        if share < 1 - _FACING:
+        if fraction < 1 - _FACING:
             findings.append(
-                Finding(name=name, meaning=meaning, remedy=remedy, evidence={"share facing": share})
+                Finding(
+                    name=name, meaning=meaning, remedy=remedy, evidence={"share facing": fraction}
+                )
             )
 
 
@@ -86,14 +90,14 @@ def check_normals(
     geometric = all(one[1] is not None for one in samples)
 
     def score(mistake: VectorMistake | None) -> float:
-        shares = []
+        fractions = []
         for normals, truth_normals, toward, rotation in samples:
-            turned = normals if mistake is None else mistake.undo(normals, rotation)
+            rotated = normals if mistake is None else mistake.undo(normals, rotation)
             if geometric and truth_normals is not None:
-                shares.append(float((turned * truth_normals).sum(dim=-1).clamp_min(0).mean()))
+                fractions.append(float((rotated * truth_normals).sum(dim=-1).clamp_min(0).mean()))
             else:
-                shares.append(_share_facing(turned, toward))
-        return float(np.mean(shares))
+                fractions.append(_fraction_facing(rotated, toward))
+        return float(np.mean(fractions))
 
     mistakes = VECTOR_MISTAKES if geometric else VECTOR_MISTAKES[:3]
     values = [score(None), *(score(mistake) for mistake in mistakes)]
@@ -242,7 +246,7 @@ def _correlation(one: Float[Tensor, " pixel"], other: Float[Tensor, " pixel"]) -
     return float(a @ b) / size if size > 0 else 0.0
 
 
-def _share_facing(normals: Float[Tensor, "pixel 3"], toward: Float[Tensor, "pixel 3"]) -> float:
+def _fraction_facing(normals: Float[Tensor, "pixel 3"], toward: Float[Tensor, "pixel 3"]) -> float:
     return float(((normals.to(toward) * toward).sum(dim=-1) > 0).float().mean())
 
 

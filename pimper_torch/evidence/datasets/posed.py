@@ -155,10 +155,10 @@ def shrink(views: Views, cameras: Cameras, max_size_px: int) -> tuple[Views, Cam
         max_size_px: The longest side; 0 leaves all as they are.
     """
     full = views.sizes_px.tolist()
-    shares = [min(1.0, max_size_px / max(size)) if max_size_px else 1.0 for size in full]
+    fractions = [min(1.0, max_size_px / max(size)) if max_size_px else 1.0 for size in full]
     sizes = [
-        (max(1, round(share * width)), max(1, round(share * height)))
-        for share, (width, height) in zip(shares, full, strict=True)
+        (max(1, round(fraction * width)), max(1, round(fraction * height)))
+        for fraction, (width, height) in zip(fractions, full, strict=True)
     ]
     width, height = (max(sides) for sides in zip(*sizes, strict=True))
     images = views.images.new_zeros(*views.images.shape[:2], height, width)
@@ -176,7 +176,7 @@ def shrink(views: Views, cameras: Cameras, max_size_px: int) -> tuple[Views, Cam
         images=images,
         sizes_px=sizes_px,
         masks=None if views.masks is None else masks,
-        focals_px=views.focals_px * torch.tensor(shares).to(views.focals_px),
+        focals_px=views.focals_px * torch.tensor(fractions).to(views.focals_px),
     )
     return small, cameras.replace(intrinsics=torch.stack(intrinsics), sizes_px=sizes_px)
 

@@ -51,7 +51,7 @@ def read_rendered(
         InputError: Not such a folder, or something in it is missing or damaged.
     """
     folder = Path(folder)
-    names, settings = _read_account(folder)
+    names, settings = _read_report(folder)
     chosen = list(range(len(names)) if views is None else views)
     expect(
         len(set(chosen)) == len(chosen) > 0 and all(0 <= one < len(names) for one in chosen),
@@ -63,14 +63,14 @@ def read_rendered(
     named = [names[one] for one in chosen]
     cameras = _read_cameras(folder, named)
     pictures = _read_views(folder, named, settings, cameras, photographs)
-    lamps, lights = _read_lights(folder, names, chosen)
+    point_lights, lights = _read_lights(folder, names, chosen)
     truth = Truth(
         mesh=read_mesh(folder / "truth" / "mesh.ply"),
         surroundings=None
         if settings.fixed_table
         else read_mesh(folder / "truth" / "surroundings.ply"),
         lights_world=lights,
-        lamps_world=lamps,
+        point_lights_world=point_lights,
     )
     if maps:
         truth = truth.replace(**_read_maps(folder, named, settings))
@@ -78,17 +78,17 @@ def read_rendered(
     return Capture(views=pictures, cameras=cameras, truth=truth, position=order, light=order)
 
 
-def _read_account(folder: Path) -> tuple[tuple[str, ...], SceneConfig]:
+def _read_report(folder: Path) -> tuple[tuple[str, ...], SceneConfig]:
     path = folder / "truth" / "scene.json"
-    account = _read_json(path, folder)
+    report = _read_json(path, folder)
     expect(
-        account.get("format") == FORMAT and account.get("format_version") == FORMAT_VERSION,
+        report.get("format") == FORMAT and report.get("format_version") == FORMAT_VERSION,
         path,
         _KIND,
         f"format {FORMAT!r}, version {FORMAT_VERSION}",
-        f"{account.get('format')!r}, version {account.get('format_version')!r}",
+        f"{report.get('format')!r}, version {report.get('format_version')!r}",
     )
-    names, settings = account.get("names"), account.get("settings")
+    names, settings = report.get("names"), report.get("settings")
     expect(
         isinstance(settings, dict)
         and isinstance(names, list)
@@ -197,35 +197,35 @@ def _read_lights(
     folder: Path, names: Sequence[str], chosen: Sequence[int]
 ) -> tuple[Float[Tensor, "view 3"], Float[Tensor, "view 4"]]:
     path = folder / "truth" / "lights.json"
-    account = _read_json(path, folder)
+    report = _read_json(path, folder)
     try:
-        lamps = torch.tensor(account["positions_world"], dtype=torch.float64)
-        lights = torch.tensor(account["harmonics_world"], dtype=torch.float64)
+        point_lights = torch.tensor(report["positions_world"], dtype=torch.float64)
+        lights = torch.tensor(report["harmonics_world"], dtype=torch.float64)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: has no numbers in `positions_world` or `harmonics_world` ({error}). Render "
             "the scene again."
         ) from error
     expect(
-        lamps.shape == (len(names), 3) and lights.shape == (len(names), 4),
+        point_lights.shape == (len(names), 3) and lights.shape == (len(names), 4),
         path,
         _KIND,
         f"a place and four harmonics for each of {len(names)} views",
-        f"{tuple(lamps.shape)} and {tuple(lights.shape)}",
+        f"{tuple(point_lights.shape)} and {tuple(lights.shape)}",
     )
-    return lamps[list(chosen)], lights[list(chosen)]
+    return point_lights[list(chosen)], lights[list(chosen)]
 
 
 def _read_json(path: Path, folder: Path) -> Mapping[str, object]:
     expect(path.is_file(), folder, _KIND, f"{path.relative_to(folder)} in it")
     try:
-        account = json.loads(path.read_text(encoding="utf-8"))
+        report = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: is no JSON that can be read ({error}). Render the scene again."
         ) from error
-    expect(isinstance(account, dict), path, _KIND, "a JSON object", type(account).__name__)
-    return account
+    expect(isinstance(report, dict), path, _KIND, "a JSON object", type(report).__name__)
+    return report
 
 
 def _file(folder: Path, name: str) -> Path:

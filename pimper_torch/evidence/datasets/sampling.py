@@ -44,7 +44,7 @@ def one_light_per_position(
         (photographs,) = torch.nonzero(position == place, as_tuple=True)
         offered = sorted((int(light[index]), int(index)) for index in photographs)
         others = [pair for pair in offered if pair[0] != last] or offered
-        least = min(taken.get(lamp, 0) for lamp, _ in others)
+        least = min(taken.get(point_light, 0) for point_light, _ in others)
         rarest = [pair for pair in others if taken.get(pair[0], 0) == least]
         draw = int(torch.randint(len(rarest), (1,), generator=generator))
         last, index = rarest[draw]
@@ -84,8 +84,8 @@ def choose_photographs(
     _refuse_absent(light, lights, "lights", place, kind)
     kept = [
         index
-        for index, (where, lamp) in enumerate(zip(position, light, strict=True))
-        if (positions is None or where in positions) and (lights is None or lamp in lights)
+        for index, (where, point_light) in enumerate(zip(position, light, strict=True))
+        if (positions is None or where in positions) and (lights is None or point_light in lights)
     ]
     kept.sort(key=lambda index: (position[index], light[index]))
     expect(bool(kept), place, kind, "photographs of these positions under these lights", "none")

@@ -49,11 +49,11 @@ def read_transforms(
 
     ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
     The focal length is ``fl_x``, ``fl_y`` in pixels, or follows from ``camera_angle_x``; the
-    principal point ``cx``, ``cy`` is the middle of the image unless given. All of these, and
+    principal point ``cx``, ``cy`` is the centre of the image unless given. All of these, and
     ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may stand in the file
     or in a frame. instant-ngp and nerfstudio take them from COLMAP and cast rays through
     x + 0.5 (nerfstudio, "Data conventions" and ``Cameras.get_image_coords``), and Blender's
-    middle is that of the image's area: their pixels are ours. Lenses are undistorted.
+    centre is that of the image's area: their pixels are ours. Lenses are undistorted.
 
     The mask is ``mask_path`` where a frame has one, else the image's alpha channel.
 

@@ -1,7 +1,6 @@
 """Figures that compare a result with the truth, each under its own named convention."""
 
-from pimper_torch.evidence.metrics.account import Row, account, rows
-from pimper_torch.evidence.metrics.alignment import Alignment, align_estimate, carry
+from pimper_torch.evidence.metrics.alignment import Alignment, align_estimate, transfer
 from pimper_torch.evidence.metrics.distances import SurfaceComparison, TrueSurface
 from pimper_torch.evidence.metrics.dtu import DtuFigures, dtu_figures
 from pimper_torch.evidence.metrics.evaluate import EvaluateConfig, Evaluation, evaluate
@@ -17,6 +16,7 @@ from pimper_torch.evidence.metrics.relative import (
     compare_in_view,
     relative_error,
 )
+from pimper_torch.evidence.metrics.report import Row, report, rows
 from pimper_torch.evidence.metrics.sampling import SurfaceSamples, sample_surface
 from pimper_torch.evidence.metrics.similarity import (
     pair_views,

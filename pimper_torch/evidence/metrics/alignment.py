@@ -34,7 +34,7 @@ class Alignment(Record):
         scale: Scene units of the truth in one of the estimate.
         rotation_deg: Angle of the rotation.
         cameras: How many pairs of cameras were used; 0 if none.
-        trimmed_share: Share of the samples left out by ``icp``; ``None`` otherwise.
+        trimmed_fraction: Fraction of the samples left out by ``icp``; ``None`` otherwise.
         residual: Root mean square distance of the samples ``icp`` kept, scene units.
         converged: Whether ``icp`` came to rest; ``None`` otherwise.
     """
@@ -45,7 +45,7 @@ class Alignment(Record):
     scale: float
     rotation_deg: float
     cameras: int = 0
-    trimmed_share: float | None = None
+    trimmed_fraction: float | None = None
     residual: float | None = None
     converged: bool | None = None
 
@@ -93,7 +93,7 @@ def align_estimate(
         return _told("cameras", f"similarity on {used} cameras", start, cameras=used)
     target = joined(true_surface(capture), capture.truth.surroundings)
     found = trimmed_icp(estimate.mesh, target, start, icp, generator=generator)
-    trimmed = (icp or IcpConfig()).trimmed_share
+    trimmed = (icp or IcpConfig()).trimmed_fraction
     origin = f"similarity on {used} cameras" if used else "identity"
     return _told(
         "icp",
@@ -101,7 +101,7 @@ def align_estimate(
         f"trimmed, from {origin}",
         found.truth_from_world,
         cameras=used,
-        trimmed_share=trimmed,
+        trimmed_fraction=trimmed,
         residual=found.residual,
         converged=found.converged,
     )
@@ -118,7 +118,7 @@ def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Camer
     return estimate.cameras.take(ours.tolist()), capture.cameras.take(truth.tolist())
 
 
-def carry(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
+def transfer(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
     """Put a mesh in the frame of the truth by a similarity, in float64 on the CPU."""
     mesh = mesh.to("cpu")
     scale, rotation = split_similarity(truth_from_world)
@@ -136,7 +136,7 @@ def _told(
     truth_from_world: Float[Tensor, "4 4"],
     *,
     cameras: int = 0,
-    trimmed_share: float | None = None,
+    trimmed_fraction: float | None = None,
     residual: float | None = None,
     converged: bool | None = None,
 ) -> Alignment:
@@ -148,7 +148,7 @@ def _told(
         scale=scale,
         rotation_deg=float(rotation_angles_deg(rotation)),
         cameras=cameras,
-        trimmed_share=trimmed_share,
+        trimmed_fraction=trimmed_fraction,
         residual=residual,
         converged=converged,
     )

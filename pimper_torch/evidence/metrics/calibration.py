@@ -43,7 +43,7 @@ class Calibration(Record):
         within_two: Share with one up to twice the expected one; 95 %.
         rank_correlation: Spearman's, between expected and true errors; NaN if all expected ones
             are the same.
-        bins: Of equal shares of the surface, by rising expected error.
+        bins: Of equal fractions of the surface, by rising expected error.
         samples: Compared.
     """
 
@@ -71,14 +71,14 @@ def calibrate(
     expected, true = expected[known].double().cpu(), true[known].double().cpu()
     if len(expected) < _BINS:
         return None
-    share = true / expected
+    fraction = true / expected
     order = expected.argsort()
     varied = bool(expected.min() < expected.max())
     correlation = spearmanr(expected.numpy(), true.numpy()).statistic if varied else math.nan
     return Calibration(
-        ratio=float(share.median()) / _MEDIAN_OF_ONE,
-        within_one=float((share <= 1).double().mean()),
-        within_two=float((share <= 2).double().mean()),
+        ratio=float(fraction.median()) / _MEDIAN_OF_ONE,
+        within_one=float((fraction <= 1).double().mean()),
+        within_two=float((fraction <= 2).double().mean()),
         rank_correlation=float(correlation),
         bins=tuple(
             CalibrationBin(

@@ -82,7 +82,7 @@ def closedness(mesh: Mesh, *, fold_deg: float = 90.0) -> Closedness:
     balance = torch.zeros_like(sharing).index_add(0, index.flatten(), upwards.flatten())
     pairs, _ = face_pairs(faces)
     normals = normalize(face_normals(vertices, faces), dim=1)
-    turn = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(dim=1)
+    rotation = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(dim=1)
     border, loop = boundary_loops(faces)
     steps = (vertices[border[:, 0]] - vertices[border[:, 1]]).norm(dim=1)
     lengths = steps.new_zeros(int(loop.max()) + 1 if len(loop) else 0).index_add(0, loop, steps)
@@ -94,7 +94,7 @@ def closedness(mesh: Mesh, *, fold_deg: float = 90.0) -> Closedness:
         edges=torch.bincount(loop, minlength=len(lengths))[order],
         crowded=int((sharing > 2).sum()),
         twisted=int(((sharing == 2) & (balance != 0)).sum()),
-        folds=int((turn < math.cos(math.radians(fold_deg))).sum()),
+        folds=int((rotation < math.cos(math.radians(fold_deg))).sum()),
         pieces=int(face_components(faces).max()) + 1,
         euler=len(used) - len(ends) + len(faces),
         diagonal=float((corners.amax(dim=0) - corners.amin(dim=0)).norm()),

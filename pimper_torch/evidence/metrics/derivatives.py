@@ -15,14 +15,14 @@ from torch import Tensor
 
 from pimper_torch.records import Record
 
-# Central differences of two step sizes that differ by more than this share saw a jump; forward and
-# backward ones a kink.
+# Central differences of two step sizes that differ by more than this fraction saw a jump; forward
+# and backward ones a kink.
 _JUMP = 0.01
 
 # Of so many roundings a function's value is made.
 _ROUNDINGS = 16
 
-# A direction in which more than this share of an output's elements jump tells nothing of it.
+# A direction in which more than this fraction of an output's elements jump tells nothing of it.
 _MAX_JUMPS = 0.5
 
 Tensors = Mapping[str, Tensor]
@@ -36,7 +36,7 @@ class DerivativeCheck(Record):
         analytic: ``w . (J d)`` by autograd, for every weight ``w`` and direction ``d``.
         numeric: The same by central differences.
         smooth: Directions in which not too many elements jump or bend.
-        jumped: Share of the output's elements that jump or bend, over all directions.
+        jumped: Fraction of the output's elements that jump or bend, over all directions.
     """
 
     analytic: Float[Tensor, "weight direction"]
@@ -120,9 +120,9 @@ def check_derivatives(
         name: sizes[name] * torch.randn(directions, *value.shape, generator=generator).to(value)
         for name, value in inputs.items()
     }
-    middle = {key: value.detach() for key, value in function(_leaves(inputs)).items()}
+    centre = {key: value.detach() for key, value in function(_leaves(inputs)).items()}
     moving = {
-        name: [_differences(function, inputs, name, path, steps, middle) for path in paths[name]]
+        name: [_differences(function, inputs, name, path, steps, centre) for path in paths[name]]
         for name in inputs
     }
     live = _leaves(inputs)
@@ -163,7 +163,7 @@ def _differences(
     name: str,
     path: Tensor,
     steps: tuple[float, float],
-    middle: Tensors,
+    centre: Tensors,
 ) -> tuple[dict[str, Tensor], dict[str, Bool[Tensor, " element"]]]:
     """Give central differences of all outputs along a path, and the elements that jump or bend."""
 
@@ -174,14 +174,14 @@ def _differences(
     central = []
     for step in steps:
         after, before = at(step), at(-step)
-        central.append({key: (after[key] - before[key]) / (2 * step) for key in middle})
+        central.append({key: (after[key] - before[key]) / (2 * step) for key in centre})
     coarse, fine = central
     apart = {}
-    for key in middle:
-        bend = (after[key] - 2 * middle[key] + before[key]) / steps[1]
+    for key in centre:
+        bend = (after[key] - 2 * centre[key] + before[key]) / steps[1]
         size = torch.maximum(coarse[key].abs(), fine[key].abs()).flatten()
         off = torch.maximum((coarse[key] - fine[key]).abs(), bend.abs()).flatten()
-        floor = _rounding(middle[key], steps[1])
+        floor = _rounding(centre[key], steps[1])
         apart[key] = ~(off <= _JUMP * (size + size.median()) + floor)
         fine[key] = torch.where(fine[key].abs() <= floor, 0, fine[key])
     return fine, apart

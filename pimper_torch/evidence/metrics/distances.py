@@ -41,8 +41,8 @@ class ThresholdFigures(Record):
     Attributes:
         threshold: Scene units.
         threshold_percent: Of the diagonal.
-        precision: Share of the estimate nearer to the truth than the threshold.
-        recall: Share of the truth nearer to the estimate than the threshold.
+        precision: Fraction of the estimate nearer to the truth than the threshold.
+        recall: Fraction of the truth nearer to the estimate than the threshold.
         f_score: Their harmonic mean; 0 if both are 0.
     """
 
@@ -82,24 +82,24 @@ class SurfaceComparison(Record):
         diagonal: Of the true object's bounding box along the axes of the truth, scene units.
         accuracy: From the estimate to the truth; ``None`` if all of it belongs to the
             surroundings.
-        surroundings_share: Share of the estimate that lies nearer to the truth's
+        surroundings_fraction: Fraction of the estimate that lies nearer to the truth's
             surroundings than to the object, and is left out of the accuracy.
         whole: With the completeness of the whole truth.
         seen: With that of the truth seen from at least ``seen_from`` places; ``None`` if
             nobody knows which it is, or none is.
         seen_from: How many places of the camera.
-        seen_share: Share of the truth that is seen so; ``None`` if nobody knows.
+        seen_fraction: Fraction of the truth that is seen so; ``None`` if nobody knows.
         calibration: Of the estimate's expected error, over its samples that count for the
             accuracy; ``None`` if it tells none.
     """
 
     diagonal: float
     accuracy: DistanceFigures | None
-    surroundings_share: float
+    surroundings_fraction: float
     whole: TwoSided | None
     seen: TwoSided | None
     seen_from: int
-    seen_share: float | None
+    seen_fraction: float | None
     calibration: Calibration | None = None
 
 
@@ -171,11 +171,11 @@ class TrueSurface:
         return SurfaceComparison(
             diagonal=self.diagonal,
             accuracy=_figures(to_truth, self.diagonal) if len(to_truth) else None,
-            surroundings_share=float(aside.double().mean()),
+            surroundings_fraction=float(aside.double().mean()),
             whole=two_sided(to_estimate),
             seen=None if seen is None else two_sided(to_estimate[seen]),
             seen_from=self._seen_from,
-            seen_share=None if seen is None else float(seen.double().mean()),
+            seen_fraction=None if seen is None else float(seen.double().mean()),
             calibration=calibration,
         )
 

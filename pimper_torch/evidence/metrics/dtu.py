@@ -33,8 +33,8 @@ class DtuFigures(Record):
         points: Of the result after thinning.
         judged: Of these, inside the mask.
         judged_true: Points of the scan above the table.
-        capped_share: Share of the judged points left out of accuracy, 20 mm off or more.
-        capped_share_true: Share of the scan's left out of completeness.
+        capped_fraction: Fraction of the judged points left out of accuracy, 20 mm off or more.
+        capped_fraction_true: Fraction of the scan's left out of completeness.
     """
 
     mean_accuracy: float
@@ -45,8 +45,8 @@ class DtuFigures(Record):
     points: int
     judged: int
     judged_true: int
-    capped_share: float
-    capped_share_true: float
+    capped_fraction: float
+    capped_fraction_true: float
 
 
 def dtu_figures(
@@ -100,8 +100,8 @@ def dtu_figures(
         points=len(points),
         judged=len(judged),
         judged_true=len(judged_true),
-        capped_share=1 - len(accuracy) / len(judged),
-        capped_share_true=1 - len(completeness) / len(judged_true),
+        capped_fraction=1 - len(accuracy) / len(judged),
+        capped_fraction_true=1 - len(completeness) / len(judged_true),
     )
 
 
@@ -118,9 +118,9 @@ def observed(points: Float[Tensor, "point 3"], protocol: DtuProtocol) -> Bool[Te
 
 
 def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
-    """Give the vertices, and a lattice on each face about ``distance`` apart.
+    """Give the vertices, and a subdivided mesh on each face about ``distance`` apart.
 
-    The lattice is the published one: with edges ``v1, v2`` of twice-area ``A``, it has
+    The subdivided mesh is the published one: with edges ``v1, v2`` of twice-area ``A``, it has
     ``n_i = floor(|v_i| / (distance sqrt(|v1||v2| / A)))`` steps along ``v_i``, its points at
     half steps. A face too small for a step has its vertices only.
 
@@ -152,8 +152,8 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
     k2 = (within % (n2[face] + 1) + 0.5) / n2[face]
     inside = k1 + k2 < 1
     chosen = usable[face[inside]]
-    lattice = a[chosen] + k1[inside, None] * v1[chosen] + k2[inside, None] * v2[chosen]
-    return torch.cat([vertices, lattice])
+    subdivision = a[chosen] + k1[inside, None] * v1[chosen] + k2[inside, None] * v2[chosen]
+    return torch.cat([vertices, subdivision])
 
 
 def _near(

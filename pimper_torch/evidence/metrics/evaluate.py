@@ -12,8 +12,8 @@ from pimper_torch.evidence.metrics.alignment import (
     Alignment,
     Method,
     align_estimate,
-    carry,
     paired_cameras,
+    transfer,
 )
 from pimper_torch.evidence.metrics.distances import (
     SurfaceComparison,
@@ -45,7 +45,7 @@ class EvaluateConfig:
         alignment: ``none``, ``cameras``, ``icp``, or ``auto``: cameras where both sides have
             two, else none.
         views: Names of the views that normals, albedo and the relative error are compared
-            in; if empty, the estimate's reference view, or the middle one if it has none.
+            in; if empty, the estimate's reference view, or the centre one if it has none.
         thresholds_percent: Of the diagonal of the true object's bounding box, for precision,
             recall and F-score.
         seen_from: Places of the camera that must see a true point which is counted as seen.
@@ -120,7 +120,7 @@ def evaluate(
     config = config or EvaluateConfig()
     generator = torch.Generator().manual_seed(config.seed)
     alignment = align_estimate(estimate, capture, config.alignment, config.icp, generator=generator)
-    moved = carry(estimate.mesh, alignment.truth_from_world)
+    moved = transfer(estimate.mesh, alignment.truth_from_world)
     surface = surface or prepared_surface(capture, config)
     maps = maps or capture
     compared = (
@@ -195,11 +195,11 @@ def camera_figures(estimate: Estimate, capture: Capture) -> CameraFigures | None
     if pairs is None or pairs[0].num_views < 2:
         return None
     ours, truth = pairs
-    middle, diagonal, points = None, None, None
+    centre, diagonal, points = None, None, None
     if capture.truth.mesh is not None or capture.truth.points_world is not None:
         surface = true_surface(capture)
         corners = surface.vertices_world.double()
-        middle = (corners.amin(dim=0) + corners.amax(dim=0)) / 2
+        centre = (corners.amin(dim=0) + corners.amax(dim=0)) / 2
         diagonal = bounding_diagonal(surface)
         points = corners[:: max(1, len(corners) // _PLACES)]
     return compare_cameras(
@@ -207,7 +207,7 @@ def camera_figures(estimate: Estimate, capture: Capture) -> CameraFigures | None
         truth,
         similarity_between_cameras(ours, truth),
         views=capture.views.num_views,
-        middle=middle,
+        centre=centre,
         diagonal=diagonal,
         points_true=points,
     )

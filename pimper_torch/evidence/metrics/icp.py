@@ -15,7 +15,7 @@ from pimper_torch.geometry.nearest import Nearest, NearestSurface
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import Mesh, Record
 
-# A direction of the seven that moves the surface less than this share of the strongest is no
+# A direction of the seven that moves the surface less than this fraction of the strongest is no
 # direction: turning a ball, sliding a plane.
 _UNDETERMINED = 1e-6
 
@@ -25,7 +25,7 @@ class IcpConfig:
     """How two surfaces are brought together.
 
     Attributes:
-        trimmed_share: Share of the estimate's samples, those farthest from the truth, that
+        trimmed_fraction: Fraction of the estimate's samples, those farthest from the truth, that
             each step leaves out. It must cover outliers and whatever the truth lacks; what
             the estimate lacks needs none, for only its own samples look for partners.
         distance: ``plane`` measures along the true normals, which converges faster and
@@ -33,19 +33,19 @@ class IcpConfig:
             without faces has no normals and is always measured by ``point``.
         samples: Of the estimate.
         iterations: At most.
-        tolerance: Stop when a step moves the samples by less than this share of their
+        tolerance: Stop when a step moves the samples by less than this fraction of their
             spread.
     """
 
-    trimmed_share: float = 0.2
+    trimmed_fraction: float = 0.2
     distance: Literal["plane", "point"] = "plane"
     samples: int = 8000
     iterations: int = 60
     tolerance: float = 1e-7
 
     def __post_init__(self) -> None:
-        share = self.trimmed_share
-        require(0 <= share < 1, "trimmed_share", share, "at least 0, less than 1")
+        fraction = self.trimmed_fraction
+        require(0 <= fraction < 1, "trimmed_fraction", fraction, "at least 0, less than 1")
         require(self.samples >= 100, "samples", self.samples, "at least 100")
         require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
         require(self.tolerance > 0, "tolerance", self.tolerance, "more than 0")
@@ -81,7 +81,7 @@ def trimmed_icp(
     """Find the similarity that lays an estimate on the truth, beginning near it.
 
     Each step pairs every sample of the estimate with the nearest point of the true surface,
-    drops the share of pairs that are farthest apart, and moves the estimate by the
+    drops the fraction of pairs that are farthest apart, and moves the estimate by the
     similarity that is best for the rest. It finds the nearest minimum only, and the scale
     is part of it: an estimate that starts far off may shrink into a corner of the truth, so
     look at the scale that is reported.
@@ -102,7 +102,7 @@ def trimmed_icp(
     normals = face_normals(truth.vertices_world.cpu().double(), truth.faces.cpu())
     by_plane = config.distance == "plane" and len(truth.faces) > 0
     samples = sample_surface(mesh, config.samples, generator).points
-    kept = max(3, round((1 - config.trimmed_share) * len(samples)))
+    kept = max(3, round((1 - config.trimmed_fraction) * len(samples)))
     found = start.cpu().double()
     spread = _spread(transform(found, samples))
     converged, taken = False, 0
@@ -139,14 +139,14 @@ def _step_to_planes(
     The residual ``n . (p - q)`` changes by ``n . (w x p + t + s p)``, linear in w, t and s.
     Those of the seven unknowns that the planes leave open stay zero.
     """
-    middle = source.mean(dim=0)
+    centre = source.mean(dim=0)
     size = _spread(source)
-    local = (source - middle) / size
+    local = (source - centre) / size
     unit = normals / normals.norm(dim=1, keepdim=True).clamp_min(torch.finfo(normals.dtype).tiny)
     gap = ((target - source) * unit).sum(dim=1) / size
-    turn = torch.linalg.cross(local, unit)
+    rotation = torch.linalg.cross(local, unit)
     grow = (local * unit).sum(dim=1, keepdim=True)
-    rows = torch.cat([turn, unit, grow], dim=1)
+    rows = torch.cat([rotation, unit, grow], dim=1)
     solution = torch.linalg.pinv(rows.mT @ rows, rtol=_UNDETERMINED, hermitian=True) @ (
         rows.mT @ gap
     )
@@ -154,7 +154,7 @@ def _step_to_planes(
     zero = torch.zeros_like(s)
     skew = torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
     linear = s.exp() * torch.linalg.matrix_exp(skew)
-    return rigid(linear, middle + size * t - linear @ middle)
+    return rigid(linear, centre + size * t - linear @ centre)
 
 
 def _spread(points: Float[Tensor, "point 3"]) -> float:

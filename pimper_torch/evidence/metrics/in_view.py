@@ -41,10 +41,10 @@ class ViewFigures(Record):
     Attributes:
         name: Of the view.
         relative_error: :func:`pimper_torch.evidence.metrics.relative.relative_error`, per cent.
-        coverage: Share of the true pixels whose ray meets the mesh, and not where it shows
+        coverage: Fraction of the true pixels whose ray meets the mesh, and not where it shows
             the surroundings; the other figures are over these.
         pixels: Rays that meet the truth.
-        carried_normals: Of the normals that the mesh carries at its vertices; ``None`` if it
+        transferred_normals: Of the normals that the mesh carries at its vertices; ``None`` if it
             carries none or nobody knows the true ones.
         shape_normals: Of the normals of its shape: its faces', averaged at the vertices by
             area and blended between them.
@@ -55,7 +55,7 @@ class ViewFigures(Record):
     relative_error: float
     coverage: float
     pixels: int
-    carried_normals: AngleFigures | None
+    transferred_normals: AngleFigures | None
     shape_normals: AngleFigures | None
     albedo: AlbedoFigures | None
 
@@ -140,7 +140,7 @@ def figures_of(
         relative_error=float(relative_error(met.points.double(), met.points_true.double())),
         coverage=met.coverage,
         pixels=int(met.valid.sum()),
-        carried_normals=_angles(met, mesh.normals_world, truth_from_world, maps),
+        transferred_normals=_angles(met, mesh.normals_world, truth_from_world, maps),
         shape_normals=_angles(met, shape, truth_from_world, maps),
         albedo=albedo,
     )

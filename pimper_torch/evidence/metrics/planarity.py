@@ -24,7 +24,7 @@ _JUDGES, _CANDIDATES = 20_000, 256
 # Rounds of fitting a plane to what lies near it, and taking what lies near that.
 _REFITS = 8
 
-# Normals are averaged over about this share of the diagonal, for noise tilts small faces by far.
+# Normals are averaged over about this fraction of the diagonal, for noise tilts small faces by far.
 _SMOOTHING = 0.01
 
 # Vertices that must lie away from a side's border for that to be left out: a side of a few
@@ -32,7 +32,7 @@ _SMOOTHING = 0.01
 _FEWEST_INSIDE = 12
 
 # At so many rounds over the mesh, at most.
-_MAX_ROUNDS = 60
+_MAX_ITERATIONS = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -42,7 +42,7 @@ class PlanarFace(Record):
     Attributes:
         faces: Of the mesh, that make it up.
         normal: Of the plane, outward.
-        point: In its middle.
+        point: In its centre.
         sides: Longer and shorter one of the smallest rectangle about it, scene units.
         area: Of its faces.
         rms: Root mean square distance of its vertices from the plane, by area, away from the
@@ -87,7 +87,7 @@ def planar_faces(
     *,
     band: float = 0.02,
     max_angle_deg: float = 30.0,
-    min_share: float = 0.04,
+    min_fraction: float = 0.04,
     margin: float = 0.05,
     most: int = 12,
 ) -> tuple[PlanarFace, ...]:
@@ -100,11 +100,11 @@ def planar_faces(
     Args:
         mesh: Orientation outward.
         generator: On the CPU; for the places.
-        band: How far a side may lie off its plane, as a share of the mesh's diagonal. What is
+        band: How far a side may lie off its plane, as a fraction of the mesh's diagonal. What is
             farther belongs to no side, nor to its flatness.
         max_angle_deg: How far its smoothed normals may turn away.
-        min_share: Of the mesh's area, that a side must have.
-        margin: At the border, as a share of the side's edge: not looked at for flatness, as
+        min_fraction: Of the mesh's area, that a side must have.
+        margin: At the border, as a fraction of the side's edge: not looked at for flatness, as
             edges are rounded.
         most: How many sides to find at most.
 
@@ -120,31 +120,31 @@ def planar_faces(
         )
     diagonal = (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()
     normals = _smoothed_face_normals(vertices, faces, _SMOOTHING * float(diagonal))
-    middles = vertices[faces].mean(dim=1)
+    centres = vertices[faces].mean(dim=1)
     width, cosine = band * diagonal, math.cos(math.radians(max_angle_deg))
     left = torch.ones_like(area, dtype=torch.bool)
     found: list[PlanarFace] = []
-    while len(found) < most and bool(area[left].sum() > min_share * area.sum()):
+    while len(found) < most and bool(area[left].sum() > min_fraction * area.sum()):
         weight = torch.where(left, area, 0)
         judges = torch.multinomial(weight, _JUDGES, replacement=True, generator=generator)
         tried = judges[torch.randperm(_JUDGES, generator=generator)[:_CANDIDATES]]
-        height = middles[judges] @ normals[tried].T - (middles[tried] * normals[tried]).sum(dim=1)
+        height = centres[judges] @ normals[tried].T - (centres[tried] * normals[tried]).sum(dim=1)
         near = (height.abs() < width) & (normals[judges] @ normals[tried].T > cosine)
         best = tried[near.sum(dim=0).argmax()]
-        normal, point = normals[best], middles[best]
+        normal, point = normals[best], centres[best]
         for _ in range(_REFITS):
-            near = _near(middles, normals, normal, point, width, cosine) & left
+            near = _near(centres, normals, normal, point, width, cosine) & left
             if int(near.sum()) < 3:
                 break
-            normal, point = _plane(middles[near], area[near], normal)
-        near = _near(middles, normals, normal, point, width, cosine) & left
+            normal, point = _plane(centres[near], area[near], normal)
+        near = _near(centres, normals, normal, point, width, cosine) & left
         (members,) = torch.nonzero(near, as_tuple=True)
         if len(members) == 0:
             break
         members = _largest_part(faces, area, members)
         left[members] = False
-        if area[members].sum() < min_share * area.sum():
-            if near.sum() == len(members) or area[near].sum() < min_share * area.sum():
+        if area[members].sum() < min_fraction * area.sum():
+            if near.sum() == len(members) or area[near].sum() < min_fraction * area.sum():
                 break
             continue
         found.append(_measured(vertices, faces, members, normal, margin))
@@ -157,16 +157,16 @@ def dihedrals(
     *,
     reach: float = 0.04,
     min_length: float = 0.3,
-    min_turn_deg: float = 20.0,
+    min_rotation_deg: float = 20.0,
 ) -> tuple[Dihedral, ...]:
     """Measure the angles between flat sides that meet.
 
     Args:
         mesh: They were found on.
         sides: From :func:`planar_faces`.
-        reach: How near they must come, as a share of the mesh's diagonal.
-        min_length: Of the border they share, as a share of the shorter one's edge.
-        min_turn_deg: Sides turned less are two halves of one.
+        reach: How near they must come, as a fraction of the mesh's diagonal.
+        min_length: Of the border they share, as a fraction of the shorter one's edge.
+        min_rotation_deg: Sides turned less are two halves of one.
     """
     vertices, faces = mesh.vertices_world.detach().cpu().double(), mesh.faces.cpu()
     far = reach * float((vertices.amax(dim=0) - vertices.amin(dim=0)).norm())
@@ -176,38 +176,40 @@ def dihedrals(
     for one, first in enumerate(sides):
         for other in range(one + 1, len(sides)):
             second = sides[other]
-            turn = math.degrees(math.acos(float((first.normal @ second.normal).clamp(-1, 1))))
+            rotation = math.degrees(math.acos(float((first.normal @ second.normal).clamp(-1, 1))))
             distance, _ = trees[other].query(places[one], distance_upper_bound=far)
             border = places[one][np.isfinite(distance)]
-            if len(border) < 2 or turn < min_turn_deg:
+            if len(border) < 2 or rotation < min_rotation_deg:
                 continue
             along = normalize(torch.linalg.cross(first.normal, second.normal), dim=0).numpy()
             length = float(np.ptp(border @ along))
             if length >= min_length * min(first.edge, second.edge):
-                found.append(Dihedral(one=one, other=other, angle_deg=180 - turn, length=length))
+                found.append(
+                    Dihedral(one=one, other=other, angle_deg=180 - rotation, length=length)
+                )
     return tuple(found)
 
 
 def _near(
-    middles: Float[Tensor, "face 3"],
+    centres: Float[Tensor, "face 3"],
     normals: Float[Tensor, "face 3"],
     normal: Float[Tensor, " 3"],
     point: Float[Tensor, " 3"],
     width: Float[Tensor, ""],
     cosine: float,
 ) -> Bool[Tensor, " face"]:
-    return (((middles - point) @ normal).abs() < width) & (normals @ normal > cosine)
+    return (((centres - point) @ normal).abs() < width) & (normals @ normal > cosine)
 
 
 def _plane(
     points: Float[Tensor, "point 3"], weight: Float[Tensor, " point"], like: Float[Tensor, " 3"]
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
     """Fit a plane by least squares; its normal on the side of ``like``."""
-    share = weight / weight.sum()
-    middle = (share[:, None] * points).sum(dim=0)
-    offset = points - middle
-    normal = torch.linalg.eigh((share[:, None] * offset).T @ offset).eigenvectors[:, 0]
-    return torch.where(normal @ like < 0, -normal, normal), middle
+    fraction = weight / weight.sum()
+    centre = (fraction[:, None] * points).sum(dim=0)
+    offset = points - centre
+    normal = torch.linalg.eigh((fraction[:, None] * offset).T @ offset).eigenvectors[:, 0]
+    return torch.where(normal @ like < 0, -normal, normal), centre
 
 
 def _largest_part(
@@ -228,28 +230,30 @@ def _measured(
     """Fit the plane to the inner part of a side, and measure distances from it."""
     corners = faces[members]
     area = face_normals(vertices, corners).norm(dim=1) / 2
-    share = area.new_zeros(len(vertices)).index_add(0, corners.flatten(), area.repeat_interleave(3))
-    (used,) = torch.nonzero(share > 0, as_tuple=True)
-    points, weight = vertices[used], share[used]
-    normal, middle = _plane(points, weight, like)
+    fraction = area.new_zeros(len(vertices)).index_add(
+        0, corners.flatten(), area.repeat_interleave(3)
+    )
+    (used,) = torch.nonzero(fraction > 0, as_tuple=True)
+    points, weight = vertices[used], fraction[used]
+    normal, centre = _plane(points, weight, like)
     frame = torch.linalg.svd(normal[None]).Vh[1:]
-    flat = ((points - middle) @ frame.T).numpy()
+    flat = ((points - centre) @ frame.T).numpy()
     hull = ConvexHull(flat)
     sides = _rectangle(flat[hull.vertices])
     rim = margin * math.sqrt(sides[0] * sides[1])
     outside = (flat @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
     inner = torch.from_numpy(outside < -rim)
     if int(inner.sum()) >= _FEWEST_INSIDE:
-        normal, middle = _plane(points[inner], weight[inner], like)
+        normal, centre = _plane(points[inner], weight[inner], like)
         points, weight = points[inner], weight[inner]
-    distance = ((points - middle) @ normal).abs()
+    distance = ((points - centre) @ normal).abs()
     order = distance.argsort()
     below = weight[order].cumsum(dim=0) / weight.sum()
     last = int(torch.searchsorted(below, 0.95).clamp_max(len(order) - 1))
     return PlanarFace(
         faces=members,
         normal=normal,
-        point=middle,
+        point=centre,
         sides=sides,
         area=float(area.sum()),
         rms=float(((weight * distance.square()).sum() / weight.sum()).sqrt()),
@@ -274,11 +278,11 @@ def _smoothed_face_normals(
     """Average normals over about ``length``: n rounds over the mesh reach the root of n edges."""
     corners = vertices[faces]
     edge = float(side_lengths(corners).median())
-    rounds = min(_MAX_ROUNDS, round((length / max(edge, 1e-30)) ** 2))
-    if rounds == 0:
+    iterations = min(_MAX_ITERATIONS, round((length / max(edge, 1e-30)) ** 2))
+    if iterations == 0:
         return normalize(face_normals(vertices, faces), dim=1)
     smooth = vertex_normals(vertices, faces)
-    for _ in range(rounds):
+    for _ in range(iterations):
         around = smooth[faces].sum(dim=1).repeat_interleave(3, dim=0)
         total = torch.zeros_like(smooth).index_add(0, faces.flatten(), around)
         smooth = normalize(total, dim=1)

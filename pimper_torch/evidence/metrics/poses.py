@@ -31,7 +31,7 @@ class CameraFigures(Record):
         median_rotation_deg: The same.
         mean_center: Distance between the cameras' places, scene units of the truth.
         median_center: The same.
-        mean_center_percent: Of each true camera's distance from the object's middle; NaN
+        mean_center_percent: Of each true camera's distance from the object's centre; NaN
             where nobody knows the object.
         mean_center_percent_of_diagonal: Of the object's bounding box; NaN the same.
         mean_focal_percent: Of the focal length, absolute; images of unlike size are taken
@@ -62,7 +62,7 @@ def compare_cameras(
     truth_from_world: Float[Tensor, "4 4"],
     *,
     views: int,
-    middle: Float[Tensor, " 3"] | None = None,
+    centre: Float[Tensor, " 3"] | None = None,
     diagonal: float | None = None,
     points_true: Float[Tensor, "point 3"] | None = None,
 ) -> CameraFigures:
@@ -73,21 +73,21 @@ def compare_cameras(
         truth: The same views in the same order.
         truth_from_world: Similarity; on these cameras, for the usual figure.
         views: How many photographs there are in all.
-        middle: Of the object, frame of the truth.
+        centre: Of the object, frame of the truth.
         diagonal: Of the object's bounding box.
         points_true: Some of the object's points.
     """
     truth_from_ours = truth_from_world.double().cpu()
     _, rotation = split_similarity(truth_from_ours)
-    turned = ours.cam_from_world[:, :3, :3].double().cpu() @ rotation.mT
+    rotated = ours.cam_from_world[:, :3, :3].double().cpu() @ rotation.mT
     centers = transform(truth_from_ours, ours.centers_world.double().cpu())
     centers_true = truth.centers_world.double().cpu()
-    between = truth.cam_from_world[:, :3, :3].double().cpu() @ turned.mT
+    between = truth.cam_from_world[:, :3, :3].double().cpu() @ rotated.mT
     angles = rotation_angles_deg(between)
     offset = (centers - centers_true).norm(dim=1)
     away = torch.full_like(offset, torch.nan)
-    if middle is not None:
-        away = (centers_true - middle.to(centers_true)).norm(dim=1)
+    if centre is not None:
+        away = (centers_true - centre.to(centers_true)).norm(dim=1)
     focal = _focal(ours) / _focal(truth) - 1
     place, bend = math.nan, math.nan
     if points_true is not None and diagonal:
@@ -95,8 +95,8 @@ def compare_cameras(
         if len(found) >= _FEWEST_PLACES:
             fitted = similarity_between_points(found, right)
             place, bend = (
-                float(100 * (transform(carried, found) - right).norm(dim=1).mean() / diagonal)
-                for carried in (truth_from_ours, fitted)
+                float(100 * (transform(transferred, found) - right).norm(dim=1).mean() / diagonal)
+                for transferred in (truth_from_ours, fitted)
             )
     return CameraFigures(
         views=views,

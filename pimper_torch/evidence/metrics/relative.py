@@ -40,7 +40,7 @@ class ViewComparison(Record):
 
     Attributes:
         relative_error: :func:`relative_error` over the rays that meet both, in per cent.
-        coverage: Share of the true pixels whose ray meets the mesh.
+        coverage: Fraction of the true pixels whose ray meets the mesh.
         mean_angle_deg: Between the normals, over the same rays; NaN without true normals.
         median_angle_deg: The same.
         num_pixels: Rays that meet the truth.
@@ -87,9 +87,9 @@ def compare_in_view(
         own = mesh.normals_world
         if own is None:
             own = vertex_normals(mesh.vertices_world, mesh.faces)
-        turned = rotate(truth_from_world.to(own), own)
+        rotated = rotate(truth_from_world.to(own), own)
         angles = angles_deg(
-            normalize(met.interpolate(turned).double(), dim=-1), normals_true[met.both].double()
+            normalize(met.interpolate(rotated).double(), dim=-1), normals_true[met.both].double()
         )
     return ViewComparison(
         relative_error=float(relative_error(met.points, met.points_true)),
@@ -124,7 +124,7 @@ class Meeting(Record):
 
     @property
     def coverage(self) -> float:
-        """Share of the rays that meet the truth which meet the mesh too."""
+        """Fraction of the rays that meet the truth which meet the mesh too."""
         return float(self.both.sum() / self.valid.sum())
 
     @property

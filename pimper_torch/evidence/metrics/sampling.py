@@ -14,24 +14,24 @@ from pimper_torch.records import Mesh, Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SurfaceSamples(Record):
-    """Points on a surface, each standing for the same share of it.
+    """Points on a surface, each standing for the same fraction of it.
 
     Attributes:
         points: World, float64.
         normals: Of the faces they lie in, unit; ``None`` for a point cloud.
         corners: Vertices that each lies between; the one that it is of a point cloud.
-        shares: Of these; they add up to 1.
+        fractions: Of these; they add up to 1.
     """
 
     points: Float[Tensor, "sample 3"]
     normals: Float[Tensor, "sample 3"] | None
     corners: Int[Tensor, "sample corner"]
-    shares: Float[Tensor, "sample corner"]
+    fractions: Float[Tensor, "sample corner"]
 
     def interpolate(self, per_vertex: Float[Tensor, " vertex"]) -> Float[Tensor, " sample"]:
         """Blend what is known at the vertices of the surface."""
-        values = per_vertex.detach().to(self.shares)[self.corners]
-        return (self.shares * values).sum(dim=1)
+        values = per_vertex.detach().to(self.fractions)[self.corners]
+        return (self.fractions * values).sum(dim=1)
 
 
 def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> SurfaceSamples:
@@ -60,7 +60,7 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
             points=vertices[chosen],
             normals=None,
             corners=corners,
-            shares=torch.ones_like(corners, dtype=torch.float64),
+            fractions=torch.ones_like(corners, dtype=torch.float64),
         )
     normals = face_normals(vertices, faces)
     ends = normals.norm(dim=1).cumsum(dim=0)
@@ -79,7 +79,7 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
         points=points,
         normals=normalize(normals[face], dim=1),
         corners=faces[face],
-        shares=torch.stack([1 - u - v, u, v], dim=1),
+        fractions=torch.stack([1 - u - v, u, v], dim=1),
     )
 
 

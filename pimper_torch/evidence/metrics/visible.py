@@ -9,7 +9,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Capture, Mesh
 
-# Share of the object's diagonal that a surface may lie in front of a point without hiding it:
+# Fraction of the object's diagonal that a surface may lie in front of a point without hiding it:
 # the ray caster's float32 needs a millionth, depth maps of files a thousandth.
 _HIDDEN_BEHIND = 1e-3
 

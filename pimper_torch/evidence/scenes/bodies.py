@@ -23,11 +23,11 @@ class Body:
         mesh: World. Its normals are interpolated over the faces; without them, those of the
             faces averaged round each vertex.
         texture: Albedo at points of the world; ``None`` takes the mesh's own albedo.
-        specular: Share of light that the surface mirrors where it comes straight down: 0 is
+        specular: Fraction of light that the surface mirrors where it comes straight down: 0 is
             wholly matte, 0.04 is glaze or varnish.
         roughness: Of the mirroring facets, as artists count it (its square is GGX's alpha):
             0.1 is polished, 0.5 satin.
-        conductor: A metal in place of matte surface under glaze: it mirrors the lamps as
+        conductor: A metal in place of matte surface under glaze: it mirrors the point lights as
             ``roughness`` says, other bodies and the environment sharply. Its albedo is 0.
         surroundings: Part of the scene but not of the object: the table.
     """
@@ -69,7 +69,7 @@ class Carried:
         return self.texture(transform(self.own_from_world.to(points), points))
 
 
-def carried(body: Body, world_from_own: Float[Tensor, "4 4"]) -> Body:
+def transferred(body: Body, world_from_own: Float[Tensor, "4 4"]) -> Body:
     """Move a body from its own frame to a place in the world, with its texture."""
     normals, texture = body.mesh.normals_world, body.texture
     mesh = body.mesh.replace(

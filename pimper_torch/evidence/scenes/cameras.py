@@ -12,7 +12,7 @@ from pimper_torch.geometry.frames import rigid
 from pimper_torch.records import Cameras
 
 # Of scenes on a table, whose world has z up.
-# Of two aims that are as good, the one nearer to the object's middle is taken.
+# Of two aims that are as good, the one nearer to the object's centre is taken.
 _STAY = 0.01
 FRONT, UP = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -33,7 +33,7 @@ def look_at(
 def pinholes(
     cam_from_world: Float[Tensor, "view 4 4"], focal_px: float, width: int, height: int
 ) -> Cameras:
-    """Give cameras of one focal length whose axis meets the middle of the image."""
+    """Give cameras of one focal length whose axis meets the centre of the image."""
     K = cam_from_world.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
     num_views = len(cam_from_world)
     return Cameras(
@@ -71,7 +71,7 @@ def arc_cameras(
         elevation_deg: Mean height of the arc over the plane across ``up``.
         sway_deg: How far the elevation goes up and down on the way.
         target: What the cameras look at.
-        front: Towards the middle of the arc; must be across ``up``.
+        front: Towards the centre of the arc; must be across ``up``.
         up: Axis of the arc, and up in the photographs.
     """
     toward_world = arc_directions(
@@ -120,10 +120,10 @@ def handheld_directions(
     """Walk once round the object for each of three heights, as steadily as a hand is.
 
     Args:
-        num_views: Shared out between the rounds: the first third goes at the middle height,
+        num_views: Shared out between the rounds: the first third goes at the centre height,
             then higher, then lower.
         generator: Of the irregularities.
-        elevation_deg: Of the round in the middle; the others are 18 degrees higher and 14
+        elevation_deg: Of the round in the centre; the others are 18 degrees higher and 14
             lower, none below 8 and above 75.
     """
     third = torch.arange(num_views) * 3 // num_views
@@ -154,12 +154,12 @@ def distance_to_fit(
         focal_px: Pixels.
         width: Pixels.
         height: Pixels.
-        fill: Share of the picture, along its tighter side, that the points may take.
+        fill: Fraction of the picture, along its tighter side, that the points may take.
     """
     up_world = points_world.new_tensor(UP)
     rotation = look_at(target_world + toward_world, target_world, up_world)[:, :3, :3]
     x, y, z = ((points_world - target_world) @ rotation.mT).unbind(dim=-1)
-    # At distance d a point appears f x / (d + z) from the middle; that is to be half the side.
+    # At distance d a point appears f x / (d + z) from the centre; that is to be half the side.
     wide = focal_px * x.abs() / (fill * width / 2) - z
     high = focal_px * y.abs() / (fill * height / 2) - z
     return float(torch.maximum(wide, high).amax())
@@ -182,14 +182,14 @@ def aim_to_fit(
         focal_px: Pixels.
         width: Pixels.
         height: Pixels.
-        fill: Share of the picture, along its tighter side, that the points may take.
+        fill: Fraction of the picture, along its tighter side, that the points may take.
 
     Returns:
         The target, and the distance of :func:`distance_to_fit`.
     """
     hull = points_world[torch.from_numpy(ConvexHull(points_world.numpy()).vertices).long()]
 
-    middle = (hull.amin(dim=0) + hull.amax(dim=0)) / 2
+    centre = (hull.amin(dim=0) + hull.amax(dim=0)) / 2
     mean_toward = toward_world.mean(dim=0)
 
     def distance(target: Float[Tensor, " 3"]) -> float:
@@ -204,13 +204,13 @@ def aim_to_fit(
         )
 
     def farness(values: np.ndarray) -> float:
-        # How far the cameras are from the object's middle: their distance from the target
+        # How far the cameras are from the object's centre: their distance from the target
         # alone is less the nearer the target itself is to them. Convex.
         target = torch.from_numpy(values)
-        off = target - middle
+        off = target - centre
         return distance(target) + float(off @ mean_toward) + _STAY * float(off @ off)
 
-    found = minimize(farness, middle.numpy(), method="Nelder-Mead", options={"xatol": 1e-3})
+    found = minimize(farness, centre.numpy(), method="Nelder-Mead", options={"xatol": 1e-3})
     target = torch.from_numpy(found.x)
     return target, distance(target)
 

@@ -24,9 +24,9 @@ def potato_on_table(
     contrast: float = 1.5,
     sensor: SensorConfig | None = None,
 ) -> RenderedScene:
-    """Photograph a bumpy, textured potato under a lamp that moves between photographs.
+    """Photograph a bumpy, textured potato under a point light that moves between photographs.
 
-    The lamp is two to three times the potato's length away, so its light falls off over
+    The point light is two to three times the potato's length away, so its light falls off over
     the object, and the potato shadows itself and the table.
 
     Args:
@@ -35,8 +35,8 @@ def potato_on_table(
         width: Pixels.
         height: Pixels.
         span_deg: Of the arc.
-        flash: Irradiance of a lamp on the camera itself.
-        gloss: Share of light that the potato mirrors; 0.04 is varnish.
+        flash: Irradiance of a point light on the camera itself.
+        gloss: Fraction of light that the potato mirrors; 0.04 is varnish.
         contrast: Of the texture; see :func:`random_speckle`.
         sensor: ``None`` is the default one.
     """
@@ -56,7 +56,7 @@ def potato_on_table(
             surroundings=True,
         ),
     )
-    middle = (0.0, 0.0, 0.7)
+    centre = (0.0, 0.0, 0.7)
     cameras = arc_cameras(
         num_views,
         width=width,
@@ -65,7 +65,7 @@ def potato_on_table(
         distance=4.6,
         span_deg=span_deg,
         elevation_deg=35.0,
-        target=middle,
+        target=centre,
         front=(0.0, -1.0, 0.0),
         up=(0.0, 0.0, 1.0),
     )
@@ -74,7 +74,7 @@ def potato_on_table(
         generator,
         distance=6.0,
         flash=flash,
-        target=middle,
+        target=centre,
         toward=(0.0, -0.6, 0.8),
     )
     return render_bodies(bodies, cameras, lights, generator, sensor)

@@ -15,36 +15,37 @@ class SceneConfig:
         num_views: Photographs.
         width: Pixels.
         height: Pixels.
-        seed: Of everything random: form, texture, lamp, hand and noise.
+        seed: Of everything random: form, texture, point light, hand and noise.
         path: Of the camera: along an arc, once round at one height (the object turned), or
             carried all round at three heights.
         span_deg: Of the arc.
         elevation_deg: Mean height of the camera over the table's plane.
         sway_deg: How far the camera goes up and down along the arc.
-        fill: Share of the picture that the object takes, along the tighter side.
-        fixed_lamp: The lamp stands still beside the camera, as where the object turns; only with
-            the turntable. Else it goes to another place for every photograph.
+        fill: Fraction of the picture that the object takes, along the tighter side.
+        fixed_point_light: The point light stands still beside the camera, as where the object
+            turns; only with the turntable. Else it goes to another place for every photograph.
         fixed_room: A patterned floor and wall behind the object, which stand still before the
             camera; only with the turntable. Else there is nothing beyond the table.
         fixed_table: The table stands still before the camera, too, and the object alone turns;
             only with the turntable. Else it turns with the object.
-        light: A near lamp, whose light falls off over the object, or one far away.
-        lamp_distance: Of the near lamp, in object sizes; up to a quarter nearer or farther.
-        irradiance: Of the lamp, as the radiance of white facing it; a quarter more or less.
+        light: A near point light, whose light falls off over the object, or one far away.
+        point_light_distance: Of the near point light, in object sizes; up to a quarter nearer or
+            farther.
+        irradiance: Of the point light, as the radiance of white facing it; a quarter more or less.
         ambient: Light from everywhere, as the radiance of white; a quarter more or less.
-        flash: Of a second lamp on the camera, like irradiance; 0 is none.
+        flash: Of a second point light on the camera, like irradiance; 0 is none.
         bounces: Of light between surfaces, on its way to the one that is seen.
         exposure: Radiance is multiplied by it; what exceeds 1 saturates.
         read_noise: Standard deviation of the sensor in the dark; 1 is saturation.
-        shot_noise: Variance that light adds, as a share of its radiance.
+        shot_noise: Variance that light adds, as a fraction of its radiance.
         supersample: Rays a pixel, along each side, where pixels differ from their neighbours.
         bits: Of a sample in the photographs.
         encoding: sRGB as cameras write it, or samples proportional to radiance.
         table: Its texture: cloth is modest, patterned has plenty of features all over.
         up: Which axis of a mesh file points up.
-        turn_deg: Of the object about the upright axis, counter-clockwise seen from above.
+        rotation_deg: Of the object about the upright axis, counter-clockwise seen from above.
         albedo: Linear red, green and blue, uniform over the object; by default its texture.
-        specular: Share of light that the object mirrors head on, 0 is matte; by default the
+        specular: Fraction of light that the object mirrors head on, 0 is matte; by default the
             scene's own, for a mesh file 0.
         roughness: Of the highlight, 0.1 polished to 0.5 satin; by default the scene's own, for
             a mesh file 0.3.
@@ -64,11 +65,11 @@ class SceneConfig:
     elevation_deg: float = 30.0
     sway_deg: float = 4.0
     fill: float = 0.94
-    fixed_lamp: bool = False
+    fixed_point_light: bool = False
     fixed_room: bool = False
     fixed_table: bool = False
     light: Literal["point", "directional"] = "point"
-    lamp_distance: float = 2.5
+    point_light_distance: float = 2.5
     irradiance: float = 0.85
     ambient: float = 0.1
     flash: float = 0.0
@@ -81,7 +82,7 @@ class SceneConfig:
     encoding: Literal["srgb", "linear"] = "srgb"
     table: Literal["cloth", "patterned"] = "cloth"
     up: Literal["x", "y", "z"] = "z"
-    turn_deg: float = 0.0
+    rotation_deg: float = 0.0
     albedo: tuple[float, float, float] | None = None
     specular: float | None = None
     roughness: float | None = None
@@ -103,7 +104,7 @@ class SceneConfig:
             f"between 2 and 85 with {self.sway_deg} (sway_deg) taken from it or added",
         )
         require(0.1 <= self.fill <= 1, "fill", self.fill, "between 0.1 and 1")
-        for name in ("fixed_lamp", "fixed_room", "fixed_table"):
+        for name in ("fixed_point_light", "fixed_room", "fixed_table"):
             fixed = getattr(self, name)
             require(
                 not fixed or self.path == "turntable",
@@ -111,7 +112,12 @@ class SceneConfig:
                 fixed,
                 f"path turntable instead of {self.path}, for what stands still before the camera",
             )
-        require(self.lamp_distance >= 1, "lamp_distance", self.lamp_distance, "1 or more")
+        require(
+            self.point_light_distance >= 1,
+            "point_light_distance",
+            self.point_light_distance,
+            "1 or more",
+        )
         for name in ("irradiance", "ambient", "flash"):
             value = getattr(self, name)
             require(0 <= value < float("inf"), name, value, "0 or more")

@@ -21,7 +21,7 @@ class Environment:
 
     Attributes:
         walls: Radiance in unit directions of its own frame.
-        windows: In its own frame; rows of each: the unit direction of its middle, and two
+        windows: In its own frame; rows of each: the unit direction of its centre, and two
             vectors across it, one over the tangents of half its width and height long.
         window_radiance: Of all windows.
         own_from_world: Rotation.

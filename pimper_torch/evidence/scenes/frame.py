@@ -19,7 +19,7 @@ _BATCH = 1 << 16
 # Square roots of radiance that differ by more are sampled finely: about 4 levels of 255.
 _UNEVEN = 0.015
 # A highlight is noticeable from a hundredth of saturation, or a twentieth of the matte part.
-_NOTICEABLE, _NOTICEABLE_SHARE = 0.01, 0.05
+_NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -32,7 +32,7 @@ class Frame(Record):
         normals_world: Unit, outward; zero where the ray meets nothing.
         albedo: Linear; zero where the ray meets nothing.
         foreground: True on the object.
-        lit: True where the lamp reaches the surface.
+        lit: True where the point light reaches the surface.
         highlight: True where a highlight adds noticeably to the matte part: a hundredth of
             saturation or more, and a twentieth of the matte part. So does all that a conductor
             mirrors.
@@ -120,22 +120,22 @@ class _Look:
         self._cam_from_world = cameras.cam_from_world[view]
         self._intrinsics = cameras.intrinsics[view]
         self._eye = cameras.centers_world[view].float()
-        self._lamp = lights.lamp(view)
+        self._point_light = lights.point_light(view)
         self._indirect = None
         if interreflection is not None:
-            self._indirect = interreflection.light(stage, self._lamp)
+            self._indirect = interreflection.light(stage, self._point_light)
 
     def at(self, pixels: Float[Tensor, "pixel 2"]) -> _Seen:
         """Look through places in the image."""
         rays = rays_through(pixels, self._cam_from_world, self._intrinsics).float()
         spots = self._stage.trace(self._eye, rays)
-        shaded = self._stage.shade(spots, self._eye, self._lamp, self._indirect)
+        shaded = self._stage.shade(spots, self._eye, self._point_light, self._indirect)
         hit = (spots.body >= 0)[:, None]
-        beyond = self._lamp.surroundings(rays)
+        beyond = self._point_light.surroundings(rays)
         radiance = self._exposure * torch.where(hit, shaded.matte + shaded.mirrored, beyond)
         mirrored = self._exposure * shaded.mirrored.mean(dim=-1)
         matte = shaded.matte.mean(dim=-1)
-        relative = mirrored > _NOTICEABLE_SHARE * self._exposure * matte
+        relative = mirrored > _NOTICEABLE_FRACTION * self._exposure * matte
         return _Seen(
             spots=spots,
             radiance=radiance,

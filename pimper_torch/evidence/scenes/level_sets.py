@@ -66,8 +66,8 @@ def smooth_union(
 
     The polynomial minimum: once differentiable, and exact where they differ by more.
     """
-    share = ((width - (first - second).abs()) / width).clamp_min(0)
-    return torch.minimum(first, second) - share**2 * width / 4
+    fraction = ((width - (first - second).abs()) / width).clamp_min(0)
+    return torch.minimum(first, second) - fraction**2 * width / 4
 
 
 def smooth_difference(

@@ -15,7 +15,7 @@ _FAR = 1e5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Lamp(Record):
+class PointLight(Record):
     """The light of one photograph, in float32; see :class:`Lights`."""
 
     position: Float[Tensor, " 3"]
@@ -73,9 +73,9 @@ class Lights(Record):
     flash: Float[Tensor, " view"]
     environments: tuple[Environment, ...] | None = None
 
-    def lamp(self, view: int) -> Lamp:
+    def point_light(self, view: int) -> PointLight:
         """Pick the light of one photograph."""
-        return Lamp(
+        return PointLight(
             position=self.positions_world[view].float(),
             target=self.target_world.float(),
             irradiance=float(self.irradiance[view]),
@@ -113,11 +113,11 @@ def wandering_lights(
     target: tuple[float, float, float] = (0.0, 0.0, 0.0),
     toward: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Lights:
-    """Carry a lamp to another place for every photograph; float64.
+    """Carry a point light to another place for every photograph; float64.
 
     Args:
         num_views: How many photographs.
-        generator: Decides where the lamp goes, and how bright it is.
+        generator: Decides where the point light goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
         spread_deg: Greatest angle from ``toward``.
         min_tilt_deg: Smallest angle from ``toward``.
@@ -125,16 +125,16 @@ def wandering_lights(
         ambient: The same.
         flash: The same for every view.
         target: What is lit.
-        toward: Axis of the cone the lamp moves in.
+        toward: Axis of the cone the point light moves in.
     """
     axis = normalize(torch.tensor(toward, dtype=torch.float64), dim=0)
     aside = torch.linalg.svd(axis[None]).Vh[1:]
     square = _even_square(num_views, generator)
-    turn = 2 * torch.pi * square[:, 0]
+    rotation = 2 * torch.pi * square[:, 0]
     lowest, highest = torch.deg2rad(torch.tensor([spread_deg, min_tilt_deg])).cos().tolist()
     cosine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
     sine = (1 - cosine**2).sqrt()
-    across = turn.cos()[:, None] * aside[0] + turn.sin()[:, None] * aside[1]
+    across = rotation.cos()[:, None] * aside[0] + rotation.sin()[:, None] * aside[1]
     direction = cosine[:, None] * axis + sine[:, None] * across
     target_world = torch.tensor(target, dtype=torch.float64)
     return Lights(
@@ -160,29 +160,29 @@ def lights_round(
     sweep_deg: float = 160.0,
     elevations_deg: tuple[float, float] = (18.0, 72.0),
 ) -> Lights:
-    """Carry a lamp round an object on a table, on the side that is photographed; float64.
+    """Carry a point light round an object on a table, on the side that is photographed; float64.
 
     Args:
-        azimuths: Radians about the world's z, counter-clockwise from -y: the middle of the
-            lamp's sweep in each photograph.
-        generator: Decides where the lamp goes, and how bright it is.
+        azimuths: Radians about the world's z, counter-clockwise from -y: the centre of the
+            point light's sweep in each photograph.
+        generator: Decides where the point light goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
         target: What is lit.
         irradiance: Mean over the views; drawn up to a quarter less or more.
         ambient: The same.
         flash: The same for every view.
-        far: The lamp is so far away that its light comes from one direction and does not
+        far: The point light is so far away that its light comes from one direction and does not
             fall off.
-        sweep_deg: How far round the object the lamp goes.
-        elevations_deg: Lowest and highest place of the lamp over the table's plane.
+        sweep_deg: How far round the object the point light goes.
+        elevations_deg: Lowest and highest place of the point light over the table's plane.
     """
     count = len(azimuths)
     square = _even_square(count, generator)
-    turn = azimuths + torch.deg2rad(sweep_deg * (square[:, 0] - 0.5))
+    rotation = azimuths + torch.deg2rad(sweep_deg * (square[:, 0] - 0.5))
     lowest, highest = torch.deg2rad(torch.tensor(elevations_deg)).sin().tolist()
     sine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
     cosine = (1 - sine**2).sqrt()
-    direction = torch.stack([cosine * turn.sin(), -cosine * turn.cos(), sine], dim=-1)
+    direction = torch.stack([cosine * rotation.sin(), -cosine * rotation.cos(), sine], dim=-1)
     away = distance * _about_one(count, generator)
     return Lights(
         positions_world=target + (_FAR if far else 1) * away[:, None] * direction,

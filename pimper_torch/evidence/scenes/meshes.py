@@ -27,7 +27,7 @@ def potato(generator: torch.Generator, *, subdivisions: int = 6, bumps: float = 
     Args:
         generator: Decides its form.
         subdivisions: Of the sphere it starts from; 6 gives 81920 faces.
-        bumps: Root mean square of the fine relief, scene units; 0 leaves it smooth.
+        bumps: Root mean square of the fine height field, scene units; 0 leaves it smooth.
     """
     sphere, faces = icosphere(subdivisions)
     body = sphere * sphere.new_tensor([1.2, 0.95, 0.85])
@@ -60,12 +60,12 @@ def lathe(profile: Float[Tensor, "level 2"], around: int = 192) -> Mesh:
             0, no other is.
         around: Vertices on each ring.
     """
-    turn = 2 * torch.pi * torch.arange(around, dtype=profile.dtype) / around
+    rotation = 2 * torch.pi * torch.arange(around, dtype=profile.dtype) / around
     radius, height = profile[1:-1].unbind(dim=-1)
     rings = torch.stack(
         [
-            radius[:, None] * turn.cos(),
-            radius[:, None] * turn.sin(),
+            radius[:, None] * rotation.cos(),
+            radius[:, None] * rotation.sin(),
             height[:, None].expand(-1, around),
         ],
         dim=-1,
@@ -86,11 +86,11 @@ def moved(
     mesh: Mesh,
     *,
     scale: float = 1.0,
-    turn_deg: float = 0.0,
+    rotation_deg: float = 0.0,
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Mesh:
     """Scale a mesh, turn it about the z axis, then shift it."""
-    cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    cosine, sine = math.cos(math.radians(rotation_deg)), math.sin(math.radians(rotation_deg))
     vertices = mesh.vertices_world
     rotation = vertices.new_tensor([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     normals = mesh.normals_world
@@ -103,12 +103,12 @@ def moved(
 def push_clear(
     mesh: Mesh, others: Sequence[Mesh], place: tuple[float, float], step: float = 0.02
 ) -> Mesh:
-    """Shift a solid to a place on the table, and on away from the middle until it is free.
+    """Shift a solid to a place on the table, and on away from the centre until it is free.
 
     Args:
         mesh: Closed.
         others: Closed solids that it must not cut.
-        place: Where it would best be; not the middle.
+        place: Where it would best be; not the centre.
         step: Scene units.
     """
     own, rest = _Solid(mesh), [_Solid(one) for one in others]

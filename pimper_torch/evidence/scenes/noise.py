@@ -1,4 +1,4 @@
-"""Smooth random functions of space, for texture and relief."""
+"""Smooth random functions of space, for texture and height field."""
 
 from dataclasses import dataclass
 
@@ -68,13 +68,13 @@ def random_waves(
 class Speckle:
     """A solid texture: an albedo for every point of space.
 
-    Several lattices of random values, each finer than the one before, are blended
+    Several subdivided meshes of random values, each finer than the one before, are blended
     linearly, added and pushed towards light and dark, so that features of many sizes have
     edges. The same point has the same colour in every view.
 
     Attributes:
-        lattices: One an octave, periodic: along each axis the last value repeats the first.
-        cells: Scene units between lattice points, one an octave.
+        subdivisions: One an octave, periodic: along each axis the last value repeats the first.
+        cells: Scene units between subdivided mesh points, one an octave.
         weights: One an octave.
         darkest: Lowest albedo.
         brightest: Highest albedo.
@@ -84,7 +84,7 @@ class Speckle:
         tint: Multiplies each channel.
     """
 
-    lattices: Float[Tensor, "octave channel side side side"]
+    subdivisions: Float[Tensor, "octave channel side side side"]
     cells: tuple[float, ...]
     weights: tuple[float, ...]
     darkest: float
@@ -96,15 +96,19 @@ class Speckle:
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
         """Give the albedo at points."""
         rows = points.reshape(-1, 3)
-        side = self.lattices.shape[-1] - 1
-        channels = self.lattices.shape[1]
+        side = self.subdivisions.shape[-1] - 1
+        channels = self.subdivisions.shape[1]
         total = rows.new_zeros(channels, len(rows))
-        for lattice, cell, weight in zip(self.lattices, self.cells, self.weights, strict=True):
+        for subdivision, cell, weight in zip(
+            self.subdivisions, self.cells, self.weights, strict=True
+        ):
             grid = torch.remainder(rows / cell, side) * (2 / side) - 1
-            values = grid_sample(lattice[None].to(rows), grid[None, None, None], align_corners=True)
+            values = grid_sample(
+                subdivision[None].to(rows), grid[None, None, None], align_corners=True
+            )
             total = total + weight * values[0, :, 0, 0]
-        share = torch.sigmoid(self.contrast * (total + self.offset))
-        albedo = self.darkest + (self.brightest - self.darkest) * share
+        fraction = torch.sigmoid(self.contrast * (total + self.offset))
+        albedo = self.darkest + (self.brightest - self.darkest) * fraction
         return (albedo.mT * rows.new_tensor(self.tint)).reshape(*points.shape[:-1], channels)
 
 
@@ -139,7 +143,7 @@ def random_speckle(
     shared = torch.randn(shape, generator=generator)
     own = torch.randn((len(cells), channels, side, side, side), generator=generator)
     return Speckle(
-        lattices=pad((1 - colour) * shared + colour * own, (0, 1, 0, 1, 0, 1), mode="circular"),
+        subdivisions=pad((1 - colour) * shared + colour * own, (0, 1, 0, 1, 0, 1), mode="circular"),
         cells=cells,
         weights=tuple(1.0 for _ in cells),
         darkest=darkest,

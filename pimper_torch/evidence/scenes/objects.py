@@ -92,7 +92,7 @@ def mug(generator: torch.Generator) -> tuple[Body, ...]:
     )
     outside = CylinderRegion(radii=(_MUG_RADIUS - _MUG_WALL / 2, float("inf")))
     texture = Painted(ground=plain, paint=decor, where=outside)
-    mesh = moved(mug_mesh(), turn_deg=-25.0)
+    mesh = moved(mug_mesh(), rotation_deg=-25.0)
     return (Body(mesh=mesh, texture=texture, specular=0.045, roughness=0.22),)
 
 
@@ -159,8 +159,8 @@ def jar_mesh(levels: int = 280, around: int = 224) -> Mesh:
     steps = torch.linspace(0, float(along[-1]), levels - 1, dtype=torch.float64)
     wall = torch.from_numpy(smooth(steps.numpy()))
     wall[:, 1].clamp_(min=0)  # between its first corners the curve dips by a hair
-    middle_of_foot, top = corners.new_tensor([[0.0, 0.0]]), corners[-1:]
-    return lathe(torch.cat([middle_of_foot, wall[:-1], top]), around)
+    centre_of_foot, top = corners.new_tensor([[0.0, 0.0]]), corners[-1:]
+    return lathe(torch.cat([centre_of_foot, wall[:-1], top]), around)
 
 
 def balls(generator: torch.Generator) -> tuple[Body, ...]:
@@ -188,7 +188,7 @@ def balls(generator: torch.Generator) -> tuple[Body, ...]:
 def potatoes(generator: torch.Generator) -> tuple[Body, ...]:
     """Heap matte, bumpy potatoes with weak texture and a few eyes."""
     bodies: list[Body] = []
-    for (x, y), size, turn_deg in _POTATOES:
+    for (x, y), size, rotation_deg in _POTATOES:
         grown = potato(generator, bumps=0.009)
         skin = random_speckle(
             generator,
@@ -208,7 +208,7 @@ def potatoes(generator: torch.Generator) -> tuple[Body, ...]:
             offset=1.6,
             colour=0.0,
         )
-        mesh = moved(grown, scale=size, turn_deg=turn_deg)
+        mesh = moved(grown, scale=size, rotation_deg=rotation_deg)
         mesh = push_clear(mesh, [body.mesh for body in bodies], (x, y))
         bodies.append(Body(mesh=mesh, texture=Marked(ground=skin, marks=eyes)))
     return tuple(bodies)
@@ -227,7 +227,7 @@ def pair(generator: torch.Generator) -> tuple[Body, ...]:
     skin = random_speckle(generator, cells=(0.27, 0.11, 0.047), darkest=0.15, contrast=1.5)
     (back, back_size), (front, front_size) = _PAIR
     tall = moved(jar_mesh(), scale=back_size, shift=(*back, 0.0))
-    low = moved(potato(generator), scale=front_size, turn_deg=20.0, shift=(*front, 0.0))
+    low = moved(potato(generator), scale=front_size, rotation_deg=20.0, shift=(*front, 0.0))
     return (
         Body(mesh=tall, texture=clay, specular=0.04, roughness=0.3),
         Body(mesh=low, texture=skin),

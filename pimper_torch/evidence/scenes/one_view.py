@@ -56,7 +56,7 @@ def photograph(
         lights: Direction times strength.
         generator: On the CPU; for the noise.
         noise: Standard deviation of what is added to each value before negative ones are cut
-            off, as a share of the brightest.
+            off, as a fraction of the brightest.
     """
     n, rho = normals[mask].mT, albedo[mask].mT
     values = (lights @ n).clamp_min(0)[:, None] * rho
@@ -152,10 +152,10 @@ def regions(
     return palette[torch.arange(seeds) % colours][nearest]
 
 
-def lamps(
+def point_lights(
     views: int, generator: torch.Generator, widest_deg: float = 50.0
 ) -> Float[Tensor, "view 3"]:
-    """Draw distant lamps round the viewing direction, evenly over the cap, strength 0.7 to 1.3."""
+    """Draw distant point lights evenly over the cap round the view, of strength 0.7 to 1.3."""
     widest = torch.cos(torch.deg2rad(torch.tensor(widest_deg, dtype=torch.float64)))
     drawn = torch.rand(3, views, generator=generator, dtype=torch.float64)
     z = 1 - (1 - widest) * drawn[0]

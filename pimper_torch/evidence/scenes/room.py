@@ -1,4 +1,4 @@
-"""What stays where it is before the camera while an object turns: a room, its table, its lamp.
+"""The static background of a turntable capture: a room, its table, its point light.
 
 Frame of the room: z up from the table's plane, its origin on the turntable's axis, the camera on
 the side of -y.
@@ -20,7 +20,7 @@ from pimper_torch.records import Mesh
 _THICKNESS, _HALF_SIDE, _BEHIND = 0.12, 9.0, 4.5
 
 
-def turned_about(
+def rotated_about(
     axis_world: Float[Tensor, " 3"], azimuths: Float[Tensor, " view"]
 ) -> Float[Tensor, "view 4 4"]:
     """Give ``world_from_room``, where the object and not the camera turns.
@@ -41,7 +41,7 @@ def fixed_light(light_room: Lights, world_from_room: Float[Tensor, "view 4 4"]) 
     """Leave one light at its place in the room.
 
     Args:
-        light_room: One lamp; its target is on the axis.
+        light_room: One point light; its target is on the axis.
         world_from_room: One a photograph.
     """
     count = len(world_from_room)

@@ -1,4 +1,4 @@
-"""A whole scene, ready to be photographed: bodies, cameras and lamps."""
+"""A whole scene, ready to be photographed: bodies, cameras and point lights."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ from pimper_torch.errors import InputError
 from pimper_torch.evidence.scenes.bodies import (
     Body,
     albedo_at_vertices,
-    carried,
     normals_at_vertices,
+    transferred,
 )
 from pimper_torch.evidence.scenes.cameras import (
     UP,
@@ -32,7 +32,7 @@ from pimper_torch.evidence.scenes.lights import Lights, lights_round
 from pimper_torch.evidence.scenes.meshes import join
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.objects import RECIPES, TABLES
-from pimper_torch.evidence.scenes.room import fixed_light, room, turned_about, turntable
+from pimper_torch.evidence.scenes.room import fixed_light, room, rotated_about, turntable
 from pimper_torch.evidence.scenes.textures import Uniform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.io.meshes import read_mesh
@@ -69,7 +69,10 @@ class Scene:
 
     def bodies_in(self, view: int) -> tuple[Body, ...]:
         """Give all bodies where one photograph has them."""
-        return (*self.bodies, *(carried(body, self.world_from_room[view]) for body in self.fixed))
+        return (
+            *self.bodies,
+            *(transferred(body, self.world_from_room[view]) for body in self.fixed),
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -99,7 +102,7 @@ def _generator(seed: int, number: int) -> torch.Generator:
 
 
 def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
-    """Put an object on a table, and place cameras and lamps round it.
+    """Put an object on a table, and place cameras and point lights round it.
 
     Args:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
@@ -129,7 +132,7 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     eyes = target + distance * toward
     poses = look_at(eyes, target, target.new_tensor(UP))
     azimuths = torch.atan2(toward[:, 0], -toward[:, 1])
-    world_from_room = turned_about(target, azimuths)
+    world_from_room = rotated_about(target, azimuths)
     lights = _lights(config, generator, azimuths, target, (lowest, highest))
     reach = float((points - target)[:, :2].norm(dim=-1).amax())
     environments = _environments(config, world_from_room)
@@ -153,19 +156,19 @@ def _lights(
     box: tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]],
 ) -> Lights:
     lowest, highest = box
-    target = aim * aim.new_tensor(UP) if config.fixed_lamp else (lowest + highest) / 2
+    target = aim * aim.new_tensor(UP) if config.fixed_point_light else (lowest + highest) / 2
     ahead = torch.zeros_like(azimuths) if config.path == "arc" else azimuths
     lights = lights_round(
-        torch.zeros_like(azimuths[:1]) if config.fixed_lamp else ahead,
+        torch.zeros_like(azimuths[:1]) if config.fixed_point_light else ahead,
         generator,
-        distance=config.lamp_distance * float((highest - lowest).amax()),
+        distance=config.point_light_distance * float((highest - lowest).amax()),
         target=target,
         irradiance=config.irradiance,
         ambient=config.ambient,
         flash=config.flash,
         far=config.light == "directional",
     )
-    return fixed_light(lights, turned_about(aim, azimuths)) if config.fixed_lamp else lights
+    return fixed_light(lights, rotated_about(aim, azimuths)) if config.fixed_point_light else lights
 
 
 def _environments(
@@ -195,7 +198,7 @@ def _surroundings(
     fixed = room(generator) if config.fixed_room else ()
     if config.fixed_table:
         return (), (table, *fixed)
-    return (carried(table, turned_about(axis, torch.zeros_like(axis[:1]))[0]),), fixed
+    return (transferred(table, rotated_about(axis, torch.zeros_like(axis[:1]))[0]),), fixed
 
 
 def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "view 3"]:
@@ -224,8 +227,8 @@ def _finished(body: Body, config: SceneConfig) -> Body:
         conductor=conductor,
     )
     origin = body.mesh.vertices_world.new_zeros(3)
-    turn = torch.deg2rad(origin.new_tensor([config.turn_deg]))
-    return carried(made, turned_about(origin, turn)[0]) if config.turn_deg else made
+    rotation = torch.deg2rad(origin.new_tensor([config.rotation_deg]))
+    return transferred(made, rotated_about(origin, rotation)[0]) if config.rotation_deg else made
 
 
 def _read_body(path: str | Path, config: SceneConfig, generator: torch.Generator) -> Body:
@@ -244,7 +247,7 @@ def _read_body(path: str | Path, config: SceneConfig, generator: torch.Generator
 
 
 def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
-    """Turn the axis ``up`` to z, scale to the usual size and stand on the table's middle."""
+    """Turn the axis ``up`` to z, scale to the usual size and stand on the table's centre."""
     first = {"x": 1, "y": 2, "z": 0}[up]  # a cyclic change of axes keeps it right-handed
     order = [first, (first + 1) % 3, (first + 2) % 3]
     vertices = mesh.vertices_world[:, order]

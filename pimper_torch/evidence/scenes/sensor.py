@@ -17,7 +17,7 @@ class SensorConfig:
         supersample: Rays a pixel, along each side, where neighbouring pixels differ; one ray
             where they do not.
         read_noise: Standard deviation in the dark; 1 is saturation.
-        shot_noise: Variance that light adds, as a share of its radiance.
+        shot_noise: Variance that light adds, as a fraction of its radiance.
         exposure: Radiance is multiplied by it before it saturates at 1.
     """
 

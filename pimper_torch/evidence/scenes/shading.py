@@ -22,7 +22,7 @@ _MIN_SPECULAR = 0.02
 def fresnel(
     cosine: Float[Tensor, "*batch"], specular: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
-    """Give the share of light that is mirrored.
+    """Give the fraction of light that is mirrored.
 
     Args:
         cosine: Between the light and what it falls on.
@@ -52,7 +52,7 @@ def masking(
     to_eye: Float[Tensor, "*batch"],
     alpha: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch"]:
-    """Give Smith's share of facets that both light and eye see, over ``4 cos cos``.
+    """Give Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
 
     Args:
         to_light: Cosine between light and normal, more than 0.

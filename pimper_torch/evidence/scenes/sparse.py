@@ -19,7 +19,7 @@ def sparse_scene(
     *,
     min_views: int = 3,
     noise_px: float = 0.0,
-    outlier_share: float = 0.0,
+    outlier_fraction: float = 0.0,
     in_views: tuple[int, ...] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> SparseScene:
@@ -35,15 +35,15 @@ def sparse_scene(
         generator: Decides which points, and the noise.
         min_views: Shortest track.
         noise_px: Standard deviation of every observation.
-        outlier_share: Share of the points that are moved along their first ray by up to
+        outlier_fraction: Fraction of the points that are moved along their first ray by up to
             half their depth, keeping their short, wrong tracks.
         in_views: Pick points in the maps of these views; ``None`` is all of them, so that
-            some points lie on sides that the middle view does not see.
+            some points lie on sides that the centre view does not see.
         dtype: Of photographs, cameras and points; the default is what structure from
             motion gives.
     """
     require(min_views >= 2, "min_views", min_views, "2 or more to triangulate from")
-    require(0 <= outlier_share < 1, "outlier_share", outlier_share, "at least 0, below 1")
+    require(0 <= outlier_fraction < 1, "outlier_fraction", outlier_fraction, "at least 0, below 1")
     cameras = scene.cameras
     views = tuple(range(cameras.num_views)) if in_views is None else in_views
     points = _pick(scene, views, 4 * num_points, generator)
@@ -55,7 +55,7 @@ def sparse_scene(
         spread = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         pixels = pixels + noise_px * spread.to(pixels)
         points = triangulate_rays(cameras, pixels, seen)
-    num_outliers = round(outlier_share * len(points))
+    num_outliers = round(outlier_fraction * len(points))
     if num_outliers > 0:
         points, seen = _mislead(points, seen, cameras, num_outliers, generator)
     where = project(points, cameras.cam_from_world, cameras.intrinsics)[0].movedim(0, 1)
@@ -81,12 +81,12 @@ def _pick(
 ) -> Float[Tensor, "point 3"]:
     """Unproject pixels drawn at random from the depth maps of some views."""
     cameras, found = scene.cameras, []
-    share = -(-count // len(views))
+    fraction = -(-count // len(views))
     for view in views:
         width, height = (int(side) for side in cameras.sizes_px[view])
         depth = scene.depth[view].to(cameras.intrinsics).reshape(-1)
         (hit,) = torch.nonzero(depth.isfinite(), as_tuple=True)
-        hit = hit[torch.randperm(len(hit), generator=generator)[:share]]
+        hit = hit[torch.randperm(len(hit), generator=generator)[:fraction]]
         pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)[hit]
         rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
         found.append(cameras.centers_world[view] + depth[hit, None] * rays)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.evidence.scenes.bodies import Body, albedo_at_vertices, normals_at_vertices
-from pimper_torch.evidence.scenes.lights import Lamp
+from pimper_torch.evidence.scenes.lights import PointLight
 from pimper_torch.evidence.scenes.meshes import join
 from pimper_torch.evidence.scenes.shading import reflect
 from pimper_torch.geometry.visibility import Hits, RayCaster
@@ -47,7 +47,7 @@ class Shaded(Record):
     Attributes:
         matte: Radiance of the matte part.
         mirrored: Radiance of the highlight, and of what a conductor mirrors.
-        lit: True where the lamp reaches.
+        lit: True where the point light reaches.
     """
 
     matte: Float[Tensor, "ray channel"]
@@ -71,7 +71,7 @@ class Stage:
         counts = torch.tensor([len(body.mesh.faces) for body in bodies])
         self._ends = torch.cumsum(counts, dim=0)
         self._starts = self._ends - counts
-        # A conductor's share of mirrored light is Fresnel's own; 1 leaves the lobe alone.
+        # A conductor's fraction of mirrored light is Fresnel's own; 1 leaves the lobe alone.
         self._specular = torch.tensor([1.0 if body.conductor else body.specular for body in bodies])
         self._metal = torch.tensor([body.conductor is not None for body in bodies])
         self._roughness = torch.tensor([body.roughness for body in bodies])
@@ -103,7 +103,7 @@ class Stage:
         normals: Float[Tensor, "ray 3"],
         position: Float[Tensor, " 3"],
     ) -> Bool[Tensor, " ray"]:
-        """Tell where a lamp is above a surface's horizon and no body is in between."""
+        """Tell where a point light is above a surface's horizon and no body is in between."""
         start = points + self.clearance * normals
         toward = position - start
         (facing,) = torch.nonzero((normals * toward).sum(dim=-1) > 0, as_tuple=True)
@@ -116,7 +116,7 @@ class Stage:
         self,
         spots: Spots,
         eye: Float[Tensor, "*origin 3"],
-        lamp: Lamp,
+        point_light: PointLight,
         indirect: Float[Tensor, "vertex channel"] | None = None,
         *,
         flash: Float[Tensor, " 3"] | None = None,
@@ -127,7 +127,7 @@ class Stage:
         Args:
             spots: What it sees.
             eye: Where it is, or where each ray comes from.
-            lamp: The light.
+            point_light: The light.
             indirect: What other surfaces send to each vertex, as irradiance.
             flash: Where the flash is, and casts shadows from; by default at the eye, which sees
                 none of them.
@@ -135,20 +135,20 @@ class Stage:
         """
         specular, roughness = self._specular[spots.body], self._roughness[spots.body]
         to_eye = normalize(eye - spots.points, dim=-1)
-        lit = self.lit(spots.points, spots.normals, lamp.position)
+        lit = self.lit(spots.points, spots.normals, point_light.position)
         place_of_flash = eye if flash is None else flash
         flashed = spots.body >= 0
-        if flash is not None and lamp.flash > 0:
+        if flash is not None and point_light.flash > 0:
             flashed = self.lit(spots.points, spots.normals, flash)
-        received = torch.full_like(specular, lamp.ambient)
+        received = torch.full_like(specular, point_light.ambient)
         mirrored = torch.zeros_like(spots.points)
         for place, irradiance, reached in (
-            (lamp.position, lamp.irradiance, lit),
-            (place_of_flash, lamp.flash, flashed),
+            (point_light.position, point_light.irradiance, lit),
+            (place_of_flash, point_light.flash, flashed),
         ):
             if irradiance == 0:
                 continue
-            toward, arriving = lamp.arriving(spots.points, place, irradiance)
+            toward, arriving = point_light.arriving(spots.points, place, irradiance)
             matte, lobe = reflect(spots.normals, toward, to_eye, specular, roughness)
             half = normalize(toward + to_eye, dim=-1)
             tint = self._tint(spots.body, (half * toward).sum(dim=-1))
@@ -160,7 +160,7 @@ class Stage:
         (metal,) = torch.nonzero(self._metal[spots.body] & (spots.body >= 0), as_tuple=True)
         if len(metal) and bounces > 0:
             seen = self._mirrored(
-                spots, metal, to_eye[metal], lamp, indirect, place_of_flash, bounces - 1
+                spots, metal, to_eye[metal], point_light, indirect, place_of_flash, bounces - 1
             )
             mirrored = mirrored.index_add(0, metal, seen)
         return Shaded(matte=spots.albedo * total, mirrored=mirrored, lit=lit)
@@ -170,7 +170,7 @@ class Stage:
         spots: Spots,
         metal: Int[Tensor, " metal"],
         to_eye: Float[Tensor, "metal 3"],
-        lamp: Lamp,
+        point_light: PointLight,
         indirect: Float[Tensor, "vertex channel"] | None,
         flash: Float[Tensor, " 3"],
         bounces: int,
@@ -181,9 +181,9 @@ class Stage:
         along = normalize(2 * cosine * normals - to_eye, dim=-1)
         start = spots.points[metal] + self.clearance * normals
         there = self.trace(start, along)
-        shaded = self.shade(there, start, lamp, indirect, flash=flash, bounces=bounces)
+        shaded = self.shade(there, start, point_light, indirect, flash=flash, bounces=bounces)
         hit = (there.body >= 0)[:, None]
-        radiance = torch.where(hit, shaded.matte + shaded.mirrored, lamp.surroundings(along))
+        radiance = torch.where(hit, shaded.matte + shaded.mirrored, point_light.surroundings(along))
         return self._tint(spots.body[metal], cosine[:, 0]) * radiance
 
     def _tint(

@@ -7,7 +7,7 @@ file                            what
 `masks/view_000.png` ...        white on the object
 `truth/scene.json`              every setting, the photographs' names, the version
 `truth/sparse/`                 COLMAP model: exact cameras, true points, their tracks
-`truth/lights.json`             lamps of every photograph, and first-order harmonics
+`truth/lights.json`             point lights of every photograph, and first-order harmonics
 `truth/mesh.ply`                the object
 `truth/surroundings.ply`        its table, if that turns with the object
 `truth/maps/view_000.npz` ...   depth, normals, albedo and masks of every pixel; see
@@ -200,8 +200,8 @@ def _write_truth(scene: Scene, folder: Path) -> None:
     blockers = surface if around is None else join(surface, around)
     model, albedo = true_model(surface, blockers, scene.cameras, scene.names, generator)
     write_binary(model, to_bytes(albedo), folder / "sparse")
-    _write_json(_lights_account(scene), folder / "lights.json")
-    account = {
+    _write_json(_lights_report(scene), folder / "lights.json")
+    report = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "pimper_torch": installed_version(),
@@ -209,10 +209,10 @@ def _write_truth(scene: Scene, folder: Path) -> None:
         "names": list(scene.names),
         "settings": to_mapping(scene.config),
     }
-    _write_json(account, folder / "scene.json")
+    _write_json(report, folder / "scene.json")
 
 
-def _lights_account(scene: Scene) -> dict[str, object]:
+def _lights_report(scene: Scene) -> dict[str, object]:
     lights = scene.lights
     return {
         "names": list(scene.names),
@@ -225,6 +225,6 @@ def _lights_account(scene: Scene) -> dict[str, object]:
     }
 
 
-def _write_json(account: Mapping[str, object], path: Path) -> None:
-    text = json.dumps(account, indent=1, allow_nan=False, ensure_ascii=False)
+def _write_json(report: Mapping[str, object], path: Path) -> None:
+    text = json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False)
     path.write_text(text + "\n", encoding="utf-8")

@@ -19,6 +19,13 @@ from pimper_torch.paper.alignment.overlaps import (
     meet_overlaps,
     transformed,
 )
+from pimper_torch.paper.alignment.reliability import (
+    common_distance,
+    judge_patches,
+    overlapping_seams,
+    reliable_seams,
+    trust_by_distance,
+)
 from pimper_torch.paper.alignment.system import (
     PointPulls,
     Pulls,
@@ -27,19 +34,12 @@ from pimper_torch.paper.alignment.system import (
     seam_stiffness,
     solve_transforms,
 )
-from pimper_torch.paper.alignment.trust import (
-    common_distance,
-    judge_patches,
-    overlapping_seams,
-    reliable_seams,
-    trust_by_distance,
-)
 from pimper_torch.progress import report
 from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Record
 from pimper_torch.stage import Stage
 
-# An arc over an edge whose middle stands out by 0.7 % of its length has this C; flatter
-# reliefs are not told apart.
+# An arc over an edge whose centre stands out by 0.7 % of its length has this C; flatter
+# height fields are not told apart.
 _FLAT = 3e-3
 
 # Vertices that were filled in between points of the cloud are guesses.
@@ -63,7 +63,7 @@ class AlignConfig:
         offset: Also let each patch move along its normal: 4 unknowns a patch instead of the
             published 3.
         curvature: Weight seams by the published ``k``; without it all weigh alike.
-        rounds: How often the overlaps are met anew, as transformed so far, and solved.
+        iterations: How often the overlaps are met anew, as transformed so far, and solved.
         anchor: Weight of a facet's vertex, where the surface is known to pass, next to the
             agreement of a seam. Vertices that are points of the cloud count the less the
             less certain they are next to the disagreement at the seams.
@@ -72,14 +72,14 @@ class AlignConfig:
         prior: Weight that holds each transform at the identity. Where neighbours agree but
             for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
             4 %; where they agree in nothing, 1e-4 lets them be flattened.
-        scale_limit: No relief is flattened or stretched by more than this factor.
+        scale_limit: No height field is flattened or stretched by more than this factor.
         outlier: Samples that disagree by this many times the median lose three quarters of
             their weight, and quickly more beyond; depth edges run through some overlaps.
     """
 
     offset: bool = True
     curvature: bool = True
-    rounds: int = 3
+    iterations: int = 3
     anchor: float = 1.0
     points: float = 1.0
     prior: float = 3e-4
@@ -87,7 +87,7 @@ class AlignConfig:
     outlier: float = 5.0
 
     def __post_init__(self) -> None:
-        require(self.rounds >= 1, "rounds", self.rounds, "1 or more")
+        require(self.iterations >= 1, "iterations", self.iterations, "1 or more")
         require(self.anchor >= 0, "anchor", self.anchor, "0 or more")
         require(self.points >= 0, "points", self.points, "0 or more")
         require(self.prior > 0, "prior", self.prior, "above 0")
@@ -114,10 +114,10 @@ class _Problem(Record):
 class Align(Stage):
     r"""Undo the bas-relief transform that photometry leaves each patch with.
 
-    The relief z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z, 1)`
+    The height field z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z, 1)`
     in its own frame, without contradicting its photographs. All h are found together, from
     what neighbours say about the strip around the edge they share. Rays along the bisector
-    of the two normals meet both reliefs, as transformed so far, and
+    of the two normals meet both height fields, as transformed so far, and
 
     .. math::
         \min_h \sum_{seams} k \, \overline{| P_\mu + N_\mu h_\mu^T S_\mu
@@ -127,29 +127,29 @@ class Align(Stage):
     overlaps anew and solves one sparse linear system.
 
     *The curvature term.* :math:`k = 1 / \sum (C_\mu + C_{\mu'})` is read so: C is the mean
-    square of the relief's curvature along the seam times the edge's length, under the
+    square of the height field's curvature along the seam times the edge's length, under the
     current transform, so it grows as :math:`h_z^2`. Then :math:`k |r|^2` is a disagreement
-    relative to the reliefs that disagree, and flattening both does not make it smaller. A
+    relative to the height fields that disagree, and flattening both does not make it smaller. A
     linear solve holds k, and would not know; so the derivative of k enters the right-hand
     side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve. Where
-    reliefs agree it vanishes.
+    height fields agree it vanishes.
 
     *The gauge.* Seams alone leave some of h free. Over coplanar facets all is homogeneous:
-    any common affine change, :math:`h_z` and all, of their reliefs leaves them in agreement,
+    any common affine change, :math:`h_z` and all, of their height fields leaves them in agreement,
     and :math:`h = 0` is a solution without error: the flattening one. Between facets at an
-    angle the foot points differ, which no multiple of the reliefs but the right one bridges:
+    angle the foot points differ, which no multiple of the height fields but the right one bridges:
     folds tell scales, the better the sharper they are. Anchors fix what tilts and shifts the
-    surface: each relief is to pass through its facet's vertices, and through the points of
+    surface: each height field is to pass through its facet's vertices, and through the points of
     the cloud on the facet, with weights by their uncertainty. Vertices say nothing of scales,
     points off the plane do. The prior toward the identity decides what nothing else does:
     without folds and points, the common scale of coplanar facets. Without anchors it also
     holds the common tilt and shift; without a prior, ``scale_limit`` alone would stop the
-    flattening where reliefs have nothing in common.
+    flattening where height fields have nothing in common.
 
     *Who stays.* A patch that meets no neighbour stays on the mesh, where its own anchors
-    alone put it, and so does one whose relief lies elsewhere than that of every neighbour it
+    alone put it, and so does one whose height field lies elsewhere than that of every neighbour it
     meets even after all; their statuses tell, an :class:`~pimper_torch.records.AlignStatus`
-    each. One without relief stays as it is.
+    each. One without height field stays as it is.
 
     Rigid motions and the scale of the world change nothing. Differentiable in the depths
     through all rounds; which samples meet, and what they and the anchors weigh by distance,
@@ -190,13 +190,13 @@ class Align(Stage):
         identity = problem.unit.new_tensor([0, 0, 1, 0])
         transforms = identity.expand(patches.num_patches, 4)
         apart = []
-        for done in range(config.rounds):
+        for done in range(config.iterations):
             pulls = self._met(problem, depths, transforms)
             if not bool((pulls.weight > 0).any()):
                 return depths
             apart.append(_root_mean_square(pulls, transforms))
             transforms = self._solve_round(pulls, transforms, fresh=done == 0)
-            report(done + 1, config.rounds)
+            report(done + 1, config.iterations)
         with torch.no_grad():
             pulls = self._met(problem, depths, transforms)
             status = self._judged(pulls, transforms)
@@ -222,7 +222,7 @@ class Align(Stage):
     def _on_mesh(
         self, problem: _Problem, pulls: Pulls, transforms: Float[Tensor, "face 4"]
     ) -> Float[Tensor, "face 4"]:
-        """Put every relief where its own anchors alone have it, whatever its neighbours say."""
+        """Put every height field where its own anchors alone have it."""
         distance = mismatches(pulls, transforms).norm(dim=-1).detach()
         everyone = torch.ones_like(transforms[:, 0])
         held = self._anchored(pulls, problem, _noise(pulls, distance), everyone)
@@ -271,7 +271,7 @@ class Align(Stage):
         noise: Float[Tensor, ""],
         moves: Float[Tensor, " face"],
     ) -> Pulls:
-        """Add what holds reliefs to vertices and points, for the patches that may move."""
+        """Add what holds height fields to vertices and points, for the patches that may move."""
         unit, vertices, points = problem.unit, problem.vertices, problem.points
         coarse = problem.patches.coarse
         is_point = coarse.is_point[coarse.mesh.faces.flatten()]
@@ -318,13 +318,13 @@ class Align(Stage):
     ) -> Pulls:
         """Lower the weight of samples and points that the transforms so far contradict."""
         config, met = self.config, pulls.weight > 0
-        trust = trust_by_distance(distance, met, config.outlier)
+        reliability = trust_by_distance(distance, met, config.outlier)
         points = pulls.points
         if points is not None:
             missed = (points.samples * transforms[points.facet]).sum(dim=-1) - points.heights
             held = (1 + (missed / config.outlier / points.spread).square()) ** -2
             points = points.replace(weight=points.weight * held)
-        return pulls.replace(weight=pulls.weight * trust, points=points)
+        return pulls.replace(weight=pulls.weight * reliability, points=points)
 
     def _curvature_terms(
         self,
@@ -341,7 +341,7 @@ class Align(Stage):
 
 
 def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
-    """Estimate by how much one relief is off, from how far two are apart."""
+    """Estimate by how much one height field is off, from how far two are apart."""
     met = pulls.weight > 0
     return (
         common_distance(distance, met) / 2**0.5
@@ -374,15 +374,15 @@ def _apply(
     depths: DepthPatches, transforms: Float[Tensor, "face 4"], status: Int[Tensor, " face"]
 ) -> tuple[Depths, ...]:
     buckets = []
-    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
         own = transforms[templates.facet]
-        depth = transformed(templates.points_patch.double(), relief.depth.double(), own)
-        # Transforms chain: whoever aligns twice still learns the way from the first relief.
-        chained = own[:, 2:3] * relief.transform + own * own.new_tensor([1, 1, 0, 1])
+        depth = transformed(templates.points_patch.double(), height_field.depth.double(), own)
+        # Transforms chain: whoever aligns twice still learns the way from the first height field.
+        chained = own[:, 2:3] * height_field.transform + own * own.new_tensor([1, 1, 0, 1])
         buckets.append(
-            relief.replace(
-                depth=depth.to(relief.depth),
-                transform=chained.to(relief.transform),
+            height_field.replace(
+                depth=depth.to(height_field.depth),
+                transform=chained.to(height_field.transform),
                 status=status[templates.facet],
             )
         )

@@ -7,22 +7,22 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.geometry.frames import transform
-from pimper_torch.geometry.reliefs import sample_raster
+from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.records import CoarseMesh, PatchSet, Record
 from pimper_torch.records.patches import Depths, Templates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Anchors(Record):
-    """Points that reliefs are to pass through, any number a facet.
+    """Points that height fields are to pass through, any number a facet.
 
     Attributes:
-        facet: Whose relief.
-        samples: ``(x, y, z)`` of the relief, before any transform, over the point; patch
+        facet: Whose height field.
+        samples: ``(x, y, z)`` of the height field, before any transform, over the point; patch
             frame.
         heights: z of the point itself.
         variance: Of the point's place along the facet's normal, scene units squared.
-        known: Whether there is relief over the point.
+        known: Whether there is height field over the point.
     """
 
     facet: Int[Tensor, " anchor"]
@@ -33,7 +33,7 @@ class Anchors(Record):
 
 
 def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
-    """Anchor every relief at its facet's three vertices; in the order of the facets."""
+    """Anchor every height field at its facet's three vertices; in the order of the facets."""
     coarse = patches.coarse
     faces = coarse.mesh.faces
     facet = torch.arange(len(faces), device=faces.device).repeat_interleave(3)
@@ -48,7 +48,7 @@ def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
 
 
 def point_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
-    """Anchor reliefs at the points of the cloud on their facets; none for a mesh without."""
+    """Anchor height fields at the points of the cloud on their facets; none for a mesh without."""
     coarse: CoarseMesh = patches.coarse
     points = coarse.points
     if points is None:
@@ -62,13 +62,13 @@ def anchor_certainty(
 ) -> Float[Tensor, " anchor"]:
     r"""Weigh anchors by one over their variance, next to one that is known exactly.
 
-    A relief misses an anchor by its own error, of which the disagreement at the seams is
+    A height field misses an anchor by its own error, of which the disagreement at the seams is
     the measure, and by the point's: :math:`s^2 / (s^2 + \sigma^2)`. A point known far
-    better than reliefs agree counts fully, and not more the better it is known.
+    better than height fields agree counts fully, and not more the better it is known.
 
     Args:
-        variance: :math:`\sigma^2` of each point, along the relief's z.
-        noise: s, of the reliefs, in the same units.
+        variance: :math:`\sigma^2` of each point, along the height field's z.
+        noise: s, of the height fields, in the same units.
     """
     return noise.square() / (noise.square() + variance)
 

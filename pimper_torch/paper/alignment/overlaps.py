@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
-from pimper_torch.geometry.reliefs import intersect_relief
+from pimper_torch.geometry.height_fields import intersect_height_field
 from pimper_torch.geometry.surfaces import face_pairs
 from pimper_torch.records import PatchSet, Record
 from pimper_torch.records.patches import Depths, Templates
@@ -40,12 +40,12 @@ class Seams(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Overlaps(Record):
-    """The two reliefs of every seam, met by the same rays.
+    """The two height fields of every seam, met by the same rays.
 
     Attributes:
-        samples: ``(x, y, z)`` of the patch's own relief, before any transform, patch frame.
+        samples: ``(x, y, z)`` of the patch's own height field, before any transform, patch frame.
         feet: The foot points of the samples on their facets' planes, world.
-        met: True where both reliefs were met.
+        met: True where both height fields were met.
     """
 
     samples: Float[Tensor, "seam 2 row column 3"]
@@ -94,7 +94,7 @@ def meet_overlaps(
     buckets: tuple[Depths, ...],
     transforms: Float[Tensor, "face 4"],
 ) -> Overlaps:
-    """Meet both reliefs of every seam, as transformed now, with the seam's rays.
+    """Meet both height fields of every seam, as transformed now, with the seam's rays.
 
     Differentiable in the depths and the transforms.
     """
@@ -131,8 +131,9 @@ def _meet_bucket(
     directions_world = seams.directions[seam][:, :, None].expand_as(origins_world)
     origins = transform(patch_from_world, origins_world.flatten(1, 2))
     directions = rotate(patch_from_world, directions_world.flatten(1, 2))
-    # A ray meets the transformed relief where the ray transformed back meets the relief.
-    points, hit = intersect_relief(
+    # A ray meets the transformed height field where the ray transformed back meets the height
+    # field.
+    points, hit = intersect_height_field(
         depths.depth,
         depths.valid,
         templates.origin.double(),

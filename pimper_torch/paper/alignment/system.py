@@ -1,6 +1,6 @@
 r"""The alignment's equations: one small block per patch, one per seam.
 
-Unknown is :math:`h_\mu = (h_x, h_y, h_z, h_0)` of every patch; its relief becomes
+Unknown is :math:`h_\mu = (h_x, h_y, h_z, h_0)` of every patch; its height field becomes
 :math:`h_\mu^T S` with :math:`S = (x, y, z, 1)`. Lengths are in units of one length of the
 mesh, so that all terms, and their weights, have no unit.
 """
@@ -17,14 +17,14 @@ from pimper_torch.records import Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PointPulls(Record):
-    """Points that reliefs are to pass through.
+    """Points that height fields are to pass through.
 
     Attributes:
-        facet: Whose relief.
-        samples: ``S`` of that relief over the point.
+        facet: Whose height field.
+        samples: ``S`` of that height field over the point.
         heights: Where along the facet's normal the point lies.
         weight: How strongly it pulls.
-        spread: How far relief and point may well be apart.
+        spread: How far height field and point may well be apart.
     """
 
     facet: Int[Tensor, " point"]
@@ -41,14 +41,14 @@ class Pulls(Record):
     Attributes:
         facets: The two facets of every seam.
         normals: Their inward unit normals, world.
-        samples: ``S`` of both reliefs where a ray meets them.
+        samples: ``S`` of both height fields where a ray meets them.
         gap: Foot point of the first sample minus that of the second, world.
         weight: Of each ray; 0 where it does not count. Sums to at most 1 over a seam.
-        curvature: ``C`` of both reliefs before any transform; see :func:`curvature_along`.
-        corners: ``S`` of every relief at its facet's corners.
+        curvature: ``C`` of both height fields before any transform; see :func:`curvature_along`.
+        corners: ``S`` of every height field at its facet's corners.
         corner_weight: How strongly each corner is to stay where it is.
         prior_weight: How strongly each component of h is held at the identity.
-        points: Further points that reliefs are to pass through.
+        points: Further points that height fields are to pass through.
     """
 
     facets: Int[Tensor, "seam 2"]
@@ -75,21 +75,21 @@ def curvature_along(
     met: Bool[Tensor, "seam row column"],
     edge_lengths: Float[Tensor, " seam"],
 ) -> Float[Tensor, "seam 2"]:
-    r"""Give :math:`C`: the mean square of a relief's curvature along the edge, times its length.
+    r"""Give the mean square of a height field's curvature along the edge, times its length.
 
     :math:`C = \overline{(\ell\,\kappa)^2}`, :math:`\kappa` by second differences over a
     quarter of the edge :math:`\ell`, for normals' noise lives at shorter distances. An arc
-    over the edge whose middle stands out by a tenth of its length has C = 0.64.
+    over the edge whose centre stands out by a tenth of its length has C = 0.64.
     """
     columns = heights.shape[-1]
     stride = max(1, columns // 4)
-    ahead, middle, behind = (
+    ahead, centre, behind = (
         raster[..., start : columns - 2 * stride + start]
         for raster, start in ((heights, 2 * stride), (heights, stride), (heights, 0))
     )
     known = met[..., 2 * stride :] & met[..., stride:-stride] & met[..., : -2 * stride]
     bend = (
-        (ahead - 2 * middle + behind) * (columns / stride) ** 2 / edge_lengths[:, None, None, None]
+        (ahead - 2 * centre + behind) * (columns / stride) ** 2 / edge_lengths[:, None, None, None]
     )
     square = torch.where(known[:, None], bend, 0).square().sum(dim=(-2, -1))
     return square / known.sum(dim=(-2, -1)).clamp_min(1)[:, None]

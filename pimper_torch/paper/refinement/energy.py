@@ -1,8 +1,8 @@
-r"""The variational energy that keeps the middle of facets and smooths their seams.
+r"""The variational energy that keeps the centre of facets and smooths their seams.
 
 .. math:: E(S) = \int \lambda (1 - G) |\cup S_\mu - S|^2 + G |\nabla S|^2
 
-over the flat facets, in linear finite elements on the lattice: lumped masses, cotangents,
+over the flat facets, in linear finite elements on the subdivided mesh: lumped masses, cotangents,
 and G averaged over each face. The surface S is a place for every vertex, so that the three
 coordinates are three right-hand sides of one system.
 """
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.lattice import Lattice
+from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_pairs
 from pimper_torch.linalg.meshes import (
     Elements,
@@ -23,25 +23,25 @@ from pimper_torch.linalg.meshes import (
 )
 from pimper_torch.records import Record
 
-# Fidelity, as a share of the usual, that ties what no patch supports to the flat facets: it
+# Fidelity, as a fraction of the usual, that ties what no patch supports to the flat facets: it
 # makes the system definite on an island without support, and is nothing elsewhere.
 _TIE = 1e-9
 
-# A needle's area is taken as at least this share of its longest edge squared: its cotangents
+# A needle's area is taken as at least this fraction of its longest edge squared: its cotangents
 # would otherwise spoil the condition of the whole system.
 _MIN_SHAPE = 1e-4
 
-# A facet with a smaller share of supported vertices is taken to lie as the coarse mesh does.
-_TREND_SHARE = 0.5
+# A facet with a smaller fraction of supported vertices is taken to lie as the coarse mesh does.
+_TREND_FRACTION = 0.5
 
 
 def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    r"""Give G: where a facet is a seam and where it is its middle.
+    r"""Give G: where a facet is a seam and where it is its centre.
 
     :math:`G = \frac12 \sqrt{|a - b| + |a - c| + |c - b|}` of the barycentric coordinates.
 
-    >>> corner, edge, middle = [1.0, 0, 0], [0.5, 0.5, 0], [1 / 3] * 3
-    >>> seam_weight(torch.tensor([corner, edge, middle]))
+    >>> corner, edge, centre = [1.0, 0, 0], [0.5, 0.5, 0], [1 / 3] * 3
+    >>> seam_weight(torch.tensor([corner, edge, centre]))
     tensor([0.7071, 0.5000, 0.0000])
     """
     return (barycentric - barycentric.roll(1, dims=-1)).abs().sum(dim=-1).sqrt() / 2
@@ -65,25 +65,25 @@ class System(Record):
 
 
 def assemble(
-    lattice: Lattice,
+    subdivision: Subdivision,
     fidelity: Float[Tensor, " facet"],
     supported: Bool[Tensor, " vertex"],
 ) -> System:
     """Assemble the normal equations of the energy.
 
     Args:
-        lattice: What the energy is integrated over.
+        subdivision: What the energy is integrated over.
         fidelity: Lambda of each facet, 1/length^2.
         supported: Where the union is known. Elsewhere the mass is (nearly) zero, and the
             smoothness term alone fills S in.
 
     Constant to autograd: it holds the geometry of the flat facets only.
     """
-    weights = seam_weight(lattice.barycentric.double())
-    mesh = _elements(lattice)
-    mass = lumped_mass(mesh, fidelity.double()[lattice.face_facet])
+    weights = seam_weight(subdivision.barycentric.double())
+    mesh = _elements(subdivision)
+    mass = lumped_mass(mesh, fidelity.double()[subdivision.face_facet])
     mass = mass * (1 - weights) * torch.where(supported, 1, _TIE)
-    seams = weights[lattice.faces].mean(dim=1)
+    seams = weights[subdivision.faces].mean(dim=1)
     rows, cols, values = cotangent_laplacian(mesh, seams, _MIN_SHAPE)
     diagonal = torch.arange(mesh.count, device=mass.device)
     return System(
@@ -95,8 +95,8 @@ def assemble(
 
 
 def facet_trends(
-    lattice: Lattice,
-    union: Float[Tensor, "vertex 3"],
+    subdivision: Subdivision,
+    blend: Float[Tensor, "vertex 3"],
     supported: Bool[Tensor, " vertex"],
     num_facets: int,
 ) -> tuple[Float[Tensor, "facet 3 3"], Bool[Tensor, " facet"]]:
@@ -110,26 +110,26 @@ def facet_trends(
     Differentiable in ``union``.
     """
     known = supported.double()
-    number = _per_facet(known, lattice, num_facets)
-    total = _per_facet(torch.ones_like(known), lattice, num_facets)
+    number = _per_facet(known, subdivision, num_facets)
+    total = _per_facet(torch.ones_like(known), subdivision, num_facets)
     per_one = 1 / number.clamp_min(1)[:, None]
-    points = lattice.points.detach().double()
-    lift = torch.where(supported[:, None], union.double() - points, 0)
-    center = _per_facet(known[:, None] * points, lattice, num_facets) * per_one
-    mean = _per_facet(lift, lattice, num_facets) * per_one
-    away = known[:, None] * (points - center[lattice.facet])
-    change = known[:, None] * (lift - mean[lattice.facet])
-    spread = _per_facet(away[:, :, None] * away[:, None, :], lattice, num_facets)
-    common = _per_facet(change[:, :, None] * away[:, None, :], lattice, num_facets)
+    points = subdivision.points.detach().double()
+    lift = torch.where(supported[:, None], blend.double() - points, 0)
+    center = _per_facet(known[:, None] * points, subdivision, num_facets) * per_one
+    mean = _per_facet(lift, subdivision, num_facets) * per_one
+    away = known[:, None] * (points - center[subdivision.facet])
+    change = known[:, None] * (lift - mean[subdivision.facet])
+    spread = _per_facet(away[:, :, None] * away[:, None, :], subdivision, num_facets)
+    common = _per_facet(change[:, :, None] * away[:, None, :], subdivision, num_facets)
     # The spread has rank two, for a facet is flat; a ridge would not leave planes exact.
     inverse = torch.linalg.pinv(spread, rtol=1e-8, hermitian=True)
-    usable = (number >= _TREND_SHARE * total) & (number >= 3)
+    usable = (number >= _TREND_FRACTION * total) & (number >= 3)
     slope = torch.where(usable[:, None, None], common @ inverse, 0)
     return torch.eye(3, dtype=slope.dtype, device=slope.device) + slope, usable
 
 
-def plane_pull(
-    lattice: Lattice,
+def plane_regularization(
+    subdivision: Subdivision,
     trends: Float[Tensor, "facet 3 3"],
     fitted: Bool[Tensor, " facet"],
 ) -> Float[Tensor, "vertex 3"]:
@@ -146,25 +146,25 @@ def plane_pull(
     support keeps its shape.
 
     Args:
-        lattice: What the energy is integrated over.
+        subdivision: What the energy is integrated over.
         trends: J of every facet.
         fitted: Whether it was fitted.
     """
-    weights = seam_weight(lattice.barycentric.double())
-    gradients = _elements(lattice).turned
-    slope = trends[lattice.face_facet]
-    held = weights[lattice.faces].mean(dim=1)
-    pull = held[:, None, None] / 2 * (gradients @ slope.mT)
-    total = trends.new_zeros(len(lattice.points), 3)
-    total = total.index_add(0, lattice.faces.flatten(), pull.flatten(0, 1))
-    on_border = (lattice.barycentric == 0).any(dim=1)[lattice.faces].sum(dim=1) >= 2
-    near = on_border.nonzero()[:, 0]  # a small share of all faces, and pairing is not cheap
-    pairs, ends = face_pairs(lattice.faces[near])
+    weights = seam_weight(subdivision.barycentric.double())
+    gradients = _elements(subdivision).rotated
+    slope = trends[subdivision.face_facet]
+    held = weights[subdivision.faces].mean(dim=1)
+    regularization = held[:, None, None] / 2 * (gradients @ slope.mT)
+    total = trends.new_zeros(len(subdivision.points), 3)
+    total = total.index_add(0, subdivision.faces.flatten(), regularization.flatten(0, 1))
+    on_border = (subdivision.barycentric == 0).any(dim=1)[subdivision.faces].sum(dim=1) >= 2
+    near = on_border.nonzero()[:, 0]  # a small fraction of all faces, and pairing is not cheap
+    pairs, ends = face_pairs(subdivision.faces[near])
     faces = near[pairs]
-    facets = lattice.face_facet[faces]
+    facets = subdivision.face_facet[faces]
     seam = (facets[:, 0] != facets[:, 1]) & fitted[facets].any(dim=1)
     faces, ends = faces[seam], ends[seam]
-    corners = lattice.faces[faces]
+    corners = subdivision.faces[faces]
     opposite = (corners[..., None] != ends[:, None, None, :]).all(dim=-1)
     inward = (opposite[..., None] * gradients[faces]).sum(dim=2)
     jump = (slope[faces] @ inward[..., None])[..., 0].sum(dim=1)  # times the edge's length
@@ -172,11 +172,11 @@ def plane_pull(
     return total.index_add(0, ends.flatten(), (weight[:, None] * jump).repeat_interleave(2, dim=0))
 
 
-def _elements(lattice: Lattice) -> Elements:
-    return elements(lattice.points.detach().double(), lattice.faces)
+def _elements(subdivision: Subdivision) -> Elements:
+    return elements(subdivision.points.detach().double(), subdivision.faces)
 
 
 def _per_facet(
-    values: Float[Tensor, "vertex ..."], lattice: Lattice, num_facets: int
+    values: Float[Tensor, "vertex ..."], subdivision: Subdivision, num_facets: int
 ) -> Float[Tensor, "facet ..."]:
-    return values.new_zeros(num_facets, *values.shape[1:]).index_add(0, lattice.facet, values)
+    return values.new_zeros(num_facets, *values.shape[1:]).index_add(0, subdivision.facet, values)

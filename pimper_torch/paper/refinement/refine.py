@@ -1,4 +1,4 @@
-"""Refinement: relief of all patches in, one joined surface out."""
+"""Refinement: height field of all patches in, one joined surface out."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
+from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.fusion.continuation import about_mean
-from pimper_torch.fusion.union import Union, ray_directions, unite, vertex_spacing
-from pimper_torch.geometry.lattice import Lattice, subdivide
+from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import face_edges, vertex_normals
 from pimper_torch.linalg.systems import solutions
-from pimper_torch.paper.refinement.energy import assemble, facet_trends, plane_pull
+from pimper_torch.paper.refinement.energy import assemble, facet_trends, plane_regularization
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.stage import Stage
 
@@ -28,17 +28,17 @@ class RefineConfig:
             ``1 / (r * spacing)^2``, the inverse square of a length. Where G is constant, a
             wave of length ``w`` keeps ``1 / (1 + (2 pi R / w)^2)`` of its height, with
             ``R = r sqrt(G / (1 - G))`` vertices: half of it at ``w = 2 pi R``. R is ``r`` on
-            the middle of an edge, 1.55 ``r`` at a vertex of the coarse mesh, nothing in the
-            middle of a facet. Twice the radius is a quarter of lambda. The notebook
+            the centre of an edge, 1.55 ``r`` at a vertex of the coarse mesh, nothing in the
+            centre of a facet. Twice the radius is a quarter of lambda. The notebook
             ``02_refinement`` shows it.
-        hold_planes: Cancel what the energy's tension does to flat data, which it would
+        keep_planes: Cancel what the energy's tension does to flat data, which it would
             shrink at the open rim and shift where G changes. False is the published energy.
         outlier_samples: How far, in samples, a patch may lie from the others before they
             outvote it, where three or more meet; infinite for the plain mean.
     """
 
     smoothing_radius_samples: float = 1.0
-    hold_planes: bool = True
+    keep_planes: bool = True
     outlier_samples: float = 4.0
 
     def __post_init__(self) -> None:
@@ -48,12 +48,12 @@ class RefineConfig:
 
 
 class Refine(Stage):
-    r"""Join the patches and smooth their seams, keeping the middle of every facet.
+    r"""Join the patches and smooth their seams, keeping the centre of every facet.
 
-    Minimises :math:`\int \lambda (1-G) |\cup S_\mu - S|^2 + G |\nabla S|^2` over the lattice
-    of the coarse mesh, with places S as unknowns: one sparse factorization, three right-hand
+    Minimises :math:`\int \lambda (1-G) |\cup S_\mu - S|^2 + G |\nabla S|^2` over the subdivided
+    mesh of the coarse mesh, with places S as unknowns: one sparse factorization, three right-hand
     sides. See :mod:`~pimper_torch.paper.refinement.energy` for the discretisation and for what
-    ``hold_planes`` adds to the published energy, and :mod:`~pimper_torch.fusion.union` for the
+    ``keep_planes`` adds to the published energy, and :mod:`~pimper_torch.fusion.blend` for the
     union. Vertices that no patch supports are
     filled by the smoothness term and have confidence 0.
 
@@ -71,29 +71,29 @@ class Refine(Stage):
         The convergence's residual is the root mean square distance between the union and
         the surface, in scene units, after one solve.
 
-        Where no patch has valid relief anywhere, as under one light for all views, the
+        Where no patch has valid height field anywhere, as under one light for all views, the
         surface is that of the facets, its seams smoothed, with confidence 0.
         """
         patches = depths.patches
         mesh = patches.coarse.mesh
         spacing = vertex_spacing(patches, 1.0)
-        lattice = subdivide(mesh.vertices_world.detach(), mesh.faces, spacing)
-        directions = ray_directions(lattice, patches.coarse).detach()
-        union = unite(depths, lattice, directions, self.config.outlier_samples)
-        if not bool(union.supported.any()):
-            union = union.replace(supported=torch.ones_like(union.supported))
-        points = lattice.points + union.heights[:, None] * directions
-        refined = smooth_seams(lattice, points, union.supported, spacing, self.config)
+        subdivision = subdivide(mesh.vertices_world.detach(), mesh.faces, spacing)
+        directions = ray_directions(subdivision, patches.coarse).detach()
+        blend = blend_patches(depths, subdivision, directions, self.config.outlier_samples)
+        if not bool(blend.supported.any()):
+            blend = blend.replace(supported=torch.ones_like(blend.supported))
+        points = subdivision.points + blend.heights[:, None] * directions
+        refined = smooth_seams(subdivision, points, blend.supported, spacing, self.config)
         vertices = refined.to(points)
-        apart = (refined - points.double())[union.supported].detach()
+        apart = (refined - points.double())[blend.supported].detach()
         return Surface(
             vertices_world=vertices,
-            faces=lattice.faces,
-            facet=lattice.facet,
-            barycentric=lattice.barycentric,
-            normals_world=_normals(union, vertices, lattice),
-            albedo=about_mean(union.albedo, union.seen, face_edges(lattice.faces)[0]),
-            confidence=union.confidence,
+            faces=subdivision.faces,
+            facet=subdivision.facet,
+            barycentric=subdivision.barycentric,
+            normals_world=_normals(blend, vertices, subdivision),
+            albedo=about_mean(blend.albedo, blend.seen, face_edges(subdivision.faces)[0]),
+            confidence=blend.confidence,
             convergence=Convergence(
                 iterations=torch.ones(1, dtype=torch.long, device=points.device),
                 residual=apart.square().sum(dim=-1).mean().sqrt()[None].to(points),
@@ -103,16 +103,16 @@ class Refine(Stage):
 
 
 def smooth_seams(
-    lattice: Lattice,
+    subdivision: Subdivision,
     points: Float[Tensor, "vertex 3"],
     supported: Bool[Tensor, " vertex"],
     spacing: Float[Tensor, " facet"],
     config: RefineConfig,
 ) -> Float[Tensor, "vertex 3"]:
-    """Minimise the energy over the lattice.
+    """Minimise the energy over the subdivided mesh.
 
     Args:
-        lattice: The flat facets, subdivided.
+        subdivision: The flat facets, subdivided.
         points: The union: where the patches have each vertex.
         supported: Where they have it anywhere.
         spacing: Of each facet's vertices, scene units; the radius is counted in it.
@@ -124,19 +124,19 @@ def smooth_seams(
     Differentiable in ``points``; see :class:`Refine`.
     """
     fidelity = (config.smoothing_radius_samples * spacing.double()) ** -2
-    system = assemble(lattice, fidelity, supported)
+    system = assemble(subdivision, fidelity, supported)
     rhs = system.mass[:, None] * points.double()
-    if config.hold_planes:
-        trends, fitted = facet_trends(lattice, points, supported, len(spacing))
-        rhs = rhs + plane_pull(lattice, trends, fitted)
+    if config.keep_planes:
+        trends, fitted = facet_trends(subdivision, points, supported, len(spacing))
+        rhs = rhs + plane_regularization(subdivision, trends, fitted)
     (found,) = solutions(system.rows, system.cols, system.values, rhs, what="the refinement")
     return found
 
 
 def _normals(
-    union: Union, vertices: Float[Tensor, "vertex 3"], lattice: Lattice
+    blend: Blend, vertices: Float[Tensor, "vertex 3"], subdivision: Subdivision
 ) -> Float[Tensor, "vertex 3"]:
     """Take photometric normals where there are any, else those of the surface itself."""
-    own = normalize(vertex_normals(vertices, lattice.faces), dim=-1)
-    photometric = union.seen & (union.normals_world.detach().norm(dim=-1) > 0.5)
-    return torch.where(photometric[:, None], union.normals_world, own)
+    own = normalize(vertex_normals(vertices, subdivision.faces), dim=-1)
+    photometric = blend.seen & (blend.normals_world.detach().norm(dim=-1) > 0.5)
+    return torch.where(photometric[:, None], blend.normals_world, own)

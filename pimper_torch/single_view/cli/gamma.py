@@ -62,7 +62,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         Args:
             photos: Folder of JPEG, PNG or TIFF files; the camera did not move.
             mask: Image that is bright on the object and dark off it, of the photographs' size.
-            rank: 3 if lamps are far away and the room is dark, 4 with ambient light.
+            rank: 3 if point lights are far away and the room is dark, 4 with ambient light.
             max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         """
         return _Job(photos=photos, mask=mask, rank=rank, max_size_px=max_size_px)

@@ -42,7 +42,7 @@ def solve_alternation(problem: Bilinear, max_iterations: int, tolerance: float) 
     Args:
         problem: With its start.
         max_iterations: Steps at most.
-        tolerance: A patch is done when a step lowered its objective by less than this share.
+        tolerance: A patch is done when a step lowered its objective by less than this fraction.
 
     On a curved manifold the samples take one Gauss-Newton step along it in their turn. Without
     ``pull`` the scale between albedo and light is kept where it started. Constant to autograd.

@@ -15,7 +15,7 @@ from torch import Tensor
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.records import Convergence, Record
 
-# A channel with less than this share of a sample's brightness has nothing to say of its normal.
+# A channel with less than this fraction of a sample's brightness has nothing to say of its normal.
 _MIN_CHROMA = 0.02
 
 # Turns of tints and chroma before the first factorization; each halves what is left at least.
@@ -48,7 +48,7 @@ def solve_in_colour(
     solve: Solver,
     max_iterations: int,
     tolerance: float,
-    rounds: int = 3,
+    iterations: int = 3,
 ) -> ColourFactors:
     """Factorize patches channel by channel with common normals.
 
@@ -59,7 +59,7 @@ def solve_in_colour(
         solve: One of the solvers.
         max_iterations: Steps at most, each round.
         tolerance: The solver's.
-        rounds: Turns of factors and chroma; more matter where the light's colour changes
+        iterations: Turns of factors and chroma; more matter where the light's colour changes
             between views, which chroma is then taken for at first.
 
     Constant to autograd.
@@ -68,7 +68,7 @@ def solve_in_colour(
         channels = radiance.shape[2]
         tint, chroma = _tints(problem, radiance)
         found = None
-        for _ in range(rounds):
+        for _ in range(iterations):
             split = split_colours(problem, radiance, chroma)
             split = split.replace(
                 lights=split.lights * tint.flatten(1, 2)[..., None],
@@ -107,7 +107,7 @@ def split_colours(
         weight=weight.flatten(1, 2),
         lights=problem.lights.repeat_interleave(channels, dim=1),
         anchor=problem.anchor.repeat_interleave(channels, dim=1),
-        pull=problem.pull.repeat_interleave(channels, dim=1),
+        regularization=problem.regularization.repeat_interleave(channels, dim=1),
         prior=None if problem.prior is None else channels * problem.prior,
     )
 

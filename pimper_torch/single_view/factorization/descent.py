@@ -56,7 +56,7 @@ def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> F
         problem: With its start.
         max_iterations: Steps at most; it needs several times as many as BALM.
         tolerance: A patch is done when a step moved its shading vectors by less than this
-            share of their length.
+            fraction of their length.
 
     Returns:
         Factors with ``N`` on the manifold; the same minimum as BALM's where there is one.

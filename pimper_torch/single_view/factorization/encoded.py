@@ -18,7 +18,7 @@ from pimper_torch.single_view.factorization.low_rank import low_rank_problem, si
 
 # Further rounds of linearising about the fit and weighing outliers, each exponent starting where
 # the last one ended.
-ROUNDS = 1
+ITERATIONS = 1
 _ITERATIONS, _TOLERANCE = 30, 1e-7
 _FILL_STEPS = 30  # to a start good enough for the solver
 
@@ -63,7 +63,10 @@ class EncodedFit(Record):
 
 
 def fit_encoded(
-    problem: EncodedMatrix, response: Response, start: EncodedFit | None, rounds: int = ROUNDS
+    problem: EncodedMatrix,
+    response: Response,
+    start: EncodedFit | None,
+    iterations: int = ITERATIONS,
 ) -> EncodedFit:
     """Explain the encoded values by first-order light seen through a response.
 
@@ -75,14 +78,14 @@ def fit_encoded(
         problem: The values.
         response: Through which they are seen; ``f``.
         start: Fit of a response near by; ``None`` starts from the values.
-        rounds: After the first.
+        iterations: After the first.
     """
     mask = problem.used.double()
     about, weight = torch.where(problem.used, problem.encoded, 0.5), mask
     left: Tensor | None = None
     if start is not None:
         about, weight, left = start.predicted, mask * start.weight, start.left
-    for turn in range(rounds + 1):
+    for rotation in range(iterations + 1):
         rate = _derivative(response, about)
         target = response.linear_from_encoded(about) + rate * (problem.encoded - about)
         heavy = weight / rate.square()
@@ -95,7 +98,7 @@ def fit_encoded(
         linear = left @ solved.shading[0]
         about = response.encoded_from_linear(linear).clamp_min(_DARKEST)
         residual = mask * (problem.encoded - about)
-        if problem.scale and turn < rounds:
+        if problem.scale and rotation < iterations:
             weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
     loss = residual.square()
     if problem.scale:

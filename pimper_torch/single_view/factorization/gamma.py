@@ -1,7 +1,7 @@
 r"""An unknown gamma, found as the one that lets first-order light explain the photographs.
 
 Views of the same samples under several lights are, as radiance, a matrix of rank 3 (distant
-lamps) or 4 (ambient light besides). Encoded by a curve that is not the assumed one they are
+point lights) or 4 (ambient light besides). Encoded by a curve that is not the assumed one they are
 not. For each exponent the residual is taken where the noise is, in the encoded values,
 
 .. math:: e = M - (L R)^{1/\gamma}, \qquad f(\gamma) = \min_{L, R} \sum \rho(e),
@@ -25,7 +25,7 @@ from pimper_torch.photometry.robust import spread
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Srgb
 from pimper_torch.records import PatchViews, Record, Views
 from pimper_torch.single_view.factorization.encoded import (
-    ROUNDS,
+    ITERATIONS,
     EncodedFit,
     EncodedMatrix,
     enough,
@@ -56,7 +56,7 @@ _MIN_SCALE = 5e-4
 _CAUCHY = 2.385
 
 # The estimate is checked without the darker third and half of the entries.
-_DARKEST_SHARES = (1 / 3, 1 / 2)
+_DARKEST_FRACTIONS = (1 / 3, 1 / 2)
 # Fewer degrees of freedom say little of their own error.
 _MIN_FREE = 100
 # Beyond so many standard errors of theirs the brighter entries are believed instead; beyond the
@@ -134,7 +134,7 @@ def estimate_gamma(
     Args:
         encoded: As the files hold them, 1 being full scale.
         seen: False for what is missing. Neither dark nor saturated values need be left out.
-        rank: 3 for distant lamps alone, 4 with ambient light.
+        rank: 3 for distant point lights alone, 4 with ambient light.
         dark_level: Encoded value up to which shading is not first-order.
         saturation_level: From which values are cut off.
         max_samples: More are thinned evenly.
@@ -146,7 +146,9 @@ def estimate_gamma(
     Constant to autograd.
     """
     if not 1 <= rank <= 9:
-        raise InputError(f"rank is {rank}; needed: 3 for distant lamps, 4 with ambient light.")
+        raise InputError(
+            f"rank is {rank}; needed: 3 for distant point lights, 4 with ambient light."
+        )
     values = encoded[seen]
     if not bool(values.isfinite().all()):
         raise InputError(
@@ -156,14 +158,14 @@ def estimate_gamma(
     if values.numel() and not 0 <= float(values.min()) <= float(values.max()) <= 1:
         raise InputError(
             f"encoded values reach from {float(values.min()):.4g} to {float(values.max()):.4g}; "
-            "needed: shares of the files' full scale, 0 to 1."
+            "needed: fractions of the files' full scale, 0 to 1."
         )
     with torch.no_grad():
         limits = (dark_level, saturation_level)
         problem = _problem(encoded, seen, rank, limits, max_samples)
         for _ in range(_CHOICES):
-            problem = _chosen_by_fit(problem, _coarsely(problem, rounds=0)[1].predicted, limits)
-        return _judged(_most_trusted(problem))
+            problem = _chosen_by_fit(problem, _coarsely(problem, iterations=0)[1].predicted, limits)
+        return _judged(_most_reliable(problem))
 
 
 def gamma_of_photographs(
@@ -180,8 +182,8 @@ def gamma_of_photographs(
         views: Read with :data:`~pimper_torch.radiometry.LINEAR`, so that they hold the files'
             own values; of one size. Pixels that any of their masks leaves out are left out.
         mask: True on the object, for all photographs.
-        rank: 3 for distant lamps alone, 4 with ambient light.
-        channel: Colour to look at; the middle one, green, unless given.
+        rank: 3 for distant point lights alone, 4 with ambient light.
+        channel: Colour to look at; the centre one, green, unless given.
         max_samples: More are thinned evenly.
 
     Raises:
@@ -212,14 +214,14 @@ def gamma_of_patches(
 ) -> GammaEstimate:
     """Find the gamma of registered photographs, all facets together.
 
-    One light a view for the whole scene is assumed, so a near lamp counts as noise. Samples
+    One light a view for the whole scene is assumed, so a near point light counts as noise. Samples
     that registration dropped as dark or saturated stay dropped: keep ``warp.dark_level`` well
     below 0.1.
 
     Args:
         seen: Of views read with :data:`~pimper_torch.radiometry.LINEAR`.
-        rank: 3 for distant lamps alone, 4 with ambient light.
-        channel: Colour to look at; the middle one, green, unless given.
+        rank: 3 for distant point lights alone, 4 with ambient light.
+        channel: Colour to look at; the centre one, green, unless given.
         max_samples: More are thinned evenly.
 
     Raises:
@@ -302,13 +304,13 @@ def _chosen_by_fit(
     return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
 
 
-def _coarsely(problem: EncodedMatrix, rounds: int) -> tuple[float, EncodedFit]:
+def _coarsely(problem: EncodedMatrix, iterations: int) -> tuple[float, EncodedFit]:
     """Give the best of a few exponents, spread evenly."""
     trials = torch.logspace(math.log10(LEAST), math.log10(MOST), _TRIALS, dtype=torch.float64)
     fits: list[EncodedFit] = []
     for exponent in trials.tolist():
         former = fits[-1] if fits else None
-        fits.append(fit_encoded(problem, Gamma(exponent=exponent), former, rounds))
+        fits.append(fit_encoded(problem, Gamma(exponent=exponent), former, iterations))
     best = min(range(_TRIALS), key=lambda trial: float(fits[trial].loss.sum()))
     return float(trials[best]), fits[best]
 
@@ -335,17 +337,17 @@ def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float
     )
 
 
-def _most_trusted(problem: EncodedMatrix) -> _Minimum:
+def _most_reliable(problem: EncodedMatrix) -> _Minimum:
     """Estimate from all entries, or from the brighter ones alone where those contradict.
 
     Ambient light in attached shadows is not first-order, bright, and more precise than right.
     """
-    best, fit = _coarsely(problem, ROUNDS)
+    best, fit = _coarsely(problem, ITERATIONS)
     step = (MOST / LEAST) ** (1 / (_TRIALS - 1))
     found = [_minimise(problem, fit, best / step, best * step)]
     predicted = found[0].fit.predicted
-    for share in _DARKEST_SHARES:
-        level = predicted[problem.used].quantile(share)
+    for fraction in _DARKEST_FRACTIONS:
+        level = predicted[problem.used].quantile(fraction)
         used = enough(problem.used & (predicted > level), problem.rank)
         if freedom(used, problem.rank) < _MIN_FREE:
             break
@@ -375,8 +377,8 @@ def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> fl
     step = 0.02 * gamma
     below = fit_encoded(problem, Gamma(exponent=gamma - step), fit)
     above = fit_encoded(problem, Gamma(exponent=gamma + step), fit)
-    middle = float(fit.loss.sum())
-    curvature = (float(below.loss.sum()) + float(above.loss.sum()) - 2 * middle) / step**2
+    centre = float(fit.loss.sum())
+    curvature = (float(below.loss.sum()) + float(above.loss.sum()) - 2 * centre) / step**2
     slope = (above.loss - below.loss) / (2 * step)
     noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
     # On data without noise everything but the curvature is rounding.
@@ -388,8 +390,8 @@ def _judged(found: _Minimum) -> GammaEstimate:
     """Put the answer together."""
     problem = found.problem
     residual = residual_spread(problem, found.fit)
-    linear = fit_encoded(problem, Linear(), found.fit, 2 * ROUNDS)
-    srgb = fit_encoded(problem, Srgb(), found.fit, 2 * ROUNDS)
+    linear = fit_encoded(problem, Linear(), found.fit, 2 * ITERATIONS)
+    srgb = fit_encoded(problem, Srgb(), found.fit, 2 * ITERATIONS)
     sure = found.inner and found.error < _MAX_UNCERTAIN * found.gamma
     return GammaEstimate(
         gamma=found.gamma,

@@ -52,7 +52,7 @@ def low_rank_problem(
         lights=left,
         anchor=left,
         shading=known.new_zeros(len(known), rank, columns),
-        pull=known.new_zeros(len(known), rows),
+        regularization=known.new_zeros(len(known), rows),
         manifold=Free(rank=rank),
     )
 

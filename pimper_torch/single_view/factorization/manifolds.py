@@ -7,7 +7,7 @@ on albedo and normal alone. Which vectors those are decides how much of a factor
 light                 rank  :math:`s`                     left free
 ====================  ====  ============================  =====================
 any low-rank matrix   any   any vector                    an invertible matrix
-a distant lamp        3     :math:`\rho n`: any vector    an invertible 3 x 3
+a distant point light        3     :math:`\rho n`: any vector    an invertible 3 x 3
 first order           4     :math:`\rho (1, n)`           scaled Lorentz
 second order          9     :math:`\rho (1, n, n n^\top)` rotation, scale
 ====================  ====  ============================  =====================
@@ -148,9 +148,9 @@ class SecondOrder:
         _, normal = self.split(shading.mT)
         first, second = tangents(normal)
         columns = [second_order(normal)]
-        for turn in (first, second):
-            nothing = torch.zeros_like(turn[..., :1])
-            columns.append(torch.cat([nothing, turn, _differential(normal, turn)], dim=-1))
+        for rotation in (first, second):
+            nothing = torch.zeros_like(rotation[..., :1])
+            columns.append(torch.cat([nothing, rotation, _differential(normal, rotation)], dim=-1))
         return [column.mT for column in columns]
 
     def curvature(
@@ -159,16 +159,16 @@ class SecondOrder:
         r"""Give the manifold's part of the second derivatives; see :meth:`Cone.curvature`."""
         albedo, normal = self.split(shading.mT)
         g = slope.mT
-        turns = tangents(normal)
+        rotations = tangents(normal)
         outward = (g[..., 1:4] * normal).sum(dim=-1)
         outward = outward + (g[..., 4:] * _differential(normal, normal)).sum(dim=-1)
         mixed = [
-            (g[..., 1:4] * turn).sum(dim=-1)
-            + (g[..., 4:] * _differential(normal, turn)).sum(dim=-1)
-            for turn in turns
+            (g[..., 1:4] * rotation).sum(dim=-1)
+            + (g[..., 4:] * _differential(normal, rotation)).sum(dim=-1)
+            for rotation in rotations
         ]
         twice = {
-            (a, b): (g[..., 4:] * _differential(turns[a], turns[b])).sum(dim=-1)
+            (a, b): (g[..., 4:] * _differential(rotations[a], rotations[b])).sum(dim=-1)
             for a, b in ((0, 0), (0, 1), (1, 1))
         }
         flat = bending(-outward, mixed[0], mixed[1], twice[0, 1], albedo)
@@ -237,11 +237,11 @@ def _quadratic(degree: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 3 3"]
 
 
 def _differential(
-    normals: Float[Tensor, "*batch 3"], turn: Float[Tensor, "*batch 3"]
+    normals: Float[Tensor, "*batch 3"], rotation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 5"]:
     """Give the change of the second degree when normals move along ``turn``."""
     x, y, z = normals.unbind(dim=-1)
-    a, b, c = turn.unbind(dim=-1)
+    a, b, c = rotation.unbind(dim=-1)
     root = math.sqrt(3)
     degree = [
         root * (a * y + x * b),

@@ -12,7 +12,7 @@ from pimper_torch.photometry.variable_projection import solve_variable_projectio
 from pimper_torch.records import Record
 from pimper_torch.single_view.factorization.low_rank import low_rank_problem, random_left
 
-# Residuals below this share of the data are zero but for rounding.
+# Residuals below this fraction of the data are zero but for rounding.
 _ROUNDING = 1e-6
 
 
@@ -53,7 +53,7 @@ def factorize_from_many(
         generator: On the CPU.
         repeats: How many starts must end in the best minimum.
         max_starts: Starts at most.
-        closeness: Residuals that differ by less than this share are of the same minimum.
+        closeness: Residuals that differ by less than this fraction are of the same minimum.
         max_iterations: Of each start.
         tolerance: See
             :func:`~pimper_torch.photometry.variable_projection.solve_variable_projection`.

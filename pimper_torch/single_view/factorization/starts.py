@@ -37,9 +37,9 @@ def start_from_data(
     lights, shading = torch.where(sound, lights, reference), torch.where(sound, shading, fallback)
     # L A^-1 = reference, transposed: lights are columns that A^-T moves.
     moves = align_factorizations(lights.mT, reference.mT, weight.sum(dim=2))
-    turn = Ambiguity(matrix=moves.matrix.mT).inverse()
-    turned_lights, turned = turn.on_lights(lights), turn.on_shading(shading)
-    sound = sound & turned_lights.isfinite().all(dim=(1, 2))[:, None, None]
-    sound = sound & turned.isfinite().all(dim=(1, 2))[:, None, None]
-    start = project_to_cone(torch.where(sound, turned, fallback).mT).mT
-    return torch.where(sound, turned_lights, reference), start
+    rotation = Ambiguity(matrix=moves.matrix.mT).inverse()
+    rotated_lights, rotated = rotation.on_lights(lights), rotation.on_shading(shading)
+    sound = sound & rotated_lights.isfinite().all(dim=(1, 2))[:, None, None]
+    sound = sound & rotated.isfinite().all(dim=(1, 2))[:, None, None]
+    start = project_to_cone(torch.where(sound, rotated, fallback).mT).mT
+    return torch.where(sound, rotated_lights, reference), start

@@ -128,14 +128,14 @@ def find_discontinuities(
             (steps.kink_down < config.kink) & (steps.twist_down < config.twist),
         )
         asked = steps.known_right & calm[0] & inside[0], steps.known_down & calm[1] & inside[1]
-        share = (
+        fraction = (
             torch.where(asked[0], 1.0, config.tie) * inside[0],
             torch.where(asked[1], 1.0, config.tie) * inside[1],
         )
         system, solution = None, None
         scale, narrowed, cause = _FIRST_SCALE, False, StopCause.LIMIT
         for taken in range(1, config.max_iterations + 1):
-            weights = weight_right * share[0], weight_down * share[1]
+            weights = weight_right * fraction[0], weight_down * fraction[1]
             if system is None or solution is None:
                 system = RasterSystem(
                     *weights, anchor, method=method, tolerance=_TOLERANCE, what="the integration"
@@ -148,22 +148,22 @@ def find_discontinuities(
             smallest = _last_scale(apart, asked, config)
             narrowed = scale <= smallest
             scale = max(scale, smallest)
-            before = share
-            share = (
-                _share(apart[0], asked[0], inside[0], scale, config.tie),
-                _share(apart[1], asked[1], inside[1], scale, config.tie),
+            before = fraction
+            fraction = (
+                _fraction(apart[0], asked[0], inside[0], scale, config.tie),
+                _fraction(apart[1], asked[1], inside[1], scale, config.tie),
             )
             report(taken, config.max_iterations)
-            if narrowed and _mean_change(before, share, inside) < config.tolerance:
+            if narrowed and _mean_change(before, fraction, inside) < config.tolerance:
                 cause = StopCause.CONVERGED
                 break
             scale = max(scale / _NARROWER, smallest)
         return Continuity(
-            right=share[0],
-            down=share[1],
+            right=fraction[0],
+            down=fraction[1],
             convergence=Convergence(
                 iterations=torch.tensor([taken]),
-                residual=_deviation(apart, share)[None],
+                residual=_deviation(apart, fraction)[None],
                 cause=torch.tensor([int(cause)]),
             ),
         )
@@ -190,14 +190,14 @@ def _residuals(steps: Steps, found: Float[Tensor, "height width"]) -> Pair:
     return right / steps.unit_right - steps.right, down / steps.unit_down - steps.down
 
 
-def _share(
+def _fraction(
     residual: Float[Tensor, "row column"],
     asked: Bool[Tensor, "row column"],
     inside: Bool[Tensor, "row column"],
     scale: float,
     tie: float,
 ) -> Float[Tensor, "row column"]:
-    """Give the share of its weight that a step keeps."""
+    """Give the fraction of its weight that a step keeps."""
     geman_mcclure = (1 + (residual / scale).square()) ** -2
     return torch.where(asked, geman_mcclure, 0).clamp_min(tie) * inside
 
@@ -213,6 +213,6 @@ def _mean_change(before: Pair, after: Pair, inside: tuple[Tensor, Tensor]) -> fl
     return float(moved) / max(1, int(inside[0].sum()) + int(inside[1].sum()))
 
 
-def _deviation(apart: Pair, share: Pair) -> Float[Tensor, ""]:
-    square = (share[0] * apart[0].square()).sum() + (share[1] * apart[1].square()).sum()
-    return (square / (share[0].sum() + share[1].sum()).clamp_min(1)).sqrt()
+def _deviation(apart: Pair, fraction: Pair) -> Float[Tensor, ""]:
+    square = (fraction[0] * apart[0].square()).sum() + (fraction[1] * apart[1].square()).sum()
+    return (square / (fraction[0].sum() + fraction[1].sum()).clamp_min(1)).sqrt()

@@ -219,15 +219,15 @@ def _usable(
 def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> tuple[Tensor, Tensor]:
     """Give the weights of squared differences of the unknown, zero outside the mask."""
     inside = steps.inside
-    trust = torch.where(steps.valid, 1.0 if weight is None else weight.double(), 0).double()
+    reliability = torch.where(steps.valid, 1.0 if weight is None else weight.double(), 0).double()
     parts = []
     for axis, known, unit in (
         (1, steps.known_right, steps.unit_right),
         (0, steps.known_down, steps.unit_down),
     ):
-        last = trust.shape[axis] - 1
+        last = reliability.shape[axis] - 1
         both = inside.narrow(axis, 1, last) & inside.narrow(axis, 0, last)
-        least = torch.minimum(trust.narrow(axis, 1, last), trust.narrow(axis, 0, last))
+        least = torch.minimum(reliability.narrow(axis, 1, last), reliability.narrow(axis, 0, last))
         parts.append(both * torch.where(known, least, _FILLED_WEIGHT) / unit**2)
     return parts[0], parts[1]
 

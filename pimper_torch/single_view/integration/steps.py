@@ -161,8 +161,8 @@ def _between_planes_seen(
     ahead = (1 + unit / 2 * second).clamp_min(_GRAZING).log()
     behind = (1 - unit / 2 * first).clamp_min(_GRAZING).log()
     # The logarithm of a plane's depth bends: its slope changes by the square of itself.
-    turn = second - first - unit * first * second
-    return (ahead - behind) / unit + unit / 24 * (first + second) * turn, turn
+    rotation = second - first - unit * first * second
+    return (ahead - behind) / unit + unit / 24 * (first + second) * rotation, rotation
 
 
 def _steps(
@@ -198,7 +198,7 @@ def _steps(
 
 def _curved(
     step: Float[Tensor, "line step"],
-    turn: Float[Tensor, "line step"],
+    rotation: Float[Tensor, "line step"],
     known: Bool[Tensor, "line step"],
 ) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
     """Bend steps along the cubic through four slopes, and tell kinks.
@@ -206,9 +206,9 @@ def _curved(
     The step between tangent planes is wrong by a twelfth of the surface's third derivative,
     which on a sphere adds up from pixel to pixel; how planes turn before and after tells it.
     """
-    before, after = _beside(turn, known)
-    has_before, has_after = _beside(known.to(turn), known)
-    kink = _excess(turn, known)
+    before, after = _beside(rotation, known)
+    has_before, has_after = _beside(known.to(rotation), known)
+    kink = _excess(rotation, known)
     bend = after - before
     smooth = known & (has_before * has_after > 0)
     smooth = smooth & (bend.abs() < _SMOOTH_BEND) & (kink < _SMOOTH_EXCESS)

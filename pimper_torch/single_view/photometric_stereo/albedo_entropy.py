@@ -58,7 +58,7 @@ def resolve_by_albedo_entropy(
             (:func:`.chromaticity_groups`). The
             entropy of colour albedo is that of chromaticity, which no relief changes, plus that
             of brightness within each group, which is minimised. Without it all are one group.
-        width: Of the last kernel, as a share of albedo; about the noise of shading.
+        width: Of the last kernel, as a fraction of albedo; about the noise of shading.
         max_pixels: Evenly chosen from more.
 
     Returns:
@@ -143,7 +143,7 @@ def _descended(
     best: Float[Tensor, "candidate 3"],
     step: Float[Tensor, " 3"],
     width: float,
-    rounds: int = 4,
+    iterations: int = 4,
 ) -> tuple[Float[Tensor, "candidate 3"], Float[Tensor, " candidate"]]:
     """Move each candidate to its best neighbour a step away until none is better."""
     around = torch.tensor(list(itertools.product((-1, 0, 1), repeat=3))).to(b) * step
@@ -151,7 +151,7 @@ def _descended(
     best = best.clone()
     least = torch.full_like(best[:, 0], torch.inf)
     moving = torch.arange(len(best), device=b.device)
-    for _ in range(rounds):
+    for _ in range(iterations):
         near = best[moving, None] + around
         entropy = albedo_entropy(b, labels, near.flatten(0, 1), width).reshape(near.shape[:2])
         least[moving], chosen = entropy.min(dim=1)
@@ -186,8 +186,8 @@ def _entropy(
     u, double = 1 - t, t * t
     last = double * t / 6
     first, second = u * u * u / 6, 2 / 3 - double + 3 * last
-    for shift, share in enumerate((first, second, 1 - first - second - last, last)):
-        histogram.scatter_add_(1, index + shift, share)
+    for shift, fraction in enumerate((first, second, 1 - first - second - last, last)):
+        histogram.scatter_add_(1, index + shift, fraction)
     probability = histogram / b.shape[1]
     return -torch.special.xlogy(probability, probability).sum(dim=1)
 

@@ -1,8 +1,8 @@
 r"""Pixels of one paint, told by their colour across all photographs.
 
-A Lambertian pixel's channels differ by albedo and by the lamp's colour alone: shading, shadow
-and normal multiply all of them. In logarithm :math:`\log J_{vci} = s_{vi} + e_{vc} + a_{ci}`, with
-``e`` the colour of the light of view v and ``a`` that of pixel i.
+A Lambertian pixel's channels differ by albedo and by the point light's colour alone: shading,
+shadow and normal multiply all of them. In logarithm :math:`\log J_{vci} = s_{vi} + e_{vc} +
+a_{ci}`, with ``e`` the colour of the light of view v and ``a`` that of pixel i.
 """
 
 import torch
@@ -11,9 +11,10 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 
-# Channels darker than this share of a photograph's brightest value say nothing about colour.
+# Channels darker than this fraction of a photograph's brightest value say nothing about colour.
 _DARK = 0.02
-# Alternations between lights and pixels; each at least halves what is left where lamps overlap.
+# Alternations between lights and pixels; each at least halves what is left where point lights
+# overlap.
 _ALTERNATIONS = 20
 # Pixels among which the colours are sought; all are then assigned.
 _SOUGHT_AMONG = 2000
@@ -22,7 +23,7 @@ _SOUGHT_AMONG = 2000
 def chromaticities(
     images: Float[Tensor, "view channel height width"], mask: Bool[Tensor, "height width"]
 ) -> tuple[Float[Tensor, "channel pixel"], Bool[Tensor, " pixel"]]:
-    r"""Estimate the logarithm of each pixel's colour, brightness and the lamps' colours removed.
+    r"""Estimate the logarithm of each pixel's chromaticity, the lights' colours removed.
 
     Weighted least squares for ``e`` and ``a`` in turn, weights the square of brightness: the
     noise of a logarithm is that of the value over the value.
@@ -45,11 +46,11 @@ def chromaticities(
     weight = (bright / inverse)[:, None]
     total_view = weight.sum(dim=2).clamp_min(1e-30)
     total_pixel = weight.sum(dim=0).clamp_min(1e-30)
-    lamp = torch.zeros_like(log[:, :, 0])
+    point_light = torch.zeros_like(log[:, :, 0])
     pixel = torch.zeros_like(log[0])
     for _ in range(_ALTERNATIONS):
-        pixel = (weight * (log - lamp[..., None])).sum(dim=0) / total_pixel
-        lamp = (weight * (log - pixel)).sum(dim=2) / total_view
+        pixel = (weight * (log - point_light[..., None])).sum(dim=0) / total_pixel
+        point_light = (weight * (log - pixel)).sum(dim=2) / total_view
     return pixel.to(images), bright.any(dim=0)
 
 
@@ -71,7 +72,7 @@ def chromaticity_groups(
         mask: Pixels that count, in raster order.
         radius: In logarithm of colour; a few times its noise, less than half the distance of
             different paints.
-        smallest: Groups with less than this share of the pixels are dropped.
+        smallest: Groups with less than this fraction of the pixels are dropped.
 
     Returns:
         Labels from 0, the largest group's; -1 for pixels in no group.

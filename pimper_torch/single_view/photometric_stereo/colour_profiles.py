@@ -62,7 +62,7 @@ def resolve_by_colour_profiles(
     over the transformation and the groups' albedos; the better minimum is taken.
 
     Args:
-        images: Linear radiance, of two channels or more. Lamps may have different colours.
+        images: Linear radiance, of two channels or more. Point lights may have different colours.
         mask: Where the surface is.
         shading: Albedo times normal of the pixels inside the mask, right up to a bas-relief
             transformation. Vectors that are zero or not finite are left out.

@@ -1,7 +1,7 @@
-r"""Bas-relief resolved by the places where the surface faces a lamp.
+r"""Bas-relief resolved by the places where the surface faces a point light.
 
-Where brightness under one lamp has a maximum on a surface of one paint, the normal points to
-the lamp: albedo times normal is parallel to the light. For a factorization right up to a
+Where brightness under one point light has a maximum on a surface of one paint, the normal points to
+the point light: albedo times normal is parallel to the light. For a factorization right up to a
 bas-relief transformation this reads
 
 .. math:: \hat l \times M \hat b = 0, \qquad M = G^\top G,
@@ -36,22 +36,23 @@ from pimper_torch.single_view.photometric_stereo.relief_metric import relief_of_
 # Maxima whose pairs are tried; pairs are half their square.
 _MAX_MAXIMA = 120
 _REFINEMENTS = 30
-# Share of a view's brightest value below which a pixel may be in shadow.
+# Fraction of a view's brightest value below which a pixel may be in shadow.
 _SHADOW = 0.05
-# Share of the maxima that are expected where the surface faces the lamp; on one paint more are.
+# Fraction of the maxima that are expected where the surface faces the point light; on one paint
+# more are.
 _RIGHT = 0.2
 # From the standard form hardly a surface is flatter than this, and none as steep.
 _MAX_LOG_LAMBDA = 2.0
-# Lamps that each maximum is tried with to learn how near it comes by chance.
+# Point lights that each maximum is tried with to learn how near it comes by chance.
 _OTHERS = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DiffuseMaxima(Record):
-    """Places where brightness under one lamp has a maximum.
+    """Places where brightness under one point light has a maximum.
 
     Attributes:
-        view: Whose lamp.
+        view: Whose point light.
         place: Column and row, top-left centre at (0.5, 0.5).
         shading: Albedo times normal there, interpolated.
         deviation: Standard deviation of the vector's direction, as far as the maximum's place
@@ -73,7 +74,7 @@ def resolve_by_diffuse_maxima(
     radius: int = 3,
     agreement_deg: float = 1.0,
 ) -> BasRelief:
-    r"""Find the bas-relief transformation that turns normals at maxima towards their lamps.
+    r"""Find the bas-relief transformation that turns normals at maxima towards their point lights.
 
     Every pair of maxima gives a metric in closed form, the least singular vector of its six
     equations. The one that most maxima agree with is refined by all of them: written in the
@@ -94,8 +95,8 @@ def resolve_by_diffuse_maxima(
     Returns:
         The transformation with lambda above zero: hills stay hills. Constant to autograd.
 
-    Fails where fewer than about three lamps are faced by visible surface, and where the paint
-    changes more than the shading everywhere.
+    Fails where fewer than about three point lights are faced by visible surface, and where the
+    paint changes more than the shading everywhere.
 
     Raises:
         InputError: Sizes that do not fit, fewer than two maxima, or none that agree.
@@ -167,8 +168,10 @@ def find_maxima(
     by_gy = -(hxx * down - hxy * along) / safe
     size = vector.norm(dim=0).clamp_min(1e-30)
     unit = vector / size
-    turn = sum((by - unit * (unit * by).sum(dim=0)).square().sum(dim=0) for by in (by_gx, by_gy))
-    deviation = (error / (u * u).sum() * turn).sqrt() / size
+    rotation = sum(
+        (by - unit * (unit * by).sum(dim=0)).square().sum(dim=0) for by in (by_gx, by_gy)
+    )
+    deviation = (error / (u * u).sum() * rotation).sqrt() / size
     place = torch.stack([column + 0.5 + du, row + 0.5 + dv], dim=1)
     return DiffuseMaxima(
         view=view[kept], place=place[kept], shading=vector[:, kept], deviation=deviation[kept]
@@ -187,8 +190,8 @@ def _agreed(
     metrics = torch.linalg.svd(pairs, full_matrices=False).Vh[:, -1]
     reliefs = relief_of_metric(metrics)
     angles = _angles(reliefs, b, light).nan_to_num(nan=torch.pi)
-    # How much likelier each angle is for a right maximum than with some other maximum's lamp,
-    # which a relief that gathers all normals or all lights brings as near.
+    # How much likelier each angle is for a right maximum than with some other maximum's point
+    # light, which a relief that gathers all normals or all lights brings as near.
     alike = torch.exp(-((angles / scale) ** 2) / 2)
     chance = torch.zeros_like(alike)
     shifts = range(1, min(_OTHERS, b.shape[1] - 1) + 1)
@@ -204,7 +207,7 @@ def _agreed(
     if int((angles[best] < 3 * scale).sum()) < 2 or bool(extreme[best]):
         raise InputError(
             f"no two of {b.shape[1]} maxima of brightness agree on one relief; needed: places "
-            "that face their lamps. Lower `radius`, or use another method."
+            "that face their point lights. Lower `radius`, or use another method."
         )
     return _refined(
         BasRelief(mu=reliefs.mu[best], nu=reliefs.nu[best], lam=reliefs.lam[best]), b, light, scale
@@ -220,9 +223,9 @@ def _refined(
     """Solve all maxima's equations in the frame of the last solution, until it stays."""
     for _ in range(_REFINEMENTS):
         moved = relief.on_shading(b)
-        lamp = relief.on_lights(light.mT).mT
+        point_light = relief.on_lights(light.mT).mT
         weight = cauchy_weights(_angles(relief, b, light), scale) / scale**2
-        equations = weight[:, None, None].sqrt() * _equations(moved, lamp)
+        equations = weight[:, None, None].sqrt() * _equations(moved, point_light)
         metric = torch.linalg.svd(equations.flatten(0, 1), full_matrices=False).Vh[-1]
         step = relief_of_metric(metric)
         if not bool(step.lam.isfinite()):
@@ -253,9 +256,9 @@ def _angles(
     relief: BasRelief, b: Float[Tensor, "3 maximum"], light: Float[Tensor, "3 maximum"]
 ) -> Float[Tensor, "*batch maximum"]:
     """Give the angle between each normal and its light after the transformation."""
-    normal, lamp = relief.matrix @ b, relief.inverse().matrix.mT @ light
-    cross = torch.linalg.cross(normal, lamp, dim=-2).norm(dim=-2)
-    return torch.atan2(cross, (normal * lamp).sum(dim=-2))
+    normal, point_light = relief.matrix @ b, relief.inverse().matrix.mT @ light
+    cross = torch.linalg.cross(normal, point_light, dim=-2).norm(dim=-2)
+    return torch.atan2(cross, (normal * point_light).sum(dim=-2))
 
 
 def _tops(

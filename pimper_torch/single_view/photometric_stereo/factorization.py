@@ -25,7 +25,7 @@ from pimper_torch.single_view.photometric_stereo.regression import (
 _MAX_PIXELS = 4000
 # Of variable projection: the first solution, and each one after a change of weights.
 _FIRST_STEPS, _NEXT_STEPS = 100, 5
-_TURNS = 20
+_ROTATIONS = 20
 _WIDEST, _NARROWING = 4.0, 0.8
 
 
@@ -63,7 +63,7 @@ def factorize_photographs(
     Args:
         radiance: Linear, gray. Samples without weight do not matter.
         weight: Not negative; 0 where missing.
-        rank: 3 for lamps, 4 or 9 for harmonics.
+        rank: 3 for point lights, 4 or 9 for harmonics.
         robust: Whether to re-weight; see
             :func:`~pimper_torch.single_view.photometric_stereo.regression.regress`.
         shadows: What lights from behind leave. For harmonics, ``none``.
@@ -136,13 +136,13 @@ def _settle(
 ) -> Float[Tensor, "view rank"]:
     """Alternate weights and factors, weights from wide to their own scale."""
     weight = first
-    for turn in range(_TURNS):
+    for rotation in range(_ROTATIONS):
         problem = low_rank_problem(x[None], weight[None], left[None])
         solved = solve_variable_projection(problem, _NEXT_STEPS)
         left = solved.lights[0]
-        widen = max(1.0, _WIDEST * _NARROWING**turn)
-        trust, lit = reweigh(x, given, left @ solved.shading[0], widen, shadows)
-        weight = trust * lit
+        widen = max(1.0, _WIDEST * _NARROWING**rotation)
+        reliability, lit = reweigh(x, given, left @ solved.shading[0], widen, shadows)
+        weight = reliability * lit
     return left
 
 
@@ -153,8 +153,8 @@ def _filled(
     gain = (weight * x).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
     level = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
     albedo = (weight * x).sum(dim=0, keepdim=True) / level
-    share = weight / weight.amax().clamp_min(1e-300)
-    filled = share * x + (1 - share) * gain * albedo
+    fraction = weight / weight.amax().clamp_min(1e-300)
+    filled = fraction * x + (1 - fraction) * gain * albedo
     return torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
 
 

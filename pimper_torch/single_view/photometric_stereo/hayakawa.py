@@ -1,7 +1,7 @@
-r"""Pixels of one albedo, or lamps of one strength, make a factorization of rank three metric.
+r"""Pixels of one albedo, or lights of one strength, make a rank-three factorization metric.
 
-Six pixels whose albedo is the same, or six lamps whose strength is, determine the quadratic form
-that measures them; what leaves it unchanged are rotations and mirrors. Where integrability has
+Six pixels whose albedo is the same, or six point lights whose strength is, determine the quadratic
+form that measures them; what leaves it unchanged are rotations and mirrors. Where integrability has
 left a bas-relief transformation instead, the same knowledge leaves only convex or concave.
 
 Source: Hayakawa, Photometric stereo under a light source with arbitrary motion, JOSA A 11(11),
@@ -21,10 +21,10 @@ from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.relief import convex
 
-_ROUNDS = 20
-# The least singular value of the equations, as a share of the largest: below, the vectors lie on
+_ITERATIONS = 20
+# The least singular value of the equations, as a fraction of the largest: below, the vectors lie on
 # a cone, and more than one form measures them alike.
-_MIN_SHARE = 1e-6
+_MIN_FRACTION = 1e-6
 # Depths, as factors of the given one, from which a bas-relief is looked for.
 _DEPTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _STEPS = 60
@@ -57,9 +57,9 @@ def metric_from_albedo(
 
 
 def metric_from_strength(lights: Float[Tensor, "view 3"]) -> Float[Tensor, "3 3"]:
-    r"""Find the matrix after which all lamps have the same strength.
+    r"""Find the matrix after which all point lights have the same strength.
 
-    :math:`\lVert A^{-\top} l_v \rVert = 1` for all lamps is linear in
+    :math:`\lVert A^{-\top} l_v \rVert = 1` for all point lights is linear in
     :math:`A^{-1} A^{-\top}`. What remains free is an orthogonal matrix.
 
     Args:
@@ -69,12 +69,12 @@ def metric_from_strength(lights: Float[Tensor, "view 3"]) -> Float[Tensor, "3 3"
         ``A``, to be applied to shading. Its inverse goes to the lights.
 
     Raises:
-        InputError: Fewer than six lamps, lamps on one cone, or lamps that cannot have one
-            strength.
+        InputError: Fewer than six point lights, point lights on one cone, or point lights that
+            cannot have one strength.
     """
     weight = (lights != 0).any(dim=1).to(lights)
-    form = _form(lights.mT, weight, "lamps of equal strength")
-    return torch.linalg.inv(_root(form, "lamps of equal strength")).mT
+    form = _form(lights.mT, weight, "point lights of equal strength")
+    return torch.linalg.inv(_root(form, "point lights of equal strength")).mT
 
 
 def relief_from_albedo(
@@ -117,7 +117,7 @@ def relief_from_strength(
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
 ) -> BasRelief:
-    """Find the bas-relief transformation after which most lamps have the same strength; convex.
+    """Find the bas-relief transformation that gives most point lights one strength; convex.
 
     Args:
         lights: That go with the shading; zero rows do not matter.
@@ -127,7 +127,7 @@ def relief_from_strength(
         mask: Where the pixels are.
 
     Raises:
-        InputError: Fewer than four lamps.
+        InputError: Fewer than four point lights.
 
     Levenberg-Marquardt from seven depths, with Cauchy's weights. Constant to autograd.
     """
@@ -146,7 +146,7 @@ def relief_from_strength(
     size = _typical(lights.mT, known)
     begin = [[depth / size, 0.0, 0.0, 1 / size] for depth in _DEPTHS]
     across, tilt_x, tilt_y, along = _fitted(
-        curve, known, x.new_tensor(begin), "lamps of equal strength"
+        curve, known, x.new_tensor(begin), "point lights of equal strength"
     )
     found = BasRelief(mu=tilt_x / across, nu=tilt_y / across, lam=along / across)
     return convex(found, shading, weight, mask)
@@ -166,10 +166,10 @@ def _form(
         double[diagonal(3)] = 1
         monomials = double * outer(vectors.double() / size)
         heavy = given
-        for _ in range(_ROUNDS):
+        for _ in range(_ITERATIONS):
             root = heavy.sqrt()
             singular = torch.linalg.svdvals(root * monomials)
-            if not singular[-1] > _MIN_SHARE * singular[0]:
+            if not singular[-1] > _MIN_FRACTION * singular[0]:
                 raise InputError(
                     f"{what}: theirs are on one cone, which more than one measure makes equal; "
                     "needed: others besides. Take more, in other directions."

@@ -31,8 +31,8 @@ from pimper_torch.records import Record
 # coefficients the noise that biases the answer. On the grey sphere of 215 pixels, normals after
 # the best bas-relief are 7.3 degrees off with single pixels in blocks of 4, and 6.1 so.
 _CELLS, _BLOCKS = 64, 16
-_ROUNDS = 10
-# Where the next best solution has a curl, as a share of the terms, below this, rounding decides.
+_ITERATIONS = 10
+# Where the next best solution has a curl, as a fraction of the terms, below this, rounding decides.
 _MIN_RIVAL = 1e-6
 
 
@@ -112,10 +112,10 @@ def curls(
     inverse = torch.where(known, 1 / torch.where(known, length, 1), 0)
     unit = s * inverse
     # Noise of the direction goes with 1 / length; beyond the median nothing is gained.
-    middle = length[known].median() if known.any() else length.new_ones(())
-    trust = torch.where(known, w * (length / middle).clamp_max(1) ** 2, 0)
+    centre = length[known].median() if known.any() else length.new_ones(())
+    reliability = torch.where(known, w * (length / centre).clamp_max(1) ** 2, 0)
     raster, heavy = s.new_zeros(*mask.shape, len(s)), s.new_zeros(mask.shape)
-    raster[mask], heavy[mask] = unit.mT, trust
+    raster[mask], heavy[mask] = unit.mT, reliability
     size = float(mask.sum()) ** 0.5
     step, block = max(1, round(size / _CELLS)), max(2, round(size / _BLOCKS))
     a, b = raster[:-step, :-step], raster[:-step, step:]
@@ -141,7 +141,7 @@ def curls(
         across=mean[:, :pairs],
         down=mean[:, pairs:],
         weight=total[some],
-        noise=torch.stack([(trust[:, None] * part).mT @ part for part in parts]).sum(dim=0),
+        noise=torch.stack([(reliability[:, None] * part).mT @ part for part in parts]).sum(dim=0),
     )
 
 
@@ -186,7 +186,7 @@ def integrable(
         return Integrable(matrix=matrix.to(pseudo), curl=curl, certainty=certainty)
 
 
-def turn_to_surface(
+def rotation_to_surface(
     shading: Float[Tensor, "3 pixel"],
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
@@ -249,21 +249,21 @@ def _least(equations: Curls) -> tuple[Float[Tensor, " both"], float, float]:
     eye = torch.eye(len(metric)).to(metric)
     root = torch.linalg.cholesky(metric + 1e-12 * metric.diagonal().mean() * eye)
     weighed = equations
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         full, terms = moments(weighed)
         inner = torch.linalg.solve_triangular(root, full, upper=False)
         inner = torch.linalg.solve_triangular(root, inner.mT, upper=False)
         values, vectors = torch.linalg.eigh((inner + inner.mT) / 2)
         vectors = torch.linalg.solve_triangular(root.mT, vectors, upper=True)
         weighed = equations.replace(weight=reweighed(equations, vectors[:, 0]))
-    share = [_curl(full, terms, vectors[:, one]) for one in (0, 1)]
-    if not share[1] > _MIN_RIVAL:
+    fraction = [_curl(full, terms, vectors[:, one]) for one in (0, 1)]
+    if not fraction[1] > _MIN_RIVAL:
         raise InputError(
             "integrability: more than one matrix makes these pseudo-normals a surface, as for a "
             "plane or a cylinder; needed: normals that turn both ways. Widen the mask."
         )
     least = float(values[0].clamp_min(torch.finfo(values.dtype).tiny))
-    return vectors[:, 0], share[0], (float(values[1]) / least) ** 0.5
+    return vectors[:, 0], fraction[0], (float(values[1]) / least) ** 0.5
 
 
 def _curl(

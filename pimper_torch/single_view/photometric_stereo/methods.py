@@ -21,7 +21,10 @@ from pimper_torch.single_view.photometric_stereo.hayakawa import (
     relief_from_albedo,
     relief_from_strength,
 )
-from pimper_torch.single_view.photometric_stereo.integrability import integrable, turn_to_surface
+from pimper_torch.single_view.photometric_stereo.integrability import (
+    integrable,
+    rotation_to_surface,
+)
 from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution, Surfaced
 from pimper_torch.single_view.photometric_stereo.regression import determined
@@ -35,32 +38,32 @@ from pimper_torch.single_view.photometric_stereo.woodham import calibrated_stere
 
 
 def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
-    images, mask = _trusted(given, found)
+    images, mask = _reliable(given, found)
     groups = chromaticity_groups(images, mask) if images.shape[1] > 1 else None
-    relief = resolve_by_albedo_entropy(found.shading[:, found.trust > 0], groups)
-    return convex(relief, found.shading, found.trust, given.mask)
+    relief = resolve_by_albedo_entropy(found.shading[:, found.reliability > 0], groups)
+    return convex(relief, found.shading, found.reliability, given.mask)
 
 
 def _by_profiles(given: Problem, found: Surfaced) -> BasRelief:
-    images, mask = _trusted(given, found)
-    known = found.shading[:, found.trust > 0]
+    images, mask = _reliable(given, found)
+    known = found.shading[:, found.reliability > 0]
     relief = resolve_by_colour_profiles(images, mask, known, found.lights)
-    return convex(relief, found.shading, found.trust, given.mask)
+    return convex(relief, found.shading, found.reliability, given.mask)
 
 
 def _by_maxima(given: Problem, found: Surfaced) -> BasRelief:
-    images, mask = _trusted(given, found)
-    known = found.shading[:, found.trust > 0]
+    images, mask = _reliable(given, found)
+    known = found.shading[:, found.reliability > 0]
     relief = resolve_by_diffuse_maxima(images, mask, known, found.lights)
-    return convex(relief, found.shading, found.trust, given.mask)
+    return convex(relief, found.shading, found.reliability, given.mask)
 
 
-def _trusted(
+def _reliable(
     given: Problem, found: Surfaced
 ) -> tuple[Float[Tensor, "view channel height width"], Bool[Tensor, "height width"]]:
     """Give the photographs, and the pixels that are trusted."""
     mask = torch.zeros_like(given.mask)
-    mask[given.mask] = found.trust > 0
+    mask[given.mask] = found.reliability > 0
     return _without_holes(given), mask
 
 
@@ -76,10 +79,12 @@ def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]
 # diffuse maxima, on the photographs (benchmarks/photometric_stereo.py).
 RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "albedo_entropy": _by_entropy,
-    "rounded": lambda given, found: rounded_relief(found.shading, found.trust, given.mask),
-    "equal_albedo": lambda given, found: relief_from_albedo(found.shading, found.trust, given.mask),
+    "rounded": lambda given, found: rounded_relief(found.shading, found.reliability, given.mask),
+    "equal_albedo": lambda given, found: relief_from_albedo(
+        found.shading, found.reliability, given.mask
+    ),
     "equal_strength": lambda given, found: relief_from_strength(
-        found.lights, found.shading, found.trust, given.mask
+        found.lights, found.shading, found.reliability, given.mask
     ),
     "colour_profiles": _by_profiles,
     "diffuse_maxima": _by_maxima,
@@ -104,22 +109,22 @@ def _calibrated(given: Problem, resolve: str) -> Solution:
 
 def _hayakawa(given: Problem, resolve: str) -> Solution:
     found = factorize_photographs(given.gray, given.weight, 3, robust=given.robust)
-    trust = _trust(found.weight, found.lights)
+    reliability = _reliability(found.weight, found.lights)
     if resolve == "equal_albedo":
-        matrix = metric_from_albedo(found.shading, trust)
+        matrix = metric_from_albedo(found.shading, reliability)
     else:
         matrix = metric_from_strength(found.lights)
     shading = matrix @ found.shading
-    turned = turn_to_surface(shading, trust, given.mask, matrix @ matrix.mT)
-    sign = bulge((turned @ shading)[:2], trust, given.mask)
+    rotated = rotation_to_surface(shading, reliability, given.mask, matrix @ matrix.mT)
+    sign = bulge((rotated @ shading)[:2], reliability, given.mask)
     signs = torch.stack([sign, sign, torch.ones_like(sign)])
-    matrix = signs[:, None] * (turned @ matrix)
+    matrix = signs[:, None] * (rotated @ matrix)
     return _lambertian(
         given,
         Surfaced(
             shading=matrix @ found.shading,
             lights=found.lights @ torch.linalg.inv(matrix),
-            trust=trust,
+            reliability=reliability,
             weight=found.weight,
         ),
         None,
@@ -129,12 +134,12 @@ def _hayakawa(given: Problem, resolve: str) -> Solution:
 
 def _integrability(given: Problem, resolve: str) -> Solution:
     found = factorize_photographs(given.gray, given.weight, 3, robust=given.robust)
-    trust = _trust(found.weight, found.lights)
-    matrix = integrable(found.shading, trust, given.mask).matrix
+    reliability = _reliability(found.weight, found.lights)
+    matrix = integrable(found.shading, reliability, given.mask).matrix
     surfaced = Surfaced(
         shading=matrix @ found.shading,
         lights=found.lights @ torch.linalg.inv(matrix),
-        trust=trust,
+        reliability=reliability,
         weight=found.weight,
     )
     applied = RESOLVERS[resolve](given, surfaced)
@@ -154,7 +159,7 @@ def _perspective(given: Problem, resolve: str) -> Solution:
     found = Surfaced(
         shading=shading,
         lights=lights,
-        trust=(shading != 0).any(dim=0).double(),
+        reliability=(shading != 0).any(dim=0).double(),
         weight=given.weight,
     )
     return _lambertian(given, found, None, _FACTOR)
@@ -188,7 +193,7 @@ def _by_harmonics(
 
 
 def _lambertian(given: Problem, found: Surfaced, applied: BasRelief | None, free: str) -> Solution:
-    """Read normals and the albedo of each colour off shading and lamps."""
+    """Read normals and the albedo of each colour off shading and point lights."""
     size = found.shading.norm(dim=0)
     normals = found.shading / torch.where(size > 0, size, 1)
     shade = (found.lights @ normals).clamp_min(0)
@@ -212,7 +217,7 @@ def _scaled(found: Solution) -> Solution:
     return found.replace(lights=found.lights / factor, albedo=found.albedo * factor)
 
 
-def _trust(
+def _reliability(
     weight: Float[Tensor, "view pixel"], lights: Float[Tensor, "view unknown"]
 ) -> Float[Tensor, " pixel"]:
     """Trust pixels by the samples that are left to them."""

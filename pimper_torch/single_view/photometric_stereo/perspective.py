@@ -151,8 +151,8 @@ def _between(
     values, axes = torch.linalg.eigh(moment)
     if float(values[0]) <= 1e-12 * float(values[-1]):
         raise InputError(
-            "the images have rank two or less; needed: three lamps that are not in one plane, and "
-            "a curved surface."
+            "the images have rank two or less; needed: three lights that are not in one plane, "
+            "and a curved surface."
         )
     white = axes.mT / values.sqrt()[:, None]
     vectors = white @ right
@@ -181,9 +181,9 @@ def _between(
     weight = torch.ones_like(b[0])
     for _ in range(_REWEIGHTINGS):
         cofactors, ratio = _least(rows, weight, spread, by_u, by_v)
-        turned_u, turned_v = by_u @ cofactors, by_v @ cofactors
-        variance = torch.einsum("pi,pij,pj->p", turned_u, spread, turned_u)
-        variance = variance + torch.einsum("pi,pij,pj->p", turned_v, spread, turned_v)
+        rotated_u, rotated_v = by_u @ cofactors, by_v @ cofactors
+        variance = torch.einsum("pi,pij,pj->p", rotated_u, spread, rotated_u)
+        variance = variance + torch.einsum("pi,pij,pj->p", rotated_v, spread, rotated_v)
         weight = 1 / variance.clamp_min(1e-3 * variance.median())
         weight = weight / weight.mean()
     if ratio < _DISTINCT:
@@ -196,7 +196,7 @@ def _between(
     if int(trouble) != 0 or not bool(inverse.isfinite().all()):
         raise InputError(
             "the integrability of the surface determines no invertible matrix; needed: a curved "
-            "surface and three lamps at least that are not in one plane."
+            "surface and three point lights at least that are not in one plane."
         )
     return inverse.mT @ white
 
@@ -286,7 +286,9 @@ def _check(
     seen: Bool[Tensor, "view pixel"] | None,
 ) -> None:
     if len(images) < 3:
-        raise InputError(f"{len(images)} views; needed: three at least, each under another lamp.")
+        raise InputError(
+            f"{len(images)} views; needed: three at least, each under another point light."
+        )
     if seen is not None and seen.shape[1] != int(mask.sum()):
         raise InputError(
             f"seen tells of {seen.shape[1]} pixels, and {int(mask.sum())} are inside the mask; "

@@ -71,11 +71,11 @@ class Surfaced(Record):
     Attributes:
         shading: Albedo times normal.
         lights: That go with it.
-        trust: Of each pixel; 0 leaves it out.
+        reliability: Of each pixel; 0 leaves it out.
         weight: Of each sample.
     """
 
     shading: Float[Tensor, "3 pixel"]
     lights: Float[Tensor, "view 3"]
-    trust: Float[Tensor, " pixel"]
+    reliability: Float[Tensor, " pixel"]
     weight: Float[Tensor, "view pixel"]

@@ -19,7 +19,7 @@ from pimper_torch.records import Record
 # Of the rounds of re-weighting: the scale starts this many times too wide and narrows to its own
 # value, so that a bad start does not decide which samples are outliers.
 _WIDEST, _NARROWING = 4.0, 0.7
-# Residuals below this share of the brightness are never outliers: 8 bits have 4e-3 steps.
+# Residuals below this fraction of the brightness are never outliers: 8 bits have 4e-3 steps.
 _MIN_SCALE = 1e-4
 
 Shadows = Literal["attached", "none"]
@@ -48,7 +48,7 @@ def regress(
     robust: bool = True,
     shadows: Shadows = "attached",
     base: bool = False,
-    rounds: int = 15,
+    iterations: int = 15,
 ) -> Regressed:
     r"""Fit each pixel's shading vector to its radiance.
 
@@ -65,7 +65,7 @@ def regress(
         robust: Whether to re-weight.
         shadows: What a light from behind leaves: ``attached`` nothing, ``none`` less than nothing.
         base: Whether radiance has a part that all views of a pixel share, such as ambient light.
-        rounds: Of re-weighting.
+        iterations: Of re-weighting.
 
     Returns:
         In float64. A pixel with less to go on than it has unknowns takes one of its best fits;
@@ -82,12 +82,12 @@ def regress(
         if not robust:
             return _fit(x, given, torch.zeros_like(given), rows, base)
         found = _fit(x, given * brightness(x, seen, base), torch.zeros_like(given), rows, base)
-        for turn in range(rounds):
+        for rotation in range(iterations):
             direct = rows @ found.shading
-            trust, lit = reweigh(
-                x - found.base, given, direct, max(1.0, _WIDEST * _NARROWING**turn), shadows
+            reliability, lit = reweigh(
+                x - found.base, given, direct, max(1.0, _WIDEST * _NARROWING**rotation), shadows
             )
-            found = _fit(x, trust * lit, trust * ~lit, rows, base)
+            found = _fit(x, reliability * lit, reliability * ~lit, rows, base)
         return found
 
 
@@ -125,10 +125,10 @@ def brightness(
     x = torch.where(seen, radiance, torch.nan)
     if base:
         x = x - x.nan_to_num(nan=torch.inf).amin(dim=0)
-    middle = x.nanmedian(dim=0).values.nan_to_num(nan=0.0)
-    middle = torch.where(middle > 0, middle, x.nan_to_num(nan=0.0).amax(dim=0))
-    share = x.nan_to_num(nan=0.0).clamp_min(0) / torch.where(middle > 0, middle, 1)
-    return share.clamp_max(1)
+    centre = x.nanmedian(dim=0).values.nan_to_num(nan=0.0)
+    centre = torch.where(centre > 0, centre, x.nan_to_num(nan=0.0).amax(dim=0))
+    fraction = x.nan_to_num(nan=0.0).clamp_min(0) / torch.where(centre > 0, centre, 1)
+    return fraction.clamp_max(1)
 
 
 def determined(

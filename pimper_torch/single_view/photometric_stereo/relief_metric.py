@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
-# Squares of parallel vectors in float32 differ by about this share.
+# Squares of parallel vectors in float32 differ by about this fraction.
 _FLAT = 1e-12
 
 

@@ -38,7 +38,7 @@ _STARTS, _RAPIDITY = 48, 1.0
 # Boosts without end make all normals the same, and every field of one normal is integrable. The
 # mean normal of a visible half ball has a Lorentz factor of 1.3, of normals within 20 degrees 6.
 _LORENTZ_FACTOR = 6.0
-_STEPS, _ROUNDS = 40, 5
+_STEPS, _ITERATIONS = 40, 5
 _NUDGE = 1e-6  # of forward differences in float64
 _MIN_GAIN = 1e-6  # a step that gains less of the misfit is the last
 _MAX_PIXELS = 1000  # for the map from nine dimensions to normals, which has 27 numbers
@@ -88,23 +88,23 @@ def four_harmonic_stereo(
         mask: Where the pixels are.
         generator: Of the starts; on the CPU.
         robust: Whether what harmonics do not explain loses weight: highlights, but also what
-            lamps leave in attached shadow, so leave it for soft light.
+            point lights leave in attached shadow, so leave it for soft light.
 
     Raises:
         InputError: Fewer than four views, or too few pixels for integrability.
 
     Fails where shadows are cast, which no harmonics of the normal make; where all lights come
-    from a narrow cone, as lamps without shadows are of rank three and leave the quadric free;
-    and for a surface of revolution seen along its axis, where boosts along the axis are
+    from a narrow cone, as point lights without shadows are of rank three and leave the quadric
+    free; and for a surface of revolution seen along its axis, where boosts along the axis are
     integrable too. Constant to autograd.
     """
     with torch.no_grad():
         found = factorize_photographs(radiance, weight, 4, robust=robust, shadows="none")
-        trust = found.weight.sum(dim=0)
-        trust = trust / trust.amax()
-        upgraded = upgrade_to_cone(found.lights[None], found.shading[None], trust[None])
+        reliability = found.weight.sum(dim=0)
+        reliability = reliability / reliability.amax()
+        upgraded = upgrade_to_cone(found.lights[None], found.shading[None], reliability[None])
         L, S = upgraded.lights[0], upgraded.shading[0]
-        applied, curl = _upright(S, trust, mask, torch.linalg.inv(L.mT @ L), generator)
+        applied, curl = _upright(S, reliability, mask, torch.linalg.inv(L.mT @ L), generator)
         on_cone = project_to_cone(applied.on_shading(S).mT).mT
         return Harmonic(
             shading=on_cone,
@@ -150,19 +150,19 @@ def nine_harmonic_stereo(
     with torch.no_grad():
         found = factorize_photographs(radiance, weight, 9, robust=robust, shadows="none")
         start = four_harmonic_stereo(radiance, weight, mask, generator, robust=robust)
-        trust = found.weight.sum(dim=0)
-        trust = trust / trust.amax()
+        reliability = found.weight.sum(dim=0)
+        reliability = reliability / reliability.amax()
         S = found.shading
         some = evenly(S.shape[1], _MAX_PIXELS).to(S.device)
-        linear = _regressed(S, start.shading[1:], trust)
-        linear = _explain(linear, S[:, some], trust[some])
+        linear = _regressed(S, start.shading[1:], reliability)
+        linear = _explain(linear, S[:, some], reliability[some])
         vector = linear @ S
         length = vector.norm(dim=0)
         cone = torch.cat([length[None], vector])
         noise = torch.zeros(4, 4).to(linear)
         noise[1:, 1:] = linear @ linear.mT
         noise[0, 0] = noise.trace() / 3
-        applied, curl = _upright(cone, trust, mask, noise, generator)
+        applied, curl = _upright(cone, reliability, mask, noise, generator)
         moved = applied.on_shading(cone)
         normal = split_shading(project_to_cone(moved.mT))[1].mT
         # From rho (1, n) to t rho (1, n'), and then to t^2 rho.
@@ -251,11 +251,11 @@ def _surface(
     drawn[:, :3] *= _RAPIDITY
     drawn[:, 3:] *= 2.0  # rotations of any angle
     drawn[0] = 0
-    at_rest = lorentz(drawn).to(mean) @ _to_rest(mean)
-    matrix = torch.cat([torch.eye(4).to(mean)[None], at_rest])
+    static_background = lorentz(drawn).to(mean) @ _to_rest(mean)
+    matrix = torch.cat([torch.eye(4).to(mean)[None], static_background])
     weighed = equations
     metric = both_ways(equations.noise)
-    for turn in range(_ROUNDS):
+    for rotation in range(_ITERATIONS):
         full, terms = moments(weighed)
         values, vectors = torch.linalg.eigh(full)
         root = values.clamp_min(0).sqrt()[:, None] * vectors.mT
@@ -263,11 +263,11 @@ def _surface(
         best = int(cost.argmin())
         solution = _bivectors(matrix[best])
         weighed = equations.replace(weight=reweighed(equations, solution))
-        if turn == 0:
+        if rotation == 0:
             matrix = matrix[cost.argsort()[:4]]
             best = 0
-    share = (solution @ full @ solution) / (solution @ terms @ solution)
-    return matrix[best], float(share.clamp_min(0).sqrt())
+    fraction = (solution @ full @ solution) / (solution @ terms @ solution)
+    return matrix[best], float(fraction.clamp_min(0).sqrt())
 
 
 def _to_rest(vector: Float[Tensor, " 4"]) -> Float[Tensor, "4 4"]:

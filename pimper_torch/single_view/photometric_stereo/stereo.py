@@ -37,7 +37,7 @@ class PhotometricStereo(Record):
             not valid, the best guess there is, or zero.
         albedo: Of each colour, not negative. With unknown lights up to one factor, such that
             lights have the median length 1.
-        lights: One row a view: towards the lamp, as long as it is strong; or four or nine
+        lights: One row a view: towards the point light, as long as it is strong; or four or nine
             harmonics. Zero for a view without samples.
         lit: True where a sample agrees with the result: seen, in no shadow, no highlight.
         valid: Where the normal is determined and faces the viewer.
@@ -77,12 +77,13 @@ def photometric_stereo(
     ========================  ============================================  =================
     method                    light                                         left free
     ========================  ============================================  =================
-    ``calibrated``            lamps, known                                  nothing
-    ``hayakawa``              lamps of one strength, or pixels of one       convex or concave
+    ``calibrated``            point lights, known                                  nothing
+    ``hayakawa``              point lights of one strength, or pixels of one       convex or concave
                               albedo (``resolve``)
-    ``integrability``         lamps                                         bas-relief, chosen
+    ``integrability``         point lights                                         bas-relief,
+    chosen
                                                                             by ``resolve``
-    ``perspective``           lamps, camera near by (``intrinsics``)        nothing
+    ``perspective``           point lights, camera near by (``intrinsics``)        nothing
     ``four_harmonics``        any, from all sides of the viewer, without    convex or concave
                               cast shadows
     ``nine_harmonics``        the same, more exactly                        convex or concave
@@ -98,16 +99,16 @@ def photometric_stereo(
         method: See the table.
         resolve: For ``integrability`` by default ``albedo_entropy``, for ``hayakawa`` by default
             ``equal_strength``; others have nothing to resolve.
-        lights: For ``calibrated``, one a view: towards the lamp, as long as it is strong, camera
-            frame.
+        lights: For ``calibrated``, one a view: towards the point light, as long as it is strong,
+            camera frame.
         intrinsics: ``K``, for methods of a camera near by; others take it to be far away.
         weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
             known to be in shadow.
         generator: On the CPU; for harmonics and subspaces, by default with the seed 0.
-        robust: Whether shadows and highlights lose weight; by default with lamps, but not with
-            harmonics, which explain attached shadows.
+        robust: Whether shadows and highlights lose weight; by default with point lights, but not
+            with harmonics, which explain attached shadows.
         subspaces: Whether shadows are found first, as visibility subspaces (see
-            :mod:`.visibility_subspaces`), and left out. For lamps
+            :mod:`.visibility_subspaces`), and left out. For point lights
             whose shadows are black.
         ambient: For ``calibrated``: whether each pixel has a radiance of its own.
 

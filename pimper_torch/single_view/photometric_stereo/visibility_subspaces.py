@@ -1,8 +1,9 @@
-r"""Which lamps light which pixels, told by the subspaces that pixels lie in.
+r"""Which point lights light which pixels, told by the subspaces that pixels lie in.
 
-Pixels lit by the same lamps have brightness :math:`V L b`, with V the diagonal of ones and zeros
-of those lamps: they lie in one subspace of three dimensions, which has zeros for the lamps in
-shadow. Each set of lamps has its own, and random samples find those that many pixels share.
+Pixels lit by the same point lights have brightness :math:`V L b`, with V the diagonal of ones and
+zeros of those point lights: they lie in one subspace of three dimensions, which has zeros for the
+point lights in shadow. Each set of point lights has its own, and random samples find those that
+many pixels share.
 
 Source: Sunkavalli, Zickler & Pfister, Visibility subspaces: uncalibrated photometric stereo with
 shadows, ECCV 2010.
@@ -34,11 +35,11 @@ class VisibilitySubspaces(Record):
     """What the subspaces of a scene tell.
 
     Attributes:
-        lit: Whether a lamp lights a pixel.
+        lit: Whether a point light lights a pixel.
         lights: Up to an invertible 3 x 3 matrix, orthonormal columns: where a factorization with
-            shadows masked may start. Zero for lamps that no subspace sees.
+            shadows masked may start. Zero for point lights that no subspace sees.
         subspace: The one that each pixel lies in, largest first; -1 for none.
-        visibility: Lamps by subspaces.
+        visibility: Point lights by subspaces.
     """
 
     lit: Bool[Tensor, "view pixel"]
@@ -67,12 +68,12 @@ def find_subspaces(
     smallest: float = 0.01,
     most: int = 30,
 ) -> VisibilitySubspaces:
-    r"""Find the subspaces of pixels lit by the same lamps, and what they tell of all pixels.
+    r"""Find the subspaces of pixels lit by the same point lights, and what they tell of all pixels.
 
-    Triples of neighbouring pixels, which mostly share their lamps, propose subspaces; the one
-    with the most pixels is refitted to them, taken out, and the search goes on. Bases
-    :math:`Q_k`, orthonormal and zero where lamps are out, are :math:`V_k L` up to a matrix each.
-    Lights that all agree with are the three least eigenvectors of
+    Triples of neighbouring pixels, which mostly share their point lights, propose subspaces; the
+    one with the most pixels is refitted to them, taken out, and the search goes on. Bases
+    :math:`Q_k`, orthonormal and zero where point lights are out, are :math:`V_k L` up to a matrix
+    each. Lights that all agree with are the three least eigenvectors of
 
     .. math:: \sum_k m_k (V_k - Q_k Q_k^\top)
 
@@ -83,8 +84,8 @@ def find_subspaces(
         images: Linear radiance without ambient light; channels are added.
         mask: Pixels that count, in raster order.
         generator: On the CPU.
-        noise: Standard deviation of a value, as a share of the brightest.
-        smallest: Share of the pixels that a subspace must hold.
+        noise: Standard deviation of a value, as a fraction of the brightest.
+        smallest: Fraction of the pixels that a subspace must hold.
         most: Subspaces.
 
     Returns:
@@ -92,8 +93,9 @@ def find_subspaces(
         too bright or near zero, counts as not lit, and so do all of a pixel of which fewer than
         four fit. Constant to autograd.
 
-    Fails where every pixel has its own set of lamps, where lamps have no subspace in common, and
-    where indirect light keeps shadows brighter than noise: a whole subspace is then taken for lit.
+    Fails where every pixel has its own set of point lights, where point lights have no subspace in
+    common, and where indirect light keeps shadows brighter than noise: a whole subspace is then
+    taken for lit.
 
     Raises:
         InputError: Fewer than four views, noise that is not above zero, or no subspace found.
@@ -134,7 +136,7 @@ def find_subspaces(
         if not bases:
             raise InputError(
                 f"no {fewest} of {values.shape[1]} pixels lie in one subspace; needed: a matt "
-                "surface and distant lamps. Raise `noise`, or lower `smallest`."
+                "surface and distant point lights. Raise `noise`, or lower `smallest`."
             )
         visibility = torch.stack(visible, dim=1)
         lights, covered = _common_lights(bases, visibility, values.new_tensor(counts))

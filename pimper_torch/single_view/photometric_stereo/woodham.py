@@ -1,7 +1,7 @@
 r"""Photometric stereo under known lights, the reference for every method that lacks them.
 
 :math:`x_{vc} = \rho_c\, l_v^\top n + a_c`: one normal for all colours, an albedo for each, and, if
-asked for, a part ``a`` that does not depend on the lamp.
+asked for, a part ``a`` that does not depend on the point light.
 
 Source: Woodham, Photometric method for determining surface orientation from multiple images,
 Optical Engineering 19(1), 1980.
@@ -25,7 +25,7 @@ class Calibrated(Record):
     Attributes:
         normals: Unit, in the frame of the lights; zero where a pixel is black.
         albedo: Of each colour, not negative.
-        ambient: What a pixel shows in the shadow of the lamp; zero if not asked for.
+        ambient: What a pixel shows in the shadow of the point light; zero if not asked for.
         weight: What each sample was given in the end; 0 where missing or in shadow.
     """
 
@@ -43,7 +43,7 @@ def calibrated_stereo(
     robust: bool = True,
     ambient: bool = False,
 ) -> Calibrated:
-    r"""Recover normals and albedos of pixels under known distant lamps.
+    r"""Recover normals and albedos of pixels under known distant point lights.
 
     Weights are decided on the mean of the colours; see
     :func:`.regress`. Normal and albedos are then
@@ -54,7 +54,7 @@ def calibrated_stereo(
     Args:
         radiance: Linear. Samples without weight do not matter.
         weight: Not negative; 0 where missing.
-        lights: Towards the lamp, as long as it is strong.
+        lights: Towards the point light, as long as it is strong.
         robust: Whether shadows and highlights lose weight.
         ambient: Whether pixels have a radiance of their own, one more unknown a colour.
 

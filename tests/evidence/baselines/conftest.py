@@ -13,7 +13,7 @@ from pimper_torch.evidence.scenes.shapes import Bumps, Sphere
 
 SPHERE = Sphere()
 BUMPS = Bumps(
-    relief=random_waves(
+    height_field=random_waves(
         torch.Generator().manual_seed(3), wavelength=0.5, root_mean_square=0.03, axes=2
     )
 )
@@ -40,7 +40,7 @@ def photographed():
         options = {"width": 120, "height": 90, "focal_px": 350.0, "distance": 3.0}
         cameras = arc_cameras(num_views, span_deg=40.0, target=target, **options)
         # At most 35 degrees off: no shadow on what is seen, so first order is exact.
-        lamps = wandering_lights(
+        point_lights = wandering_lights(
             num_views,
             generator,
             distance=5.0,
@@ -50,7 +50,7 @@ def photographed():
             ambient=ambient,
         )
         texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
-        truth = render_shape(shape, cameras, lamps.harmonics_world(), texture)
+        truth = render_shape(shape, cameras, point_lights.harmonics_world(), texture)
         scene = sparse_scene(truth, 200, generator)
         config = TriangulateConfig(num_points=30, fill=False)
         return truth, scene, Triangulate(config)(scene)

@@ -4,7 +4,11 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.evidence.baselines.anchoring import bas_relief_through, points_on, turn_normals
+from pimper_torch.evidence.baselines.anchoring import (
+    bas_relief_through,
+    points_on,
+    rotation_normals,
+)
 from pimper_torch.evidence.baselines.template import lay_template
 
 
@@ -13,7 +17,7 @@ def points():
     return torch.randn(60, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
-def test_points_undo_a_bas_relief_transformation_even_inverted(points):
+def test_points_undo_a_bas_height_field_transformation_even_inverted(points):
     for scale in (2.5, -0.4):
         wanted = torch.tensor([0.3, -0.2, scale, 4.0], dtype=torch.float64)
         x, y, z = points.unbind(dim=1)
@@ -29,7 +33,7 @@ def test_wrong_points_have_no_say(points):
     assert_close(found, torch.tensor([0.5, 0, 1, 0], dtype=torch.float64), atol=0.02, rtol=0)
 
 
-def test_a_flat_relief_keeps_its_scale(points):
+def test_a_flat_height_field_keeps_its_scale(points):
     x, y, _ = points.unbind(dim=1)
     flat = 0.2 * x
     level = torch.stack([x, y, 0.2 * x + 1], dim=1)
@@ -40,12 +44,12 @@ def test_a_flat_relief_keeps_its_scale(points):
     assert found[2] > 0
 
 
-def test_normals_follow_the_relief(points):
+def test_normals_follow_the_height_field(points):
     slopes = points[:, :2]
     normals = normalize(torch.cat([slopes, -torch.ones(60, 1).double()], dim=1), dim=1)
-    turned = turn_normals(torch.tensor([0.3, -0.1, 2.0, 7.0], dtype=torch.float64), normals)
-    assert_close(-turned[:, 0] / turned[:, 2], 2 * slopes[:, 0] + 0.3)
-    assert_close(-turned[:, 1] / turned[:, 2], 2 * slopes[:, 1] - 0.1)
+    rotated = rotation_normals(torch.tensor([0.3, -0.1, 2.0, 7.0], dtype=torch.float64), normals)
+    assert_close(-rotated[:, 0] / rotated[:, 2], 2 * slopes[:, 0] + 0.3)
+    assert_close(-rotated[:, 1] / rotated[:, 2], 2 * slopes[:, 1] - 0.1)
 
 
 def test_points_beside_the_mesh_or_far_from_it_are_left_out(photographed, sphere):

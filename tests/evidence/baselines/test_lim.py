@@ -80,7 +80,7 @@ def test_factors_of_a_masked_matrix_give_back_what_is_missing():
     assert_close(factors.vectors[:, often], vectors[:, often], atol=1e-2, rtol=1e-2)
 
 
-def test_the_matrix_of_a_bas_relief_transformation_changes_slopes_as_depths_change():
+def test_the_matrix_of_a_bas_height_field_transformation_changes_slopes_as_depths_change():
     b = torch.tensor([0.2, -0.1, -0.9], dtype=torch.float64)
     moved = bas_relief_matrix(torch.tensor([0.3, -0.4, 2.0, 9.0], dtype=torch.float64)) @ b
     assert_close(-moved[0] / moved[2], 2 * (-b[0] / b[2]) + 0.3)

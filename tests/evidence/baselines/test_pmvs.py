@@ -110,8 +110,8 @@ def test_pixels_are_right_on_the_level_of_the_pyramid_that_is_worked_on(reconstr
     matrix = projections(cameras, level)[0]
     matrix = torch.cat([matrix[:2] / 2**level, matrix[2:]])  # as PMVS2 halves them
     u = float((point @ matrix.T)[0, 0] / (point @ matrix.T)[0, 2])
-    below, share = int(u), u - int(u)
-    looks_at = (1 - share) * ramp[below] + share * ramp[below + 1]
+    below, fraction = int(u), u - int(u)
+    looks_at = (1 - fraction) * ramp[below] + fraction * ramp[below + 1]
     pixels, _ = project(
         point[:, :3], cameras.cam_from_world[0].double(), cameras.intrinsics[0].double()
     )

@@ -48,7 +48,7 @@ def test_rows_of_the_matrix_are_the_radiance_of_one_point_in_all_views(photograp
     vertices = template.points(template.depth)
     for _ in range(20):
         world = template.to_world(vertices)
-        gap = world[..., 2] - bumps.relief(world[..., :2].double()).to(world)
+        gap = world[..., 2] - bumps.height_field(world[..., :2].double()).to(world)
         vertices[..., 2] += gap
     template = template.replace(depth=vertices[..., 2])
     world = template.to_world(vertices)[template.inside]
@@ -61,7 +61,7 @@ def test_rows_of_the_matrix_are_the_radiance_of_one_point_in_all_views(photograp
     assert albedo.shape[1] == 3
     expected = albedo.mean(dim=1) * (lights @ shading.T)
     off = (matrix.radiance - expected).abs()[matrix.seen]
-    assert matrix.missing_share < 0.4
+    assert matrix.missing_fraction < 0.4
     assert off.median() < 0.01 * matrix.radiance[matrix.seen].median()  # bilinear look-up
 
 
@@ -99,8 +99,8 @@ def test_a_mesh_seen_from_behind_is_refused(photographed, sphere):
 def test_the_template_faces_the_reference_camera_as_its_image_does(photographed, bumps):
     _, scene, coarse = photographed(bumps)
     template = lay_template(coarse.mesh, scene.cameras, coarse.reference, 1.0)
-    turn = template.template_from_world[:3, :3]
-    assert_close(turn @ turn.mT, torch.eye(3), atol=1e-5, rtol=0)
-    assert torch.linalg.det(turn) > 0
+    rotation = template.template_from_world[:3, :3]
+    assert_close(rotation @ rotation.mT, torch.eye(3), atol=1e-5, rtol=0)
+    assert torch.linalg.det(rotation) > 0
     axes = scene.cameras.cam_from_world[coarse.reference, :3, :3]
-    assert ((turn * axes).sum(dim=1) > 0.9).all()
+    assert ((rotation * axes).sum(dim=1) > 0.9).all()

@@ -42,4 +42,4 @@ def test_a_scenes_model_is_found_once_and_its_seconds_are_those_of_the_first_run
     assert (first.scene.points_world == second.scene.points_world).all()
     other = BenchConfig(scenes=(str(rendered),), samples=500, cameras="features")
     prepare(rendered, other, tmp_path / "cache")
-    assert [run.track_rounds for run in runs] == [2, 0]
+    assert [run.track_iterations for run in runs] == [2, 0]

@@ -85,7 +85,7 @@ def of_radius(radius):
             cameras=scene.cameras,
             reference=scene.views.names[coarse.reference],
         )
-        return Outcome(estimate=estimate, seconds=6.0, samples=1000, missing_share=0.25)
+        return Outcome(estimate=estimate, seconds=6.0, samples=1000, missing_fraction=0.25)
 
     return method
 
@@ -223,8 +223,8 @@ def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball)
     error = error_along_rays(meet_truth(moved, identity, ball.maps, 0), ball.maps)
     foreground = ball.maps.truth.foreground[0]
     assert torch.equal(error.isnan(), ~foreground)
-    middle = error[22, 30]
-    assert_close(middle, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
+    centre = error[22, 30]
+    assert_close(centre, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
     half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
     missed = error_along_rays(meet_truth(half, identity, ball.maps, 0), ball.maps).isinf()
     assert 0.3 < missed[foreground].float().mean() < 0.7

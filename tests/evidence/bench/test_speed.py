@@ -52,13 +52,13 @@ def test_rounds_of_a_stage_add_up_and_peaks_do_not(speed):
 
 
 def test_a_round_without_a_floor_is_as_far_from_it_as_the_others(speed):
-    rounds = [
+    iterations = [
         speed.Cost(stage="fuse", seconds=seconds, cpu_seconds=1, page_faults=0, floor_seconds=floor)
         for seconds, floor in ((6.0, math.nan), (10.0, 0.1), (30.0, 0.7))
     ]
-    found = speed.added("fuse", rounds)
+    found = speed.added("fuse", iterations)
     assert_close(found.seconds / found.floor_seconds, (10 + 30) / (0.1 + 0.7))
-    assert math.isnan(speed.added("fuse", rounds[:1]).floor_seconds)
+    assert math.isnan(speed.added("fuse", iterations[:1]).floor_seconds)
 
 
 def test_a_stage_has_the_peak_of_its_own_time_though_others_begin_in_it(speed):
@@ -115,7 +115,7 @@ def test_a_run_is_measured_kept_and_compared(speed, reconstruction, monkeypatch,
     earlier = tmp_path / "earlier.json"
     fused = speed.Cost(stage="fuse", seconds=1, cpu_seconds=1, page_faults=1, peak_mb=1.0)
     earlier.write_text(json.dumps({"costs": [speed.asdict(fused)]}), encoding="utf-8")
-    options = ["--preset", "fast", "--rounds", "--against", str(earlier)]
+    options = ["--preset", "fast", "--scales", "--against", str(earlier)]
     speed.main(["demo", *options, "-o", str(figures)])
     kept = json.loads(figures.read_text(encoding="utf-8"))
     assert [cost["stage"] for cost in kept["costs"]] == [

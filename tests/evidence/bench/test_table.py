@@ -240,9 +240,9 @@ def test_a_table_survives_json(tmp_path):
 def test_what_is_no_number_becomes_null_in_json(tmp_path):
     odd = FULL.replace(minutes=math.nan, chamfer=math.inf)
     write_json(table(odd), tmp_path / "bench.json")
-    account = json.loads((tmp_path / "bench.json").read_text())
-    assert account["rows"][0]["minutes"] is None
-    assert account["rows"][0]["relative_error"] == 1.234567  # all digits
+    report = json.loads((tmp_path / "bench.json").read_text())
+    assert report["rows"][0]["minutes"] is None
+    assert report["rows"][0]["relative_error"] == 1.234567  # all digits
     (row,) = read_json(tmp_path / "bench.json").rows
     assert row == FULL.replace(minutes=None, chamfer=None)
 
@@ -250,22 +250,22 @@ def test_what_is_no_number_becomes_null_in_json(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda account: account.update(format="else"), "is no table"),
-        (lambda account: account.update(version=99), "version 99"),
-        (lambda account: account["rows"][0].update(minutes="long"), "minutes"),
-        (lambda account: account["rows"][0].update(minute=1.0), "minute"),
-        (lambda account: account["rows"][0].pop("scene"), "scene"),
-        (lambda account: account.pop("machine"), "machine"),
-        (lambda account: account.update(rows=3), "whole table"),
-        (lambda account: account.update(rows=[3]), "row 0"),
+        (lambda report: report.update(format="else"), "is no table"),
+        (lambda report: report.update(version=99), "version 99"),
+        (lambda report: report["rows"][0].update(minutes="long"), "minutes"),
+        (lambda report: report["rows"][0].update(minute=1.0), "minute"),
+        (lambda report: report["rows"][0].pop("scene"), "scene"),
+        (lambda report: report.pop("machine"), "machine"),
+        (lambda report: report.update(rows=3), "whole table"),
+        (lambda report: report.update(rows=[3]), "row 0"),
     ],
 )
 def test_a_file_that_is_no_such_table_is_refused(tmp_path, change, said):
     path = tmp_path / "bench.json"
     write_json(table(FULL), path)
-    account = json.loads(path.read_text())
-    change(account)
-    path.write_text(json.dumps(account))
+    report = json.loads(path.read_text())
+    change(report)
+    path.write_text(json.dumps(report))
     with pytest.raises(InputError, match=said):
         read_json(path)
 

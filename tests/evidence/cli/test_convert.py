@@ -29,13 +29,13 @@ def data(tmp_path):
     for number in range(3):
         noise = np.random.default_rng(number).integers(0, 256, (9, 12, 3), dtype=np.uint8)
         Image.fromarray(noise).save(folder / "images" / f"{number}.png")
-        turn = np.array(POSE, dtype=float)
+        rotation = np.array(POSE, dtype=float)
         angle = 0.3 * number
-        turn[0, [0, 2]], turn[2, [0, 2]] = (
+        rotation[0, [0, 2]], rotation[2, [0, 2]] = (
             (np.cos(angle), np.sin(angle)),
             (-np.sin(angle), np.cos(angle)),
         )
-        frames.append({"file_path": f"images/{number}.png", "transform_matrix": turn.tolist()})
+        frames.append({"file_path": f"images/{number}.png", "transform_matrix": rotation.tolist()})
     lens = {"fl_x": 20, "fl_y": 21, "cx": 6.5, "cy": 4.25}
     (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
     return folder
@@ -155,9 +155,9 @@ def test_one_light_a_place_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
     photographs.mkdir(parents=True)
     calibration.mkdir(parents=True)
     for place in (1, 2, 3):
-        for lamp in (0, 3):
-            level = Image.new("RGB", (16, 12), (60 * place, 20, 90 + lamp))
-            level.save(photographs / f"rect_{place:03d}_{lamp}_r5000.png")
+        for point_light in (0, 3):
+            level = Image.new("RGB", (16, 12), (60 * place, 20, 90 + point_light))
+            level.save(photographs / f"rect_{place:03d}_{point_light}_r5000.png")
         matrix = np.array([[2000.0, 0, 800, place], [0, 2000, 600, 2], [0, 0, 1, 700]])
         np.savetxt(calibration / f"pos_{place:03d}.txt", matrix)
     arguments = ["convert", str(tmp_path), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]

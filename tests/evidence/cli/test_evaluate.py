@@ -49,7 +49,7 @@ def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
 def test_icp_is_told_with_its_share_and_takes_out_the_size(ball, tmp_path, capsys):
     larger = sphere(tmp_path / "larger.ply", 1.1)
     out = tmp_path / "report.json"
-    options = ["--alignment", "icp", "--trimmed-share", 0.1]
+    options = ["--alignment", "icp", "--trimmed-fraction", 0.1]
     assert run(larger, ball, "--samples", 3000, *options, "-o", out) == 0
     told = capsys.readouterr().out
     assert "similarity ICP, point to plane, 10 % of the estimate trimmed, from identity" in told
@@ -67,7 +67,7 @@ def test_the_true_mesh_of_a_rendered_scene_has_no_error(rendering, capsys):
     told = capsys.readouterr().out
     assert "f_score at 0.1 %" in told
     assert "f_score at 2 %" in told
-    assert "along the rays of view_001.png" in told  # the middle one
+    assert "along the rays of view_001.png" in told  # the centre one
     assert "100.0 %" in told
     assert "seen from 3 places" in told
 
@@ -151,7 +151,7 @@ def test_views_of_a_set_are_paired_by_place_whatever_their_light():
     ("options", "words"),
     [
         (["--alignment", "cameras"], "needed: two at least"),
-        (["--trimmed-share", "1.5"], "trimmed_share is 1.5"),
+        (["--trimmed-fraction", "1.5"], "trimmed_fraction is 1.5"),
         (["-o", "."], "is a folder"),
         (["-o", "nowhere/report.json"], "its folder is not there"),
     ],

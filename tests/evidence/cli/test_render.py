@@ -30,31 +30,31 @@ def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
     assert settings["path"] == "turntable"
     assert settings["bits"] == 16
     assert settings["seed"] == 4
-    assert settings["lamp_distance"] == 2.5
+    assert settings["point_light_distance"] == 2.5
     told = capsys.readouterr()
     assert f"{tmp_path}/out/photos" in told.out
     assert "--photographs.response linear" in told.out
     assert "photographs 2" in told.err
 
 
-def test_a_room_and_a_lamp_stand_still_on_demand_and_only_where_the_object_turns(
+def test_a_room_and_a_point_light_stand_still_on_demand_and_only_where_the_object_turns(
     ball, tmp_path, capsys
 ):
-    options = ("--fixed-lamp", "--fixed-room", "--fixed-table")
+    options = ("--fixed-point-light", "--fixed-room", "--fixed-table")
     assert render(ball, tmp_path / "out", *options) == 2
-    assert "fixed_lamp is True; needed: path turntable" in capsys.readouterr().err
+    assert "fixed_point_light is True; needed: path turntable" in capsys.readouterr().err
     assert render(ball, tmp_path / "out", "--path", "turntable", *options) == 0
     settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
-    assert all(settings[name] for name in ("fixed_lamp", "fixed_room", "fixed_table"))
+    assert all(settings[name] for name in ("fixed_point_light", "fixed_room", "fixed_table"))
 
 
 def test_an_object_of_one_albedo_stands_on_a_patterned_table_on_demand(ball, tmp_path):
-    options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--turn-deg", "30")
+    options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--rotation-deg", "30")
     assert render(ball, tmp_path / "out", *options) == 0
     settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
     assert settings["albedo"] == [0.6, 0.5, 0.4]
     assert settings["table"] == "patterned"
-    assert settings["turn_deg"] == 30
+    assert settings["rotation_deg"] == 30
     capture = read_rendered(tmp_path / "out")
     seen = capture.truth.albedo[capture.truth.foreground]
     assert_close(seen, torch.tensor([0.6, 0.5, 0.4]).expand_as(seen), atol=3e-4, rtol=0)  # float16
@@ -78,8 +78,8 @@ def test_a_former_rendering_is_replaced_only_on_demand(ball, tmp_path, capsys):
     assert render(ball, tmp_path / "out") == 2
     assert "--overwrite" in capsys.readouterr().err
     assert render(ball, tmp_path / "out", "--overwrite", "--seed", "9") == 0
-    account = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())
-    assert account["settings"]["seed"] == 9
+    report = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())
+    assert report["settings"]["seed"] == 9
 
 
 def test_a_scene_that_does_not_exist_is_told_in_a_sentence(tmp_path, capsys):

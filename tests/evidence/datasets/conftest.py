@@ -96,10 +96,10 @@ def sees():
 @pytest.fixture
 def capture(hand_camera, generator):
     """Two photographs of unlike sizes with masks, taken by unlike pinholes, levels of 8 bits."""
-    turn = torch.linalg.matrix_exp(
+    rotation = torch.linalg.matrix_exp(
         torch.tensor([[0.0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]], dtype=torch.float64)
     )
-    other = rigid(turn @ hand_camera[:3, :3], torch.tensor([0.3, -0.4, 9.0]).double())
+    other = rigid(rotation @ hand_camera[:3, :3], torch.tensor([0.3, -0.4, 9.0]).double())
     K = [[[20.0, 0, 7], [0, 30, 5], [0, 0, 1]], [[21.0, 0, 6.25], [0, 19, 4.5], [0, 0, 1]]]
     sizes = torch.tensor([[16, 12], [13, 9]])
     images = linear_from_srgb(torch.randint(256, (2, 3, 12, 16), generator=generator) / 255)

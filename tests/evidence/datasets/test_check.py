@@ -126,7 +126,7 @@ POSES = {
     "flipped_x": lambda pose: flipped(-1, 1, 1) @ pose,
     "flipped_y": lambda pose: flipped(1, -1, 1) @ pose,
     "flipped_z": lambda pose: flipped(1, 1, -1) @ pose,
-    "photographs_turned": lambda pose: flipped(-1, -1, 1) @ pose,
+    "photographs_rotated": lambda pose: flipped(-1, -1, 1) @ pose,
     "world_axes_flipped": lambda pose: pose @ flipped(1, -1, -1),
 }
 
@@ -181,7 +181,7 @@ def test_a_right_capture_has_no_mistake(whole, evidence):
 QUICK = {
     "mesh and masks": {"world_from_cam", "world_from_cam_opengl", "flipped_x", "flipped_z"},
     "masks": {"transposed_rotation", "flipped_y"},
-    "depth": {"opengl_axes", "center_for_translation", "photographs_turned"},
+    "depth": {"opengl_axes", "center_for_translation", "photographs_rotated"},
     "points and masks": {"world_axes_flipped"},
     "everything": set(),
 }
@@ -194,7 +194,7 @@ TOLD = [
     for name in POSES
     for evidence in EVIDENCE
     if not (name == "world_axes_flipped" and evidence in ("masks", "depth"))
-    and not (name == "photographs_turned" and evidence == "masks")
+    and not (name == "photographs_rotated" and evidence == "masks")
 ]
 
 
@@ -214,7 +214,7 @@ def test_a_pose_mistake_is_named_whatever_tells_it(whole, name, evidence):
     [
         ("world_axes_flipped", "masks"),
         ("world_axes_flipped", "depth"),
-        ("photographs_turned", "masks"),
+        ("photographs_rotated", "masks"),
     ],
 )
 def test_what_nothing_can_tell_is_not_guessed(whole, name, evidence):
@@ -268,8 +268,8 @@ def test_a_scaled_rotation_is_named(whole):
 
 def camera_frame(capture: Capture, signs: tuple[int, int, int]) -> torch.Tensor:
     rotation = capture.cameras.cam_from_world[:, :3, :3].float()
-    turned = torch.einsum("vij,vhwj->vhwi", rotation, capture.truth.normals_world)
-    return turned * torch.tensor(signs).float()
+    rotated = torch.einsum("vij,vhwj->vhwi", rotation, capture.truth.normals_world)
+    return rotated * torch.tensor(signs).float()
 
 
 def world_frame(capture: Capture, normals: torch.Tensor) -> torch.Tensor:
@@ -324,9 +324,9 @@ def test_lights_that_shine_from_elsewhere_are_named(whole):
     assert names(whole.replace(truth=whole.truth.replace(lights_world=lights))) == [
         "lights_negated"
     ]
-    turned = (rotation @ whole.truth.lights_world[:, 1:, None])[..., 0]
-    turned = turned * torch.tensor([1.0, -1, -1])
-    lights = torch.cat([lights[:, :1], turned], dim=1)
+    rotated = (rotation @ whole.truth.lights_world[:, 1:, None])[..., 0]
+    rotated = rotated * torch.tensor([1.0, -1, -1])
+    lights = torch.cat([lights[:, :1], rotated], dim=1)
     assert names(whole.replace(truth=whole.truth.replace(lights_world=lights))) == [
         "lights_in_camera_frame_y_up"
     ]

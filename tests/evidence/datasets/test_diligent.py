@@ -23,9 +23,9 @@ def viewpoint(paint_deep):
     """Write one viewpoint as DiLiGenT has it; its normals look half up."""
 
     def write(folder, *, named: bool = True) -> None:
-        names = [f"{lamp:03d}.png" for lamp in (1, 2, 3)]
-        for lamp, name in enumerate(names, start=1):
-            paint_deep(folder / name, (6000 * lamp, 3000 * lamp, 1000), WIDTH, HEIGHT)
+        names = [f"{point_light:03d}.png" for point_light in (1, 2, 3)]
+        for point_light, name in enumerate(names, start=1):
+            paint_deep(folder / name, (6000 * point_light, 3000 * point_light, 1000), WIDTH, HEIGHT)
         if named:
             (folder / "filenames.txt").write_text("\n".join(names) + "\n")
         np.savetxt(folder / "light_directions.txt", DIRECTIONS)
@@ -177,7 +177,7 @@ def test_a_normal_map_comes_with_its_depth_and_pinhole(tmp_path, paint_deep):
     depth[2:5] = 1500
     np.savez(tmp_path / "depth_gt.npz", depth_gt=depth)
     found = read_normal_map(tmp_path)
-    assert found.intrinsics.tolist() == [[900, 0, 10], [0, 890, 8], [0, 0, 1]]  # the very middle
+    assert found.intrinsics.tolist() == [[900, 0, 10], [0, 890, 8], [0, 0, 1]]  # the very centre
     assert_close(found.normals[3, 4], torch.tensor([0.6, 0, -0.8]), atol=1e-4, rtol=0)
     assert found.normals[8].abs().sum() == 0
     assert found.depth[3, 4] == 1500

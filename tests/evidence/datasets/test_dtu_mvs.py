@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.dtu_mvs import ALL_LAMPS, read_dtu_mvs, read_dtu_protocol
+from pimper_torch.evidence.datasets.dtu_mvs import ALL_LIGHTS, read_dtu_mvs, read_dtu_protocol
 
 POINTS = """ply
 format ascii 1.0
@@ -24,8 +24,8 @@ def folder(tmp_path, rig, paint):
     """Scan 9: three places, lights 0, 3 and max, and the set's own files."""
     photographs = tmp_path / "Rectified" / "scan9"
     for place in (1, 2, 3):
-        for lamp in ("0_r5000", "3_r5000", "max"):
-            paint(photographs / f"rect_{place:03d}_{lamp}.png", 30 * place)
+        for point_light in ("0_r5000", "3_r5000", "max"):
+            paint(photographs / f"rect_{place:03d}_{point_light}.png", 30 * place)
     (tmp_path / "Calibration" / "cal18").mkdir(parents=True)
     K = rig.intrinsics.clone()
     K[:, :2, 2] -= 0.5  # the set counts from the centre of the first pixel
@@ -85,7 +85,7 @@ def test_mvsnets_cameras_serve_as_well(folder, rig):
 
 
 def test_the_brightest_of_all_lights_is_read_when_asked_for(folder):
-    capture = read_dtu_mvs(folder, 9, lights=[ALL_LAMPS])
+    capture = read_dtu_mvs(folder, 9, lights=[ALL_LIGHTS])
     assert capture.views.names == tuple(f"rect_{place:03d}_max.png" for place in (1, 2, 3))
 
 

@@ -13,8 +13,11 @@ from pimper_torch.io import radiance
 @pytest.fixture
 def folder(tmp_path, save_calibration, paint):
     for place in (1, 2, 3):
-        for lamp in (1, 2, 19):
-            paint(tmp_path / "SET004" / f"Img{place:03d}_{lamp:02d}.bmp", 40 * place + lamp)
+        for point_light in (1, 2, 19):
+            paint(
+                tmp_path / "SET004" / f"Img{place:03d}_{point_light:02d}.bmp",
+                40 * place + point_light,
+            )
     save_calibration(tmp_path / "Calib_Results_11.mat")
     (tmp_path / "CleanRecon_2009_11_16").mkdir()
     scipy.io.savemat(
@@ -27,7 +30,7 @@ def folder(tmp_path, save_calibration, paint):
     return tmp_path
 
 
-def test_all_photographs_come_with_place_lamp_camera_and_scan(folder, rig):
+def test_all_photographs_come_with_place_point_light_camera_and_scan(folder, rig):
     capture = read_dtu_points(folder, 4)
     assert capture.position.tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     assert capture.light.tolist() == [1, 2, 19] * 3

@@ -200,11 +200,13 @@ def test_the_true_surface_comes_along(shot, tmp_path):
 
 
 def test_a_rounded_rotation_is_made_exact(tmp_path):
-    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -1, 2], [1, 0, 3], [-2, -3, 0]]).double())
-    rounded = (turn * 1e4).round() / 1e4
+    rotation = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -1, 2], [1, 0, 3], [-2, -3, 0]]).double()
+    )
+    rounded = (rotation * 1e4).round() / 1e4
     exact = rigid_or_refuse(rounded, torch.ones(3).double(), "R", tmp_path, "a toy")[:3, :3]
     assert_close(exact @ exact.T, torch.eye(3).double(), rtol=0, atol=1e-14)
-    assert_close(exact, turn, rtol=0, atol=1e-4)  # what the rounding took
+    assert_close(exact, rotation, rtol=0, atol=1e-4)  # what the rounding took
 
 
 @pytest.mark.parametrize(

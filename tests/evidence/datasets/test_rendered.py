@@ -46,7 +46,7 @@ def test_what_is_read_is_what_was_rendered(rendering, ball):
     assert_close(cameras.cam_from_world, scene.cameras.cam_from_world, atol=1e-12, rtol=0)
     assert_close(cameras.intrinsics, scene.cameras.intrinsics)
     assert_close(cameras.sizes_px, scene.cameras.sizes_px)
-    assert_close(truth.lamps_world, scene.lights.positions_world)
+    assert_close(truth.point_lights_world, scene.lights.positions_world)
     centers = scene.cameras.centers_world
     assert_close(truth.lights_world, scene.lights.harmonics_world(centers))
     assert_close(truth.mesh.vertices_world, scene.object_mesh.vertices_world, atol=1e-6, rtol=0)
@@ -165,9 +165,9 @@ def test_a_pickle_among_the_maps_is_not_opened(copy):
 
 def test_lights_of_fewer_views_are_refused(copy):
     path = copy / "truth" / "lights.json"
-    account = json.loads(path.read_text())
-    account["positions_world"] = account["positions_world"][:2]
-    path.write_text(json.dumps(account))
+    report = json.loads(path.read_text())
+    report["positions_world"] = report["positions_world"][:2]
+    path.write_text(json.dumps(report))
     with pytest.raises(InputError, match="each of 3 views"):
         read_rendered(copy)
 

@@ -25,11 +25,11 @@ def test_every_position_has_one_light_all_are_used_evenly_and_neighbours_differ(
     position, light = grid(num_positions, num_lights)
     chosen = one_light_per_position(position, light, torch.Generator().manual_seed(seed))
     assert position[chosen].tolist() == list(range(1, num_positions + 1))
-    lamps = light[chosen].tolist()
+    point_lights = light[chosen].tolist()
     uses = Counter(dict.fromkeys(range(num_lights), 0))
-    uses.update(lamps)
+    uses.update(point_lights)
     assert max(uses.values()) - min(uses.values()) <= 1
-    assert all(one != other for one, other in itertools.pairwise(lamps))
+    assert all(one != other for one, other in itertools.pairwise(point_lights))
 
 
 def test_the_seed_decides_and_unlike_seeds_choose_unlike_lights():
@@ -40,7 +40,7 @@ def test_the_seed_decides_and_unlike_seeds_choose_unlike_lights():
     )
     assert first.equal(again)
     assert not first.equal(other)
-    # Not the same cycle begun elsewhere: no order of the lamps is repeated.
+    # Not the same cycle begun elsewhere: no order of the point lights is repeated.
     assert len({tuple(light[first][start : start + 7].tolist()) for start in range(0, 35, 7)}) == 5
 
 

@@ -43,7 +43,7 @@ def test_a_frame_may_have_intrinsics_of_its_own(save, sees):
 
 
 def test_blender_gives_an_angle_and_no_suffix(save, sees, paint, tmp_path):
-    # 16 pixels wide, so the focal length is 8 / tan(angle / 2) = 20; the middle is (8, 6).
+    # 16 pixels wide, so the focal length is 8 / tan(angle / 2) = 20; the centre is (8, 6).
     angle = 2 * math.atan(8 / 20)
     files = ("./images/a", "./train/a")
     paint(tmp_path / "train" / "a.png", 100)

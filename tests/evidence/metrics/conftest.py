@@ -33,7 +33,7 @@ class Makers:
         return Mesh(vertices_world=radius * vertices, faces=faces)
 
     def half_sphere(self, level=5):
-        """Keep the faces of a sphere whose middle is above z = 0."""
+        """Keep the faces of a sphere whose centre is above z = 0."""
         mesh = self.sphere(level=level)
         above = mesh.vertices_world[mesh.faces].mean(dim=1)[:, 2] > 0
         return mesh.replace(faces=mesh.faces[above])
@@ -84,7 +84,9 @@ class Makers:
     def moved(self, mesh, target_from_source):
         return mesh.replace(vertices_world=transform(target_from_source, mesh.vertices_world))
 
-    def carried(self, cameras: Cameras, scale, rotation, translation) -> Cameras:
+    def transferred(self, cameras: Cameras, scale, rotation, translation) -> Cameras:
         centers = transform(rigid(scale * rotation, translation), cameras.centers_world)
-        turned = cameras.cam_from_world[:, :3, :3] @ rotation.mT
-        return cameras.replace(cam_from_world=rigid(turned, -(turned @ centers[..., None])[..., 0]))
+        rotated = cameras.cam_from_world[:, :3, :3] @ rotation.mT
+        return cameras.replace(
+            cam_from_world=rigid(rotated, -(rotated @ centers[..., None])[..., 0])
+        )

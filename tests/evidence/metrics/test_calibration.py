@@ -78,7 +78,7 @@ def test_the_evaluation_counts_expected_errors_in_the_unit_of_the_truth(make, ge
     estimate = Estimate(
         mesh=mesh.replace(expected_error=0.5 * deviation),
         names=tuple(f"view_{view}.png" for view in range(5)),
-        cameras=make.carried(cameras, 0.5, rotation, shift),
+        cameras=make.transferred(cameras, 0.5, rotation, shift),
     )
     capture = make.capture(Truth(mesh=sphere), cameras=cameras)
     found = evaluate(estimate, capture, EvaluateConfig(samples=20_000))

@@ -81,8 +81,8 @@ def test_three_faces_at_an_edge_or_two_that_disagree_are_told():
     ball = [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]
     assert closedness(mesh_of(corners, ball)).closed
     ball[3] = [1, 2, 3]
-    turned = closedness(mesh_of(corners, ball))
-    assert (turned.twisted, turned.closed, len(turned.loops)) == (3, False, 0)
+    rotated = closedness(mesh_of(corners, ball))
+    assert (rotated.twisted, rotated.closed, len(rotated.loops)) == (3, False, 0)
 
 
 def test_vertices_without_faces_do_not_count(sphere):

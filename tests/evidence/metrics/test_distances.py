@@ -32,7 +32,7 @@ def test_a_raised_square_is_off_by_its_height_both_ways(make):
     assert (above.precision, above.recall, above.f_score) == (1, 1, 1)
     assert above.threshold == pytest.approx(0.101)
     assert found.seen is None
-    assert found.seen_share is None
+    assert found.seen_fraction is None
 
 
 def test_a_larger_square_is_inaccurate_and_complete(make):
@@ -67,7 +67,7 @@ def test_half_a_sphere_is_accurate_and_half_complete(make):
     assert found.whole.completeness.mean == pytest.approx(float(missing) / 2, rel=0.03)
     at = found.whole.thresholds[-1]
     assert at.precision == 1
-    rim = math.sin(2 * math.asin(at.threshold / 2)) / 2  # share of the sphere below it
+    rim = math.sin(2 * math.asin(at.threshold / 2)) / 2  # fraction of the sphere below it
     assert at.recall == pytest.approx(0.5 + rim, abs=0.01)
 
 
@@ -89,13 +89,13 @@ def test_what_lies_on_the_table_is_left_out_of_accuracy_and_told(make):
         faces=torch.cat([estimate.faces, both.faces + 4]),
     )
     found = compared(joined, make.capture(truth))
-    assert found.surroundings_share == pytest.approx(0.5, abs=5e-3)
+    assert found.surroundings_fraction == pytest.approx(0.5, abs=5e-3)
     assert found.accuracy.mean == pytest.approx(0.1)
     assert found.accuracy.samples == pytest.approx(4_000, abs=20)
     only = compared(estimate, make.capture(truth))
     assert only.accuracy is None
     assert only.whole is None
-    assert only.surroundings_share == 1
+    assert only.surroundings_fraction == 1
 
 
 def test_completeness_of_the_seen_part_ignores_the_back(make):
@@ -108,7 +108,7 @@ def test_completeness_of_the_seen_part_ignores_the_back(make):
     assert found.whole.completeness.mean > 0.1
     assert found.seen.completeness.mean < 1e-3
     # From distance 5 a sphere of radius 1 shows the cap above 1 / 5: (1 - 1 / 5) / 2.
-    assert found.seen_share == pytest.approx(0.4, abs=0.01)
+    assert found.seen_fraction == pytest.approx(0.4, abs=0.01)
 
 
 def test_views_from_one_place_count_once(make):
@@ -116,23 +116,23 @@ def test_views_from_one_place_count_once(make):
     sphere = make.sphere(level=3)
     apart = make.capture_of(sphere, cameras=cameras)
     same = make.capture_of(sphere, cameras=cameras, position=torch.tensor([0, 0, 1, 1]))
-    assert compared(sphere, apart, seen_from=3).seen_share > 0.3
-    assert compared(sphere, same, seen_from=3).seen_share == 0
-    assert compared(sphere, same, seen_from=2).seen_share > 0.3
+    assert compared(sphere, apart, seen_from=3).seen_fraction > 0.3
+    assert compared(sphere, same, seen_from=3).seen_fraction == 0
+    assert compared(sphere, same, seen_from=2).seen_fraction > 0.3
 
 
 def test_something_in_front_hides_the_surface(make):
     cameras = make.cameras(count=3, span_deg=1.0)
     sphere = make.sphere(level=3)
     shade = make.square(side=8.0)
-    middle = 0.5 * cameras.centers_world.mean(dim=0)
+    centre = 0.5 * cameras.centers_world.mean(dim=0)
     shade = shade.replace(
         vertices_world=shade.vertices_world
         - shade.vertices_world.new_tensor([4.0, 4.0, 0.0])
-        + middle
+        + centre
     )
     hidden = make.capture(Truth(mesh=sphere, surroundings=shade), cameras=cameras)
-    assert compared(sphere, hidden).seen_share == 0
+    assert compared(sphere, hidden).seen_fraction == 0
 
 
 def test_depth_maps_tell_what_of_a_cloud_is_seen(make):
@@ -144,7 +144,7 @@ def test_depth_maps_tell_what_of_a_cloud_is_seen(make):
     truth = Truth(points_world=sphere.vertices_world, depth=depth)
     found = compared(sphere, make.capture(truth, cameras=cameras))
     # Pixels at the rim are too steep for the depth at their centre to hold within a thousandth.
-    assert 0.01 < found.seen_share < 0.41
+    assert 0.01 < found.seen_fraction < 0.41
     assert found.whole.completeness.mean < 1e-12
 
 

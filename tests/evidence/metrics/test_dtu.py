@@ -14,7 +14,7 @@ def cloud(points):
 
 
 def protocol_of(mask=None, plane=(0.0, 0.0, 1.0, 0.5), side=40):
-    """A mask of ones, voxels of 1 mm whose middles are at whole millimetres."""
+    """A mask of ones, voxels of 1 mm whose centres are at whole millimetres."""
     return DtuProtocol(
         obs_mask=torch.ones(side + 1, side + 1, side + 1) > 0 if mask is None else mask,
         bounding_box=torch.tensor([[0.0, 0, 0], [side, side, side]], dtype=torch.float64),
@@ -64,7 +64,7 @@ def test_outliers_of_twenty_millimetres_are_left_out_and_counted(generator):
     stray = torch.tensor([[10.0, 10.0, 29.9], [12.0, 10.0, 30.0]], dtype=torch.float64)
     found = dtu_figures(cloud(torch.cat([grid(), stray])), grid(), protocol_of(), generator)
     assert found.mean_accuracy == pytest.approx(19.9 / 401)
-    assert found.capped_share == pytest.approx(1 / 402)
+    assert found.capped_fraction == pytest.approx(1 / 402)
 
 
 def test_dense_points_are_thinned_before_they_are_counted(generator):
@@ -75,7 +75,7 @@ def test_dense_points_are_thinned_before_they_are_counted(generator):
     assert found.mean_accuracy == pytest.approx(5 / 401, rel=0.03)
 
 
-def test_a_point_is_in_the_voxel_whose_middle_is_nearest():
+def test_a_point_is_in_the_voxel_whose_centre_is_nearest():
     mask = torch.zeros(4, 4, 4) > 0
     mask[1, 2, 3] = True
     protocol = protocol_of(mask, side=3)
@@ -90,7 +90,7 @@ def test_points_beyond_the_cells_of_the_box_are_not_judged(generator):
     scan = torch.cat([grid(), torch.tensor([[61.0, 10, 10]]).double()])
     found = dtu_figures(cloud(grid()), scan, protocol_of(), generator)
     assert found.judged_true == 401
-    assert found.capped_share_true == pytest.approx(1 / 401)
+    assert found.capped_fraction_true == pytest.approx(1 / 401)
 
 
 def test_faces_are_sampled_as_the_published_code_samples_them():
@@ -98,8 +98,10 @@ def test_faces_are_sampled_as_the_published_code_samples_them():
     mesh = Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2]]))
     found = supersample(mesh, 0.24)  # 4 steps along each edge
     # Half steps of 1/4: (i + 1/2) / 4 + (j + 1/2) / 4 < 1 holds for i + j <= 2.
-    lattice = [[(i + 0.5) / 4, (j + 0.5) / 4, 0] for i in range(5) for j in range(5) if i + j <= 2]
-    assert_close(found, torch.cat([corners, torch.tensor(lattice).double()]))
+    subdivision = [
+        [(i + 0.5) / 4, (j + 0.5) / 4, 0] for i in range(5) for j in range(5) if i + j <= 2
+    ]
+    assert_close(found, torch.cat([corners, torch.tensor(subdivision).double()]))
     assert len(supersample(mesh, 5.0)) == 3
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.evidence.metrics import EvaluateConfig, account, evaluate, rows
+from pimper_torch.evidence.metrics import EvaluateConfig, evaluate, report, rows
 from pimper_torch.evidence.metrics.evaluate import chosen_views
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.records import DtuProtocol, Estimate, Truth
@@ -19,15 +19,15 @@ def parts(make, generator):
     lights = torch.randn(5, 4, generator=generator, dtype=torch.float64)
     rotation = make.rotation(generator)
     shift = torch.tensor([3.0, -1.0, 2.0], dtype=torch.float64)
-    turned = lights.clone()
-    turned[:, 1:] = lights[:, 1:] @ rotation.mT
+    rotated = lights.clone()
+    rotated[:, 1:] = lights[:, 1:] @ rotation.mT
     estimate = Estimate(
         mesh=make.moved(truth, rigid(0.5 * rotation, shift)).replace(
             normals_world=truth.vertices_world @ rotation.mT
         ),
         names=tuple(f"view_{index}.png" for index in (4, 2, 0)),
-        cameras=make.carried(cameras, 0.5, rotation, shift).take([4, 2, 0]),
-        lights_world=turned[[4, 2, 0]],
+        cameras=make.transferred(cameras, 0.5, rotation, shift).take([4, 2, 0]),
+        lights_world=rotated[[4, 2, 0]],
         reference="view_2.png",
     )
     return estimate, make.capture(Truth(mesh=truth, lights_world=lights), cameras=cameras)
@@ -43,7 +43,7 @@ def test_a_copy_in_another_frame_has_no_error_anywhere(parts):
     (view,) = found.views
     assert view.name == "view_2.png"
     assert view.relative_error < 1e-3
-    assert view.carried_normals.mean_deg < 0.5  # facets of the truth's shape
+    assert view.transferred_normals.mean_deg < 0.5  # facets of the truth's shape
     assert view.shape_normals.mean_deg < 0.1
     assert found.lights.mean_deg < 1e-5
     assert found.lights.lights == 3
@@ -76,7 +76,7 @@ def test_a_truth_without_a_surface_still_judges_cameras_and_lights(parts):
     assert found.cameras.missing == 2
 
 
-def test_a_mesh_alone_is_judged_by_its_surface_and_the_middle_view(parts, make):
+def test_a_mesh_alone_is_judged_by_its_surface_and_the_centre_view(parts, make):
     _, capture = parts
     found = evaluate(Estimate(mesh=make.sphere(1.1, level=4)), capture, EvaluateConfig(**FEW))
     assert found.alignment.method == "none"
@@ -106,7 +106,7 @@ def test_views_are_chosen_by_name_whatever_their_suffix(parts):
 
 def test_the_same_seed_gives_the_same_figures(parts):
     one, same, other = (
-        account(evaluate(*parts, EvaluateConfig(alignment="icp", seed=seed, **FEW)))
+        report(evaluate(*parts, EvaluateConfig(alignment="icp", seed=seed, **FEW)))
         for seed in (3, 3, 4)
     )
     assert one == same
@@ -149,7 +149,7 @@ def test_impossible_settings_are_refused(setting):
 
 
 def test_the_account_is_json_that_says_everything(parts):
-    plain = account(evaluate(*parts, EvaluateConfig(**FEW)))
+    plain = report(evaluate(*parts, EvaluateConfig(**FEW)))
     again = json.loads(json.dumps(plain, allow_nan=False))
     assert again == plain
     assert plain["alignment"]["method"] == "cameras"
@@ -160,7 +160,7 @@ def test_the_account_is_json_that_says_everything(parts):
 def test_what_is_not_finite_is_null(parts):
     estimate, capture = parts
     bare = capture.replace(truth=Truth())
-    plain = account(evaluate(estimate, bare, EvaluateConfig(**FEW)))
+    plain = report(evaluate(estimate, bare, EvaluateConfig(**FEW)))
     assert plain["cameras"]["mean_center_percent"] is None
 
 

@@ -16,12 +16,12 @@ def known_similarity(make, generator, angle_deg=6.0, scale=1.07):
     return rigid(scale * make.rotation(generator, angle_deg), shift)
 
 
-def with_outliers(mesh, generator, share):
-    """Add triangles off the surface until they have this share of the area."""
+def with_outliers(mesh, generator, fraction):
+    """Add triangles off the surface until they have this fraction of the area."""
     a, b, c = mesh.vertices_world[mesh.faces].unbind(dim=1)
     area = float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2)
     count = 40
-    side = (2 * area * share / (1 - share) / count) ** 0.5
+    side = (2 * area * fraction / (1 - fraction) / count) ** 0.5
     corner = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     corner = 2.2 * torch.nn.functional.normalize(corner, dim=1)
     frame = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator).double()).Q
@@ -46,9 +46,9 @@ def error_of(found, known):
 def test_a_known_similarity_is_found_among_a_third_of_outliers(generator, make, distance):
     truth = make.potato(level=3)
     known = known_similarity(make, generator)
-    dirty = with_outliers(truth, generator, share=0.3)
+    dirty = with_outliers(truth, generator, fraction=0.3)
     estimate = make.moved(dirty, torch.linalg.inv(known))
-    settings = IcpConfig(trimmed_share=0.35, distance=distance, iterations=150, samples=600)
+    settings = IcpConfig(trimmed_fraction=0.35, distance=distance, iterations=150, samples=600)
     found = trimmed_icp(estimate, truth, torch.eye(4).double(), settings, generator=generator)
     scale, angle, shift = error_of(found.truth_from_world, known)
     # What is trimmed is more than the outliers, so the rest lies exactly on the truth; by
@@ -64,18 +64,18 @@ def test_without_trimming_the_outliers_pull(generator, make):
     truth = make.potato(level=3)
     known = known_similarity(make, generator)
     estimate = make.moved(with_outliers(truth, generator, 0.3), torch.linalg.inv(known))
-    settings = IcpConfig(trimmed_share=0.0, **FEW)
+    settings = IcpConfig(trimmed_fraction=0.0, **FEW)
     found = trimmed_icp(estimate, truth, torch.eye(4).double(), settings, generator=generator)
     assert error_of(found.truth_from_world, known)[0] > 1e-2
 
 
 def test_half_an_estimate_with_outliers_finds_its_place(generator, make):
     truth = make.potato(level=3)
-    middle = truth.vertices_world[truth.faces].mean(dim=1)
-    half = truth.replace(faces=truth.faces[middle[:, 2] > 0])
+    centre = truth.vertices_world[truth.faces].mean(dim=1)
+    half = truth.replace(faces=truth.faces[centre[:, 2] > 0])
     known = known_similarity(make, generator, angle_deg=4.0, scale=1.04)
     estimate = make.moved(with_outliers(half, generator, 0.15), torch.linalg.inv(known))
-    settings = IcpConfig(trimmed_share=0.25, **FEW)
+    settings = IcpConfig(trimmed_fraction=0.25, **FEW)
     found = trimmed_icp(estimate, truth, torch.eye(4).double(), settings, generator=generator)
     scale, angle, shift = error_of(found.truth_from_world, known)
     assert found.converged
@@ -86,11 +86,11 @@ def test_half_an_estimate_with_outliers_finds_its_place(generator, make):
 
 def test_a_truth_that_lacks_half_needs_that_half_trimmed(generator, make):
     whole = make.potato(level=3)
-    middle = whole.vertices_world[whole.faces].mean(dim=1)
-    half = whole.replace(faces=whole.faces[middle[:, 2] > 0])
+    centre = whole.vertices_world[whole.faces].mean(dim=1)
+    half = whole.replace(faces=whole.faces[centre[:, 2] > 0])
     known = known_similarity(make, generator, angle_deg=4.0, scale=1.03)
     estimate = make.moved(whole, torch.linalg.inv(known))
-    settings = IcpConfig(trimmed_share=0.6, iterations=60, **FEW)
+    settings = IcpConfig(trimmed_fraction=0.6, iterations=60, **FEW)
     found = trimmed_icp(estimate, half, torch.eye(4).double(), settings, generator=generator)
     scale, angle, shift = error_of(found.truth_from_world, known)
     assert max(scale, shift) < 1e-4
@@ -99,7 +99,7 @@ def test_a_truth_that_lacks_half_needs_that_half_trimmed(generator, make):
 
 def test_a_blown_up_sphere_is_brought_to_size_and_not_turned(generator, make):
     truth = make.sphere(level=4)
-    settings = IcpConfig(trimmed_share=0.0, **FEW)
+    settings = IcpConfig(trimmed_fraction=0.0, **FEW)
     start = torch.eye(4).double()
     found = trimmed_icp(make.sphere(1.2, level=4), truth, start, settings, generator=generator)
     scale, rotation = split_similarity(found.truth_from_world)
@@ -110,7 +110,7 @@ def test_a_blown_up_sphere_is_brought_to_size_and_not_turned(generator, make):
 
 def test_a_plane_slides_and_grows_no_more_than_it_was_told(generator, make):
     start = rigid(torch.eye(3), torch.tensor([0.3, 0.2, 0.1])).double()
-    settings = IcpConfig(trimmed_share=0.0, **FEW)
+    settings = IcpConfig(trimmed_fraction=0.0, **FEW)
     found = trimmed_icp(make.square(), make.square(side=4.0), start, settings, generator=generator)
     expected = rigid(torch.eye(3), torch.tensor([0.3, 0.2, 0.0])).double()
     assert_close(found.truth_from_world, expected, atol=1e-9, rtol=0)
@@ -121,13 +121,13 @@ def test_a_cloud_is_measured_by_points(generator, make):
     cloud = truth.replace(faces=truth.faces[:0])
     known = known_similarity(make, generator, angle_deg=2.0, scale=1.01)
     estimate = make.moved(truth, torch.linalg.inv(known))
-    settings = IcpConfig(trimmed_share=0.1, iterations=60, **FEW)
+    settings = IcpConfig(trimmed_fraction=0.1, iterations=60, **FEW)
     found = trimmed_icp(estimate, cloud, torch.eye(4).double(), settings, generator=generator)
     assert found.distance == "point"
     assert error_of(found.truth_from_world, known)[0] < 0.01
 
 
-@pytest.mark.parametrize("setting", [{"trimmed_share": 1.0}, {"samples": 3}, {"iterations": 0}])
+@pytest.mark.parametrize("setting", [{"trimmed_fraction": 1.0}, {"samples": 3}, {"iterations": 0}])
 def test_impossible_settings_are_refused(setting):
     with pytest.raises(ConfigError, match=next(iter(setting))):
         IcpConfig(**setting)
@@ -142,7 +142,7 @@ def aligned(make, generator, method, cameras_there=True):
     estimate = Estimate(
         mesh=make.moved(truth, world_from_truth),
         names=tuple(f"view_{index}.jpg" for index in range(5)) if cameras_there else (),
-        cameras=make.carried(cameras, 0.5, rotation, shift) if cameras_there else None,
+        cameras=make.transferred(cameras, 0.5, rotation, shift) if cameras_there else None,
     )
     capture = make.capture_of(truth, cameras=cameras)
     found = align_estimate(estimate, capture, method, generator=generator)
@@ -157,7 +157,7 @@ def test_cameras_of_the_same_names_align_the_frames(generator, make, method):
     assert found.cameras == 5
     assert found.scale == pytest.approx(2.0)
     assert found.rotation_deg == pytest.approx(50.0)
-    assert found.trimmed_share == (0.2 if method == "icp" else None)
+    assert found.trimmed_fraction == (0.2 if method == "icp" else None)
 
 
 def test_without_cameras_nothing_is_aligned_and_that_is_told(generator, make):

@@ -38,12 +38,12 @@ def test_a_mesh_that_is_the_truth_has_no_error(make):
     assert found.name == "view_1.png"
     assert found.relative_error < 1e-4  # float32 of the ray caster
     assert found.coverage == 1.0
-    assert found.carried_normals is None
+    assert found.transferred_normals is None
     assert found.shape_normals.mean_deg < 0.5  # facets
     assert found.albedo.one_scale_percent < 1e-3
 
 
-def test_carried_normals_and_those_of_the_shape_are_told_apart(make, generator):
+def test_transferred_normals_and_those_of_the_shape_are_told_apart(make, generator):
     sphere, cameras = make.sphere(level=4), make.cameras(count=1)
     tilt = make.rotation(generator, 10.0)
     # About its axis the tilt turns nothing: the mean angle is below 10, the shape's is not.
@@ -54,8 +54,8 @@ def test_carried_normals_and_those_of_the_shape_are_told_apart(make, generator):
     normals = truth.normals_world[0][truth.depth[0].isfinite()].double()
     cosine = (normals * (normals @ tilt.mT)).sum(dim=1) / normals.square().sum(dim=1)
     expected = torch.rad2deg(cosine.clamp(-1, 1).acos())
-    assert found.carried_normals.mean_deg == pytest.approx(float(expected.mean()), abs=0.02)
-    assert found.carried_normals.median_deg == pytest.approx(float(expected.median()), abs=0.05)
+    assert found.transferred_normals.mean_deg == pytest.approx(float(expected.mean()), abs=0.02)
+    assert found.transferred_normals.median_deg == pytest.approx(float(expected.median()), abs=0.05)
 
 
 def test_a_true_mesh_serves_where_there_are_no_maps(make):

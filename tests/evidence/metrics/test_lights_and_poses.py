@@ -64,13 +64,13 @@ def test_a_turned_and_shifted_camera_is_off_by_just_that(make, generator):
         intrinsics=truth.intrinsics * truth.intrinsics.new_tensor([1.1, 1.1, 1])[:, None],
     )
     found = compare_cameras(
-        cameras, truth, IDENTITY, views=7, middle=torch.zeros(3).double(), diagonal=2.0
+        cameras, truth, IDENTITY, views=7, centre=torch.zeros(3).double(), diagonal=2.0
     )
     assert (found.views, found.missing) == (7, 2)
     assert found.mean_rotation_deg == pytest.approx(3 / 5)
     assert found.median_rotation_deg == pytest.approx(0, abs=1e-6)
     assert found.mean_center == pytest.approx(0.1)
-    assert found.mean_center_percent == pytest.approx(100 * 0.1 / 5)  # 5 from the middle
+    assert found.mean_center_percent == pytest.approx(100 * 0.1 / 5)  # 5 from the centre
     assert found.mean_center_percent_of_diagonal == pytest.approx(5.0)
     assert found.mean_focal_percent == pytest.approx(10.0)
 
@@ -78,7 +78,7 @@ def test_a_turned_and_shifted_camera_is_off_by_just_that(make, generator):
 def test_cameras_in_another_frame_and_half_the_size_are_right_after_alignment(make, generator):
     truth = make.cameras()
     rotation = make.rotation(generator)
-    ours = make.carried(truth, 0.2, rotation, torch.tensor([1.0, 2.0, 3.0]).double())
+    ours = make.transferred(truth, 0.2, rotation, torch.tensor([1.0, 2.0, 3.0]).double())
     ours = ours.replace(
         intrinsics=ours.intrinsics * ours.intrinsics.new_tensor([0.5, 0.5, 1])[:, None],
         sizes_px=ours.sizes_px // 2,
@@ -87,7 +87,7 @@ def test_cameras_in_another_frame_and_half_the_size_are_right_after_alignment(ma
     assert found.mean_rotation_deg < 1e-5
     assert found.mean_center < 1e-8
     assert found.mean_focal_percent < 1e-8
-    assert found.mean_center_percent != found.mean_center_percent  # nobody told the middle
+    assert found.mean_center_percent != found.mean_center_percent  # nobody told the centre
 
 
 def test_places_are_off_by_the_similarity_and_bend_only_where_cameras_differ(make, generator):

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics.planarity import dihedrals, planar_faces
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.records import Mesh
 
 SIZE = (1.0, 1.5, 3.0)
@@ -28,9 +28,9 @@ def box(generator, noise=0.0, lean_deg=0.0, spacing=0.03):
     faces = torch.tensor([part for a, b, c, d in QUADS for part in ((a, b, c), (a, c, d))])
     dense = subdivide(corners, faces, torch.full((12,), spacing).double())
     volume = (dense.points[dense.faces].det() / 6).sum()
-    turned = dense.faces if volume > 0 else dense.faces.flip(1)
+    rotated = dense.faces if volume > 0 else dense.faces.flip(1)
     shake = torch.randn(dense.points.shape, generator=generator, dtype=torch.float64)
-    return Mesh(vertices_world=dense.points + noise * shake, faces=turned)
+    return Mesh(vertices_world=dense.points + noise * shake, faces=rotated)
 
 
 def test_an_exact_box_has_six_flat_sides_at_right_angles(generator):
@@ -46,9 +46,9 @@ def test_an_exact_box_has_six_flat_sides_at_right_angles(generator):
     angles = dihedrals(mesh, sides)
     assert len(angles) == 12
     assert all(abs(each.angle_deg - 90) < 1e-6 for each in angles)
-    # Outward: away from the middle.
-    middle = torch.tensor(SIZE).double() / 2
-    assert all((side.point - middle) @ side.normal > 0 for side in sides)
+    # Outward: away from the centre.
+    centre = torch.tensor(SIZE).double() / 2
+    assert all((side.point - centre) @ side.normal > 0 for side in sides)
 
 
 def test_noise_is_measured_as_it_was_made(generator):
@@ -84,8 +84,8 @@ def test_a_bulge_is_found_in_the_side_that_has_it(generator):
 
 def test_an_open_box_with_a_part_missing_keeps_the_sides_it_has(generator):
     mesh = box(generator, noise=0.002)
-    middles = mesh.vertices_world[mesh.faces].mean(dim=1)
-    kept = (middles[:, 2] > 0.05) & ((middles - torch.tensor([0, 0.7, 1.5])).norm(dim=1) > 0.3)
+    centres = mesh.vertices_world[mesh.faces].mean(dim=1)
+    kept = (centres[:, 2] > 0.05) & ((centres - torch.tensor([0, 0.7, 1.5])).norm(dim=1) > 0.3)
     sides = planar_faces(mesh.replace(faces=mesh.faces[kept]), generator)
     assert len(sides) == 5
     assert all(side.rms == pytest.approx(0.002, rel=0.1) for side in sides)
@@ -94,7 +94,7 @@ def test_an_open_box_with_a_part_missing_keeps_the_sides_it_has(generator):
 def test_a_ball_has_no_flat_sides_to_speak_of(generator):
     vertices, faces = icosphere(4)
     sides = planar_faces(
-        Mesh(vertices_world=vertices, faces=faces), generator, band=0.002, min_share=0.04
+        Mesh(vertices_world=vertices, faces=faces), generator, band=0.002, min_fraction=0.04
     )
     assert len(sides) == 0
 

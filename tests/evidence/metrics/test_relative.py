@@ -33,7 +33,7 @@ def raised(mesh, height):
 def test_a_shifted_square_has_the_error_computed_by_hand():
     square = torch.tensor([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], dtype=torch.float64)
     shifted = square + square.new_tensor([0.0, 0.0, 0.1])
-    # ||shift||_F = sqrt(4 * 0.01) = 0.2; corners are sqrt 2 from the middle: sqrt(4 * 2).
+    # ||shift||_F = sqrt(4 * 0.01) = 0.2; corners are sqrt 2 from the centre: sqrt(4 * 2).
     assert_close(relative_error(shifted, square), square.new_tensor(100 * 0.2 / 8**0.5))
 
 
@@ -75,7 +75,7 @@ def test_a_blown_up_sphere_is_off_by_its_growth(cameras):
     )
     assert exact.relative_error < 0.2  # facets; a thin ring of rays grazes the rim
     rays = found.relative_error
-    middle = compare_in_view(
+    centre = compare_in_view(
         nearer,
         IDENTITY,
         cameras,
@@ -83,14 +83,14 @@ def test_a_blown_up_sphere_is_off_by_its_growth(cameras):
         truth.depth[0],
         where=truth.normals_world[0][..., 2] > 0.95,
     )
-    # Near the middle rays and normals are alike, so points move by 0.02 / cos of 1.
+    # Near the centre rays and normals are alike, so points move by 0.02 / cos of 1.
     assert rays > 2
     points = truth.normals_world[0][truth.normals_world[0][..., 2] > 0.95]
     spread = (points - points.mean(dim=0)).square().sum(dim=1).mean().sqrt()
-    assert abs(middle.relative_error / float(100 * 0.02 / spread) - 1) < 0.05
+    assert abs(centre.relative_error / float(100 * 0.02 / spread) - 1) < 0.05
 
 
-def test_an_estimate_in_another_frame_is_carried_to_the_truth(cameras):
+def test_an_estimate_in_another_frame_is_transferred_to_the_truth(cameras):
     truth = truth_of(Sphere(), cameras)
     vertices, faces = icosphere(6)
     angle = torch.tensor(0.7, dtype=torch.float64)
@@ -144,8 +144,8 @@ def test_tilted_normals_are_off_by_their_tilt(cameras):
 def test_angles_are_accurate_at_both_ends():
     base = torch.tensor([[0.0, 0.0, -1.0]] * 4, dtype=torch.float64)
     angle = torch.tensor([1e-9, 1.0, 2.0, torch.pi], dtype=torch.float64)
-    turned = torch.stack([angle.sin(), torch.zeros(4).double(), -angle.cos()], dim=1)
-    assert_close(angles_deg(base, turned), torch.rad2deg(angle), rtol=1e-9, atol=0)
+    rotated = torch.stack([angle.sin(), torch.zeros(4).double(), -angle.cos()], dim=1)
+    assert_close(angles_deg(base, rotated), torch.rad2deg(angle), rtol=1e-9, atol=0)
 
 
 def test_a_mesh_elsewhere_is_refused(cameras):

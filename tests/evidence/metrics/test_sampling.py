@@ -19,7 +19,7 @@ def test_samples_are_even_by_area_not_by_face(generator, make):
     assert abs(float(lower.double().mean()) - 0.5) < 1e-3  # stratified: far below 1/sqrt(4000)
     mean = samples.points.mean(dim=0)
     assert_close(mean, torch.tensor([0.5, 0.5, 0.0]).double(), atol=0.02, rtol=0)
-    # Second moment of the unit square about its middle; folding wrongly gives another.
+    # Second moment of the unit square about its centre; folding wrongly gives another.
     moment = (samples.points[:, :2] - 0.5).square().mean(dim=0)
     assert_close(moment, torch.full((2,), 1 / 12).double(), atol=0.004, rtol=0)
     assert_close(samples.normals.abs()[:, 2], torch.ones(4000).double())

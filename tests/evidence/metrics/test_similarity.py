@@ -23,13 +23,13 @@ def random_rotation(generator):
     return Q * torch.linalg.det(Q)
 
 
-def carried(cameras: Cameras, target_from_source, scale, rotation) -> Cameras:
+def transferred(cameras: Cameras, target_from_source, scale, rotation) -> Cameras:
     centers = transform(target_from_source, cameras.centers_world)
-    turned = cameras.cam_from_world[:, :3, :3] @ rotation.mT
-    return cameras.replace(cam_from_world=rigid(turned, -(turned @ centers[..., None])[..., 0]))
+    rotated = cameras.cam_from_world[:, :3, :3] @ rotation.mT
+    return cameras.replace(cam_from_world=rigid(rotated, -(rotated @ centers[..., None])[..., 0]))
 
 
-def test_points_carried_by_a_similarity_are_carried_back(generator):
+def test_points_transferred_by_a_similarity_are_transferred_back(generator):
     rotation = random_rotation(generator)
     known = rigid(2.5 * rotation, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
     points = torch.randn(20, 3, generator=generator, dtype=torch.float64)
@@ -59,11 +59,11 @@ def test_mirrored_points_still_get_a_rotation(generator):
 
 
 @pytest.mark.parametrize("num_views", [2, 3, 12])
-def test_cameras_on_an_arc_are_carried_back_however_few_they_are(generator, num_views):
+def test_cameras_on_an_arc_are_transferred_back_however_few_they_are(generator, num_views):
     truth = arc_cameras(num_views, width=64, height=48, focal_px=70.0, distance=4.0, sway_deg=0.0)
     rotation = random_rotation(generator)
     known = rigid(0.2 * rotation, torch.tensor([0.4, 5.0, -1.0], dtype=torch.float64))
-    ours = carried(truth, known, 0.2, rotation)
+    ours = transferred(truth, known, 0.2, rotation)
     found = similarity_between_cameras(ours, truth)
     assert_close(found @ known, torch.eye(4, dtype=torch.float64), atol=1e-10, rtol=0)
 
@@ -74,7 +74,7 @@ def test_cameras_in_a_row_leave_no_rotation_open(generator):
     truth = pinholes(look_at(eyes, torch.zeros(3, dtype=torch.float64), up), 70.0, 64, 48)
     rotation = random_rotation(generator)
     known = rigid(3.0 * rotation, torch.tensor([0.4, 5.0, -1.0], dtype=torch.float64))
-    found = similarity_between_cameras(carried(truth, known, 3.0, rotation), truth)
+    found = similarity_between_cameras(transferred(truth, known, 3.0, rotation), truth)
     assert_close(found @ known, torch.eye(4, dtype=torch.float64), atol=1e-10, rtol=0)
 
 

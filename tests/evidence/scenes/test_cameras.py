@@ -5,7 +5,7 @@ from pimper_torch.evidence.scenes.cameras import arc_cameras, look_at
 from pimper_torch.geometry.projection import project
 
 
-def test_looking_cameras_see_their_target_in_the_middle_with_up_upwards():
+def test_looking_cameras_see_their_target_in_the_centre_with_up_upwards():
     eyes = torch.tensor([[3.0, 1.0, 2.0], [-1.0, 4.0, 0.5]], dtype=torch.float64)
     target = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -6,18 +6,18 @@ from torch.testing import assert_close
 from pimper_torch.evidence.scenes.bodies import Body
 from pimper_torch.evidence.scenes.conductors import CONDUCTORS, Conductor
 from pimper_torch.evidence.scenes.environment import random_environment
-from pimper_torch.evidence.scenes.lights import Lamp
+from pimper_torch.evidence.scenes.lights import PointLight
 from pimper_torch.evidence.scenes.meshes import icosphere, moved, table
 from pimper_torch.evidence.scenes.stage import Stage
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.records import Mesh
 
 
-def lamp(**changes):
+def point_light(**changes):
     """Only ambient light, unless told."""
     dark = {"irradiance": 0.0, "ambient": 1.0, "flash": 0.0}
     place = {"position": torch.tensor([0.0, 0.0, 9.0]), "target": torch.zeros(3)}
-    return Lamp(**(place | dark | changes))
+    return PointLight(**(place | dark | changes))
 
 
 def radiance(stage, eye, rays, light, **changes):
@@ -74,7 +74,7 @@ def test_a_flat_mirror_shows_what_is_above_it(generator):
     down = torch.randn(200, 3, generator=generator)
     down[:, 2] = -1.5
     rays = normalize(down, dim=-1)
-    spots, seen = radiance(stage, eye, rays, lamp())
+    spots, seen = radiance(stage, eye, rays, point_light())
     assert (spots.body == 0).all()
     rise = 3 - stage.clearance  # the reflected ray starts clear of the mirror
     at_ceiling = spots.points + rays * rays.new_tensor([1.0, 1, -1]) * (rise / -rays[:, 2:])
@@ -90,12 +90,12 @@ def test_a_mirroring_sphere_shows_the_environment_by_the_reflected_ray(generator
     eye = torch.tensor([0.0, -4.0, 1.0])
     toward = 0.9 * even_directions(4000).float()
     rays = normalize(toward - eye, dim=-1)
-    spots, seen = radiance(stage, eye, rays, lamp(ambient=0.3, environment=picture))
+    spots, seen = radiance(stage, eye, rays, point_light(ambient=0.3, environment=picture))
     met = spots.body >= 0
     normals = spots.normals[met]
     out = mirrored_about(rays[met], normals)
-    share = CONDUCTORS["gold"].reflectance(-(rays[met] * normals).sum(dim=-1))
-    assert_close(seen[met], 0.3 * share * picture(out), atol=1e-4, rtol=1e-3)
+    fraction = CONDUCTORS["gold"].reflectance(-(rays[met] * normals).sum(dim=-1))
+    assert_close(seen[met], 0.3 * fraction * picture(out), atol=1e-4, rtol=1e-3)
     assert seen[met].std() > 0.05
 
 
@@ -106,16 +106,16 @@ def test_mirrors_face_to_face_end():
     stage = Stage([up, Body(mesh=down, texture=torch.zeros_like, conductor=CONDUCTORS["silver"])])
     eye = torch.tensor([0.0, 0.0, 1.0])
     rays = normalize(torch.tensor([[0.0, 0.1, -1.0]]), dim=-1)
-    _, seen = radiance(stage, eye, rays, lamp())
+    _, seen = radiance(stage, eye, rays, point_light())
     assert (seen == 0).all()  # nothing shines, and nothing recurses for ever
 
 
-def test_a_lamp_on_metal_has_the_metals_colour():
+def test_a_point_light_on_metal_has_the_metals_colour():
     def highlight(**material):
         body = Body(mesh=table(4.0), texture=torch.zeros_like, roughness=0.3, **material)
         eye = torch.tensor([0.0, 0.0, 3.0])
         down = torch.tensor([[0.0, 0.0, -1.0]])
-        return radiance(Stage([body]), eye, down, lamp(irradiance=1.0, ambient=0.0))[1][0]
+        return radiance(Stage([body]), eye, down, point_light(irradiance=1.0, ambient=0.0))[1][0]
 
     copper = highlight(conductor=CONDUCTORS["copper"])
     full = highlight(specular=1.0)

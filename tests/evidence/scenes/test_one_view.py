@@ -6,8 +6,8 @@ from pimper_torch.evidence.scenes.one_view import (
     ball,
     bumps,
     bumps_in_perspective,
-    lamps,
     photograph,
+    point_lights,
     regions,
 )
 
@@ -21,7 +21,7 @@ def test_normals_face_the_viewer_and_bulge_where_the_ball_does():
     normals, mask = ball(20)
     assert_close(normals.norm(dim=-1), torch.ones(20, 20, dtype=torch.float64))
     assert (normals[mask][:, 2] < 0).all()
-    assert (normals[10, 15:][mask[10, 15:], 0] > 0).all()  # right of the middle: to the right
+    assert (normals[10, 15:][mask[10, 15:], 0] > 0).all()  # right of the centre: to the right
     assert not mask[0, 0]
     assert normals[mask][:, 2].max() < -torch.cos(torch.tensor(1.31))  # 75 degrees
 
@@ -49,7 +49,7 @@ def test_the_normals_in_perspective_are_those_of_the_depth(generator):
 
 def test_images_are_light_by_normal_by_albedo_without_negative_values(generator):
     normals, mask = ball(16)
-    lights = lamps(6, generator)
+    lights = point_lights(6, generator)
     made = photograph(normals, regions(16, generator), mask, lights, generator)
     values = made.images[..., mask]
     expected = (lights @ made.normals).clamp_min(0)[:, None] * made.albedo

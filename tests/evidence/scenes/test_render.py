@@ -26,7 +26,7 @@ def white(points):
     return torch.ones_like(points)
 
 
-def lamp(position, **changes):
+def point_light(position, **changes):
     settings = {
         "positions_world": torch.tensor([position], dtype=torch.float64),
         "irradiance": torch.tensor([1.0], dtype=torch.float64),
@@ -74,8 +74,8 @@ def test_depth_times_ray_is_the_surface_in_closed_forms(cameras):
         assert_close(along, depth[hit])
 
 
-def test_the_middle_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_squared():
-    lights = lamp([0.0, 0.0, 2.0])
+def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_squared():
+    lights = point_light([0.0, 0.0, 2.0])
     generator = torch.Generator().manual_seed(62)
     scene = render_bodies([Body(mesh=table(2.0), texture=white)], above(), lights, generator, QUIET)
     image = scene.views.images[0, 0]
@@ -91,7 +91,7 @@ def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
         Body(mesh=ball((1.0, 0.0, 1.0), 0.3), texture=white, surroundings=True),
     ]
     # From (2, 0, 2) through the ball's centre (1, 0, 1) light would come to the origin.
-    lights = lamp([2.0, 0.0, 2.0], ambient=torch.tensor([0.1], dtype=torch.float64))
+    lights = point_light([2.0, 0.0, 2.0], ambient=torch.tensor([0.1], dtype=torch.float64))
     generator = torch.Generator().manual_seed(63)
     scene = render_bodies(bodies, above(), lights, generator, QUIET)
     image = scene.views.images[0, 0]
@@ -106,15 +106,15 @@ def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
     assert not scene.foreground[0, 15, 30]  # the ball stands before the table there
 
 
-def test_a_lamp_below_the_horizon_gives_no_light_but_the_ambient():
-    lights = lamp([0.0, 1.0, -2.0], ambient=torch.tensor([0.25], dtype=torch.float64))
+def test_a_point_light_below_the_horizon_gives_no_light_but_the_ambient():
+    lights = point_light([0.0, 1.0, -2.0], ambient=torch.tensor([0.25], dtype=torch.float64))
     generator = torch.Generator().manual_seed(64)
     scene = render_bodies([Body(mesh=table(3.0), texture=white)], above(), lights, generator, QUIET)
     assert_close(scene.views.images, torch.full_like(scene.views.images, 0.25))
 
 
 def test_a_flash_lights_what_faces_the_camera_without_shadows():
-    lights = lamp([0.0, 0.0, -2.0], flash=torch.tensor([0.5], dtype=torch.float64))
+    lights = point_light([0.0, 0.0, -2.0], flash=torch.tensor([0.5], dtype=torch.float64))
     generator = torch.Generator().manual_seed(65)
     scene = render_bodies([Body(mesh=table(3.0), texture=white)], above(), lights, generator, QUIET)
     assert_close(scene.views.images[0, :, 15, 15], torch.full((3,), 0.5), atol=1e-4, rtol=0)
@@ -128,11 +128,13 @@ def test_gloss_adds_a_highlight_where_the_mirror_direction_is():
     difference = []
     for body in (matte, glossy):
         generator = torch.Generator().manual_seed(66)
-        scene = render_bodies([body], above(), lamp([2.0, 0.0, 5.0], **dim), generator, QUIET)
+        scene = render_bodies(
+            [body], above(), point_light([2.0, 0.0, 5.0], **dim), generator, QUIET
+        )
         difference.append(scene.views.images[0, 0])
     extra = difference[1] - difference[0]
     assert (extra >= -0.012).all()  # what is mirrored is taken from the matte part
-    # Camera and lamp stand 5 above x = 0 and x = 2: they mirror at x = 1, 12 pixels aside.
+    # Camera and point light stand 5 above x = 0 and x = 2: they mirror at x = 1, 12 pixels aside.
     row, column = divmod(int(extra.argmax()), 31)
     assert row == 15
     assert abs(column - 27) <= 1
@@ -169,7 +171,7 @@ def test_a_ray_traced_ball_agrees_with_its_closed_form():
 
 
 def test_noise_and_saturation_are_those_of_the_sensor():
-    lights = lamp([0.0, 0.0, 50.0], irradiance=torch.tensor([0.5], dtype=torch.float64))
+    lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.5], dtype=torch.float64))
     noisy = SensorConfig(supersample=1, read_noise=0.01, shot_noise=0.0)
     body = Body(mesh=table(3.0), texture=white)
     generator = torch.Generator().manual_seed(68)
@@ -177,15 +179,15 @@ def test_noise_and_saturation_are_those_of_the_sensor():
     assert abs(image.std() - 0.01) < 0.001
     again = torch.Generator().manual_seed(68)
     assert_close(render_bodies([body], above(), lights, again, noisy).views.images, image)
-    bright = lamp([0.0, 0.0, 50.0], irradiance=torch.tensor([5.0], dtype=torch.float64))
+    bright = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([5.0], dtype=torch.float64))
     assert (render_bodies([body], above(), bright, generator, noisy).views.images == 1).all()
 
 
 def test_a_pixel_gathers_the_light_of_its_whole_area():
-    def halves(points):  # black and white meet at x = 0, the middle of the middle pixel
+    def halves(points):  # black and white meet at x = 0, the centre of the centre pixel
         return (points[..., :1] > 0).to(points).expand_as(points)
 
-    lights = lamp([0.0, 0.0, 50.0], irradiance=torch.tensor([0.8], dtype=torch.float64))
+    lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.8], dtype=torch.float64))
     sensor = SensorConfig(supersample=4, read_noise=0.0, shot_noise=0.0)
     generator = torch.Generator().manual_seed(69)
     body = Body(mesh=table(3.0), texture=halves)
@@ -195,7 +197,7 @@ def test_a_pixel_gathers_the_light_of_its_whole_area():
     assert_close(image[16], torch.tensor(0.8), atol=2e-3, rtol=0)
 
 
-def test_lamps_wander_within_their_cone_and_differ(generator):
+def test_point_lights_wander_within_their_cone_and_differ(generator):
     lights = wandering_lights(12, generator, distance=4.0, toward=(0.0, -1.0, 1.0))
     toward = lights.positions_world / lights.positions_world.norm(dim=1, keepdim=True)
     axis = torch.tensor([0.0, -(0.5**0.5), 0.5**0.5], dtype=torch.float64)
@@ -213,8 +215,8 @@ def test_a_potato_is_closed_rests_on_the_table_and_depends_on_its_seed_only():
     assert_close(first.vertices_world[:, 2].min(), torch.tensor(0.0, dtype=torch.float64))
     edges = first.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
     assert (torch.unique(edges, dim=0, return_counts=True)[1] == 2).all()
-    middle = first.vertices_world.mean(dim=0)
-    outward = ((first.vertices_world - middle) * first.normals_world).sum(dim=1)
+    centre = first.vertices_world.mean(dim=0)
+    outward = ((first.vertices_world - centre) * first.normals_world).sum(dim=1)
     assert (outward > 0).all()
     again = potato(torch.Generator().manual_seed(70), subdivisions=3)
     assert_close(first.vertices_world, again.vertices_world)
@@ -233,8 +235,8 @@ def test_joined_meshes_keep_their_triangles():
 def test_the_potato_scene_has_shadows_and_texture_and_little_saturation():
     scene = potato_on_table(3, num_views=2, width=80, height=60)
     assert scene.views.images.shape == (2, 3, 60, 80)
-    share = scene.lit[scene.foreground].float().mean()
-    assert 0.5 < share < 0.98
+    fraction = scene.lit[scene.foreground].float().mean()
+    assert 0.5 < fraction < 0.98
     assert (scene.views.images >= 1).float().mean() < 0.03
     assert scene.albedo[scene.foreground].std() > 0.1
     assert 0.2 < scene.foreground.float().mean() < 0.6

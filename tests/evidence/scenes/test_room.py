@@ -38,7 +38,7 @@ def photograph(scene, view):
 
 
 def test_all_but_the_object_and_its_shadow_is_the_same_in_every_photograph(egg):
-    scene = build_scene(egg, settings(fixed_lamp=True, fixed_room=True, fixed_table=True))
+    scene = build_scene(egg, settings(fixed_point_light=True, fixed_room=True, fixed_table=True))
     first, second = photograph(scene, 0), photograph(scene, 1)
     around = ~first.foreground & ~second.foreground
     alike = around & (first.lit == second.lit)
@@ -46,13 +46,13 @@ def test_all_but_the_object_and_its_shadow_is_the_same_in_every_photograph(egg):
     assert (around & ~alike).any()  # the shadow turned
     assert_close(first.image[:, alike], second.image[:, alike], atol=1e-4, rtol=0)  # float32
     assert first.image[:, alike].std() > 0.02  # patterned, so that equality says something
-    turned = first.foreground & second.foreground
-    assert (first.image - second.image).abs()[:, turned].mean() > 0.05
+    rotated = first.foreground & second.foreground
+    assert (first.image - second.image).abs()[:, rotated].mean() > 0.05
     assert_close(scene.bodies_in(0)[0].mesh.vertices_world, scene.object_mesh.vertices_world)
 
 
 def test_a_turning_table_is_where_the_true_cameras_see_it_and_the_room_is_not(egg):
-    scene = build_scene(egg, settings(fixed_lamp=True, fixed_room=True))
+    scene = build_scene(egg, settings(fixed_point_light=True, fixed_room=True))
     first, second = photograph(scene, 0), photograph(scene, 1)
     cameras = scene.cameras
     at = pixel_centers(80, 60, like=cameras.intrinsics).reshape(-1, 2)
@@ -77,22 +77,22 @@ def test_a_turning_table_is_where_the_true_cameras_see_it_and_the_room_is_not(eg
     assert difference[beyond].mean() > 0.05
 
 
-def test_a_fixed_lamp_stands_still_before_the_camera(egg):
-    scene = build_scene(egg, settings(fixed_lamp=True))
-    lamps = scene.lights.positions_world[:, None]
-    before = transform(scene.cameras.cam_from_world, lamps)[:, 0]
+def test_a_fixed_point_light_stands_still_before_the_camera(egg):
+    scene = build_scene(egg, settings(fixed_point_light=True))
+    point_lights = scene.lights.positions_world[:, None]
+    before = transform(scene.cameras.cam_from_world, point_lights)[:, 0]
     assert_close(before, before[:1].expand(5, 3))
-    assert (lamps[1:] - lamps[:-1]).norm(dim=-1).min() > 1  # it goes round the object
+    assert (point_lights[1:] - point_lights[:-1]).norm(dim=-1).min() > 1  # it goes round the object
     assert scene.lights.irradiance.std() == 0
     target = transform(scene.cameras.cam_from_world, scene.lights.target_world.expand(5, 1, 3))
     assert_close(target, target[:1].expand(5, 1, 3))  # so the room is lit alike
     moving = build_scene(egg, settings())
-    lamps = moving.lights.positions_world[:, None]
-    before = transform(moving.cameras.cam_from_world, lamps)[:, 0]
+    point_lights = moving.lights.positions_world[:, None]
+    before = transform(moving.cameras.cam_from_world, point_lights)[:, 0]
     assert before.std(dim=0).min() > 0.1
 
 
-@pytest.mark.parametrize("name", ["fixed_lamp", "fixed_room", "fixed_table"])
+@pytest.mark.parametrize("name", ["fixed_point_light", "fixed_room", "fixed_table"])
 @pytest.mark.parametrize("path", ["arc", "handheld"])
 def test_only_a_turntable_has_things_that_stand_still(name, path):
     with pytest.raises(ConfigError, match=f"{name} is True.*turntable instead of {path}"):
@@ -102,7 +102,7 @@ def test_only_a_turntable_has_things_that_stand_still(name, path):
 @pytest.mark.parametrize("fixed_table", [False, True])
 def test_the_truth_is_told_in_the_frame_of_the_object(egg, tmp_path, fixed_table):
     config = settings(
-        num_views=3, fixed_lamp=True, fixed_room=True, fixed_table=fixed_table, bits=16
+        num_views=3, fixed_point_light=True, fixed_room=True, fixed_table=fixed_table, bits=16
     )
     scene = build_scene(egg, config)
     capture = read_rendered(render_scene(egg, tmp_path / "out", config, processes=1))
@@ -113,7 +113,7 @@ def test_the_truth_is_told_in_the_frame_of_the_object(egg, tmp_path, fixed_table
         assert_close(truth.depth[view], frame.depth)
         assert_close(truth.lit[view], frame.lit)
         assert_close(capture.views.masks[view], frame.foreground)
-        alone = build_scene(egg, settings(num_views=3))  # no room, no fixed lamp
+        alone = build_scene(egg, settings(num_views=3))  # no room, no fixed point light
         bare = photograph(alone, view)
         assert_close(frame.foreground, bare.foreground)
         shown = frame.foreground

@@ -47,17 +47,17 @@ def test_the_object_fills_every_picture_and_leaves_none(egg):
         assert reach.amax(dim=(1, 2)).max() > 0.93
 
 
-def test_an_aim_is_better_than_the_middle_of_the_box(generator):
+def test_an_aim_is_better_than_the_centre_of_the_box(generator):
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64)
     points[:, 2] **= 4  # most of it low
     toward = arc_directions(5, span_deg=50.0, elevation_deg=40.0, sway_deg=4.0)
     view = {"focal_px": 100.0, "width": 80, "height": 60, "fill": 0.9}
 
     def size(target, distance):
-        """Of a point of the middle in the pictures, on average."""
+        """Of a point of the centre in the pictures, on average."""
         eyes = target + distance * toward
-        middle = (points.amin(dim=0) + points.amax(dim=0)) / 2
-        return float((100 / ((eyes - middle) * toward).sum(dim=1)).mean())
+        centre = (points.amin(dim=0) + points.amax(dim=0)) / 2
+        return float((100 / ((eyes - centre) * toward).sum(dim=1)).mean())
 
     target, distance = aim_to_fit(toward, points, **view)
     best = size(target, distance)
@@ -125,11 +125,11 @@ def test_a_patterned_table_has_more_contrast_than_a_cloth(egg):
 def test_an_object_turns_counter_clockwise_with_its_texture(egg):
     options = {"num_views": 2, "width": 40, "height": 30}
     still = build_scene(egg, SceneConfig(**options)).object_mesh
-    turned = build_scene(egg, SceneConfig(turn_deg=90.0, **options)).object_mesh
+    rotated = build_scene(egg, SceneConfig(rotation_deg=90.0, **options)).object_mesh
     quarter = still.vertices_world.new_tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # x to y
-    assert_close(turned.vertices_world, still.vertices_world @ quarter.mT)
-    assert_close(turned.normals_world.double(), still.normals_world.double() @ quarter.mT)
-    assert_close(turned.albedo, still.albedo, atol=1e-4, rtol=0)  # the texture's float32
+    assert_close(rotated.vertices_world, still.vertices_world @ quarter.mT)
+    assert_close(rotated.normals_world.double(), still.normals_world.double() @ quarter.mT)
+    assert_close(rotated.albedo, still.albedo, atol=1e-4, rtol=0)  # the texture's float32
 
 
 def test_normals_of_a_file_that_contradict_its_faces_are_not_taken(tmp_path):
@@ -143,8 +143,8 @@ def test_normals_of_a_file_that_contradict_its_faces_are_not_taken(tmp_path):
     )
     (tmp_path / "flat.obj").write_text(corners + flat + faces)
     mesh = build_scene(tmp_path / "flat.obj", SMALL).object_mesh
-    middle = mesh.vertices_world.mean(dim=0)
-    radial = torch.nn.functional.normalize(mesh.vertices_world - middle, dim=1)
+    centre = mesh.vertices_world.mean(dim=0)
+    radial = torch.nn.functional.normalize(mesh.vertices_world - centre, dim=1)
     assert_close(mesh.normals_world, radial.float(), atol=1e-5, rtol=0)
 
 
@@ -157,10 +157,12 @@ def test_a_conductor_has_no_albedo_and_an_environment_all_photographs_share(egg)
     directions = even_directions(500)
 
     def pictures(scene):
-        return [scene.lights.lamp(view).surroundings(directions) for view in range(3)]
+        return [scene.lights.point_light(view).surroundings(directions) for view in range(3)]
 
-    ambient = [scene.lights.lamp(view).ambient for view in range(3)]
-    first, second, _ = (one / share for one, share in zip(pictures(scene), ambient, strict=True))
+    ambient = [scene.lights.point_light(view).ambient for view in range(3)]
+    first, second, _ = (
+        one / fraction for one, fraction in zip(pictures(scene), ambient, strict=True)
+    )
     assert_close(first, second)
     changing = build_scene(egg, SceneConfig(conductor="copper", environment="changing", **options))
     first, second, third = pictures(changing)
@@ -221,7 +223,7 @@ def test_a_cloud_without_faces_is_refused(tmp_path):
         ({"num_views": 0}, "num_views is 0"),
         ({"elevation_deg": 3.0}, "elevation_deg is 3.0"),
         ({"irradiance": 0.0, "ambient": 0.0}, "some light"),
-        ({"lamp_distance": 0.5}, "lamp_distance is 0.5"),
+        ({"point_light_distance": 0.5}, "point_light_distance is 0.5"),
         ({"exposure": 0.0}, "exposure is 0.0"),
         ({"albedo": (0.5, 0.5, 1.5)}, "albedo is"),
         ({"bounces": 9}, "bounces is 9"),
@@ -233,7 +235,7 @@ def test_settings_that_give_no_photographs_are_refused(setting, words):
         SceneConfig(**setting)
 
 
-def test_lamps_stay_over_the_table_on_the_photographed_side(generator):
+def test_point_lights_stay_over_the_table_on_the_photographed_side(generator):
     azimuths = torch.linspace(0, 5, 12, dtype=torch.float64)
     target = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     lights = lights_round(
@@ -255,9 +257,9 @@ def test_light_from_far_away_does_not_fall_off(generator):
     lights = lights_round(
         azimuths, generator, distance=5.0, target=target, irradiance=1.0, ambient=0.1, far=True
     )
-    lamp = lights.lamp(0)
+    point_light = lights.point_light(0)
     points = torch.tensor([[1.0, 1, 1], [-1, -1, -1]])
-    toward, arriving = lamp.arriving(points, lamp.position, 1.0)
+    toward, arriving = point_light.arriving(points, point_light.position, 1.0)
     assert_close(toward[0], toward[1], atol=1e-5, rtol=0)
     assert_close(arriving, torch.ones(2), atol=1e-4, rtol=0)
 
@@ -289,7 +291,7 @@ def test_paint_covers_and_marks_darken():
 
 
 @pytest.mark.parametrize("name", objects.RECIPES)
-def test_every_object_stands_on_the_table_at_its_middle(name, monkeypatch, generator):
+def test_every_object_stands_on_the_table_at_its_centre(name, monkeypatch, generator):
     monkeypatch.setattr(objects, "mug_mesh", lambda: _MUG_MESH(cell=0.06))
     bodies = objects.RECIPES[name](generator)
     points = torch.cat([body.mesh.vertices_world for body in bodies])
@@ -307,14 +309,14 @@ _MUG_MESH = objects.mug_mesh
 
 def test_no_ball_cuts_another():
     bodies = objects.balls(torch.Generator().manual_seed(1))
-    middles = [body.mesh.vertices_world.mean(dim=0) for body in bodies]
+    centres = [body.mesh.vertices_world.mean(dim=0) for body in bodies]
     radii = [
-        float((body.mesh.vertices_world[0] - middle).norm())
-        for body, middle in zip(bodies, middles, strict=True)
+        float((body.mesh.vertices_world[0] - centre).norm())
+        for body, centre in zip(bodies, centres, strict=True)
     ]
     for first in range(len(bodies)):
         for second in range(first):
-            distance = float((middles[first] - middles[second]).norm())
+            distance = float((centres[first] - centres[second]).norm())
             assert distance > radii[first] + radii[second] - 1e-3
 
 

@@ -11,10 +11,10 @@ UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 def hemisphere(steps=400):
     """Directions over a plane, and the solid angle each stands for."""
     cosine = (torch.arange(steps, dtype=torch.float64) + 0.5) / steps
-    turn = 2 * torch.pi * (torch.arange(2 * steps, dtype=torch.float64) + 0.5) / (2 * steps)
-    cosine, turn = torch.meshgrid(cosine, turn, indexing="ij")
+    rotation = 2 * torch.pi * (torch.arange(2 * steps, dtype=torch.float64) + 0.5) / (2 * steps)
+    cosine, rotation = torch.meshgrid(cosine, rotation, indexing="ij")
     sine = (1 - cosine**2).sqrt()
-    directions = torch.stack([sine * turn.cos(), sine * turn.sin(), cosine], dim=-1)
+    directions = torch.stack([sine * rotation.cos(), sine * rotation.sin(), cosine], dim=-1)
     return directions.reshape(-1, 3), 2 * torch.pi / cosine.numel()
 
 
@@ -46,7 +46,8 @@ def test_no_more_light_leaves_a_white_surface_than_arrives(roughness, tilt_deg):
     tilt = torch.deg2rad(torch.tensor(tilt_deg, dtype=torch.float64))
     to_eye = torch.stack([tilt.sin(), torch.zeros_like(tilt), tilt.cos()])
     directions, solid_angle = hemisphere()
-    # By reciprocity what the eye gets from lamps all round is what a lamp there sends all round.
+    # By reciprocity what the eye gets from point lights all round is what a point light there sends
+    # all round.
     matte, mirrored = split(UP, directions, to_eye, 0.05, roughness)
     total = ((matte + mirrored) / torch.pi).sum() * solid_angle
     assert 0.7 < total < 1
@@ -65,7 +66,7 @@ def test_the_highlight_head_on_has_its_closed_form():
     assert_close(mirrored[0], torch.tensor(0.04 / (4 * 0.25**2), dtype=torch.float64))
 
 
-def test_nothing_comes_from_a_lamp_below_the_horizon():
+def test_nothing_comes_from_a_point_light_below_the_horizon():
     below = normalize(torch.tensor([[1.0, 0.0, -0.01]], dtype=torch.float64), dim=-1)
     for part in split(UP, below, UP, 0.05, 0.9):
         assert (part == 0).all()

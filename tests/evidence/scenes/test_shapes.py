@@ -37,8 +37,8 @@ def test_a_hit_lies_on_the_surface_and_nothing_before_it_does(name, generator):
     points = (origins + distance[:, None] * directions)[hit]
     level = LEVELS[name]
     assert_close(level(points), torch.zeros(len(points), dtype=torch.float64), atol=1e-12, rtol=0)
-    for share in (0.3, 0.7, 0.99):
-        before = (origins + share * distance[:, None] * directions)[hit]
+    for fraction in (0.3, 0.7, 0.99):
+        before = (origins + fraction * distance[:, None] * directions)[hit]
         assert (level(before) > 0).all()
 
 
@@ -66,15 +66,15 @@ def test_a_ray_from_inside_a_sphere_meets_its_far_side():
     assert_close(Sphere(radius=3.0).intersect(origin, direction), torch.tensor([1.5]).double())
 
 
-def test_bumps_are_met_on_the_relief_with_normals_across_it(generator):
-    relief = waves(generator)
-    shape = Bumps(relief=relief)
+def test_bumps_are_met_on_the_height_field_with_normals_across_it(generator):
+    height_field = waves(generator)
+    shape = Bumps(height_field=height_field)
     origins, directions = rays_from_above(generator)
     points = origins + shape.intersect(origins, directions)[:, None] * directions
     assert points[:, 2].std() > 0.02  # a plane would pass otherwise
-    assert_close(points[:, 2], relief(points[:, :2]), atol=1e-12, rtol=0)
+    assert_close(points[:, 2], height_field(points[:, :2]), atol=1e-12, rtol=0)
     xy = points[:, :2].clone().requires_grad_()
-    (slope,) = torch.autograd.grad(relief(xy).sum(), xy)
+    (slope,) = torch.autograd.grad(height_field(xy).sum(), xy)
     tangent_x = torch.stack([torch.ones(len(xy)), torch.zeros(len(xy)), slope[:, 0]], dim=1)
     tangent_y = torch.stack([torch.zeros(len(xy)), torch.ones(len(xy)), slope[:, 1]], dim=1)
     expected = torch.linalg.cross(tangent_x, tangent_y)

@@ -42,8 +42,8 @@ def test_no_point_is_observed_from_behind_the_sphere(scene, generator):
     assert ((points * toward).sum(dim=1) > 0).all()
     # A camera at the arc's end does not see all that the other end sees.
     assert not sparse.observed.all()
-    share = sparse.observed.double().mean()
-    assert share > 0.6
+    fraction = sparse.observed.double().mean()
+    assert fraction > 0.6
 
 
 def test_noise_is_on_the_observations_and_reaches_the_points(scene, generator):
@@ -55,7 +55,7 @@ def test_noise_is_on_the_observations_and_reaches_the_points(scene, generator):
 
 
 def test_outliers_are_few_and_gross_and_have_short_tracks(scene, generator):
-    sparse = exact_cloud(scene, 200, generator, outlier_share=0.1)
+    sparse = exact_cloud(scene, 200, generator, outlier_fraction=0.1)
     off = (sparse.points_world.norm(dim=1) - 1).abs()
     gross = off > 1e-6
     assert gross.sum() == 20
@@ -86,7 +86,8 @@ def test_a_plane_fills_all_views_with_points(generator):
 
 
 @pytest.mark.parametrize(
-    ("setting", "words"), [({"min_views": 1}, "min_views is 1"), ({"outlier_share": 1.5}, "share")]
+    ("setting", "words"),
+    [({"min_views": 1}, "min_views is 1"), ({"outlier_fraction": 1.5}, "fraction")],
 )
 def test_impossible_clouds_are_refused(scene, generator, setting, words):
     with pytest.raises(ConfigError, match=words):

@@ -44,8 +44,8 @@ def test_a_rendering_holds_what_it_says(rendering):
     for part, suffix in (("photos", "png"), ("masks", "png"), ("truth/maps", "npz")):
         held = sorted(path.name for path in (rendering / part).iterdir())
         assert held == [f"view_{view:03d}.{suffix}" for view in range(3)]
-    account = json.loads((rendering / "truth" / "scene.json").read_text())
-    assert account["settings"]["width"] == 48
+    report = json.loads((rendering / "truth" / "scene.json").read_text())
+    assert report["settings"]["width"] == 48
 
 
 def test_photographs_and_masks_are_those_of_the_frames(rendering, ball):

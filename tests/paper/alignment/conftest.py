@@ -35,10 +35,10 @@ def facets_over(generator):
         vertices = torch.cat([xy, height(xy[:, 0], xy[:, 1])[:, None]], dim=1)
         faces = torch.from_numpy(Delaunay(xy.numpy()).simplices).long()
         a, b, c = xy[faces].unbind(dim=1)
-        turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+        rotation = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
         # Outward is -z, toward the camera: clockwise in (x right, y down).
-        faces = torch.where((turn > 0)[:, None], faces[:, [0, 2, 1]], faces)
-        faces = faces[turn.abs() > 1e-6]
+        faces = torch.where((rotation > 0)[:, None], faces[:, [0, 2, 1]], faces)
+        faces = faces[rotation.abs() > 1e-6]
         cam_from_world = torch.eye(4, dtype=torch.float64)[None].clone()
         cam_from_world[0, 2, 3] = 10.0
         focal = 10.0 / sample
@@ -59,13 +59,13 @@ def facets_over(generator):
 
 
 @pytest.fixture
-def reliefs():
-    """Give patches a relief, ``(points_patch, patch_from_world) -> depth``."""
+def height_fields():
+    """Give patches a height field, ``(points_patch, patch_from_world) -> depth``."""
 
-    def build(patches, relief):
+    def build(patches, height_field):
         buckets = []
         for templates in patches.buckets:
-            depth = relief(templates.points_patch, templates.patch_from_world)
+            depth = height_field(templates.points_patch, templates.patch_from_world)
             identity = torch.tensor([0.0, 0, 1, 0], dtype=depth.dtype).expand(len(depth), 4)
             buckets.append(Depths(depth=depth, valid=templates.inside, transform=identity))
         return DepthPatches(photometric=_blank(patches), buckets=tuple(buckets))
@@ -74,16 +74,16 @@ def reliefs():
 
 
 @pytest.fixture
-def sphere_relief():
+def sphere_height_field():
     """Closed form: the near side of a sphere, seen along each patch's z."""
 
     def build(center, radius):
-        def relief(points, patch_from_world):
+        def height_field(points, patch_from_world):
             center_patch = transform(patch_from_world, center[None])[:, None]
             x, y, _ = (points - center_patch).unbind(dim=-1)
             return center_patch[..., 2] - (radius**2 - x**2 - y**2).sqrt()
 
-        return relief
+        return height_field
 
     return build
 

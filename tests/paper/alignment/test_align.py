@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.paper.alignment.align import Align, AlignConfig
-from pimper_torch.paper.alignment.trust import trust_by_distance
+from pimper_torch.paper.alignment.reliability import trust_by_distance
 from pimper_torch.records import Mesh
 
 RADIUS = 2.0
@@ -24,10 +24,10 @@ def random_transforms(count, generator, offset=0.02):
 
 def spoiled(depths, transforms):
     buckets = []
-    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
         x, y, _ = templates.points_patch.unbind(dim=-1)
         hx, hy, hz, h0 = transforms[templates.facet][:, :, None, None].unbind(dim=1)
-        buckets.append(relief.replace(depth=hx * x + hy * y + hz * relief.depth + h0))
+        buckets.append(height_field.replace(depth=hx * x + hy * y + hz * height_field.depth + h0))
     return depths.replace(buckets=tuple(buckets))
 
 
@@ -39,12 +39,14 @@ def error(found, truth):
 
 def by_facet(depths):
     facets = torch.cat([templates.facet for templates in depths.patches.buckets])
-    return torch.cat([relief.transform for relief in depths.buckets])[torch.argsort(facets)]
+    return torch.cat([height_field.transform for height_field in depths.buckets])[
+        torch.argsort(facets)
+    ]
 
 
 @pytest.fixture
-def sphere(facets_over, reliefs, sphere_relief):
-    return reliefs(facets_over(cap), sphere_relief(CENTER, RADIUS))
+def sphere(facets_over, height_fields, sphere_height_field):
+    return height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
 
 
 @pytest.fixture
@@ -53,7 +55,7 @@ def noise(generator):
 
     def add(depths, amplitude):
         buckets = []
-        for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+        for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
             x, y, _ = templates.points_patch.unbind(dim=-1)
             waves = torch.zeros_like(x)
             for _ in range(6):
@@ -61,17 +63,19 @@ def noise(generator):
                     3, len(x), 1, 1, generator=generator, dtype=torch.float64
                 )
                 waves = waves + torch.cos(fx / 0.08 * x + fy / 0.08 * y + 9 * start)
-            buckets.append(relief.replace(depth=relief.depth + amplitude * waves / 3**0.5))
+            buckets.append(
+                height_field.replace(depth=height_field.depth + amplitude * waves / 3**0.5)
+            )
         return depths.replace(buckets=tuple(buckets))
 
     return add
 
 
 @pytest.mark.parametrize(("prior", "left"), [(1e-6, 0.001), (3e-4, 0.03)])
-def test_alignment_undoes_random_bas_relief_transforms(sphere, generator, prior, left):
+def test_alignment_undoes_random_bas_height_field_transforms(sphere, generator, prior, left):
     put_on = random_transforms(sphere.patches.num_patches, generator)
     bad = spoiled(sphere, put_on)
-    found = Align(AlignConfig(prior=prior, rounds=4))(bad)
+    found = Align(AlignConfig(prior=prior, iterations=4))(bad)
     assert error(found, sphere) < left * error(bad, sphere)
     # Scales too, which no anchor tells: only neighbours and the folds between them do.
     scales = by_facet(found)[:, 2] * put_on[:, 2]
@@ -82,7 +86,7 @@ def test_alignment_undoes_random_bas_relief_transforms(sphere, generator, prior,
 
 def test_the_published_three_numbers_undo_what_three_numbers_did(sphere, generator):
     bad = spoiled(sphere, random_transforms(sphere.patches.num_patches, generator, offset=0.0))
-    found = Align(AlignConfig(prior=1e-6, rounds=5, offset=False))(bad)
+    found = Align(AlignConfig(prior=1e-6, iterations=5, offset=False))(bad)
     assert error(found, sphere) < 0.01 * error(bad, sphere)
     assert (by_facet(found)[:, 3] == 0).all()
 
@@ -96,9 +100,9 @@ def test_depths_are_the_reported_transform_of_the_old_depths(sphere, generator):
 
 
 def test_the_curvature_term_keeps_disagreeing_patches_from_being_flattened(
-    facets_over, reliefs, noise
+    facets_over, height_fields, noise
 ):
-    flat = reliefs(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
+    flat = height_fields(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
     bad = noise(flat, 0.02)  # neighbours have nothing in common
 
     def scales(**settings):
@@ -108,8 +112,8 @@ def test_the_curvature_term_keeps_disagreeing_patches_from_being_flattened(
     assert scales(scale_limit=1e6).median() > 0.25
 
 
-def test_no_patch_collapses_with_default_settings(facets_over, reliefs, noise):
-    flat = reliefs(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
+def test_no_patch_collapses_with_default_settings(facets_over, height_fields, noise):
+    flat = height_fields(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
     bad = noise(flat, 0.02)
     for curvature in (True, False):
         scales = by_facet(Align(AlignConfig(curvature=curvature))(bad))[:, 2]
@@ -118,7 +122,7 @@ def test_no_patch_collapses_with_default_settings(facets_over, reliefs, noise):
 
 
 def test_noise_on_a_curved_surface_shrinks_it_without_the_curvature_term_only(sphere, noise):
-    bad = noise(sphere, 0.01)  # half of the relief's own size
+    bad = noise(sphere, 0.01)  # half of the height field's own size
 
     def mean_scale(curvature):
         return by_facet(Align(AlignConfig(prior=1e-5, curvature=curvature))(bad))[:, 2].mean()
@@ -152,7 +156,9 @@ def test_rigid_motion_and_scale_of_the_world_change_nothing(sphere, generator):
     patches = bad.patches.replace(coarse=coarse.replace(mesh=mesh), buckets=tuple(templates))
     moved = bad.replace(
         photometric=bad.photometric.replace(patches=patches),
-        buckets=tuple(relief.replace(depth=size * relief.depth) for relief in bad.buckets),
+        buckets=tuple(
+            height_field.replace(depth=size * height_field.depth) for height_field in bad.buckets
+        ),
     )
     here, there = Align()(bad), Align()(moved)
     for a, b in zip(here.buckets, there.buckets, strict=True):
@@ -174,12 +180,14 @@ def test_a_patch_without_data_stays_as_it_is_and_drags_nobody(sphere, generator)
 
 
 def test_patches_that_meet_nobody_are_handed_back(sphere):
-    nothing = tuple(relief.replace(valid=relief.valid & False) for relief in sphere.buckets)
+    nothing = tuple(
+        height_field.replace(valid=height_field.valid & False) for height_field in sphere.buckets
+    )
     alone = sphere.replace(buckets=nothing)
     assert Align()(alone) is alone
 
 
-def test_a_single_facet_is_handed_back(facets_over, reliefs):
+def test_a_single_facet_is_handed_back(facets_over, height_fields):
     patches = facets_over(lambda x, y: 0 * x, side=2)
     mesh = patches.coarse.mesh
     first = patches.buckets[0]
@@ -187,20 +195,20 @@ def test_a_single_facet_is_handed_back(facets_over, reliefs):
         coarse=patches.coarse.replace(mesh=mesh.replace(faces=mesh.faces[first.facet[:1]])),
         buckets=(_one_template(first),),
     )
-    depths = reliefs(lone, lambda points, _: 0.1 * points[..., 0] ** 2)
+    depths = height_fields(lone, lambda points, _: 0.1 * points[..., 0] ** 2)
     assert Align()(depths) is depths
 
 
 def test_a_step_in_one_patch_is_left_standing_instead_of_tilting_it(sphere):
     facet = 0
     bucket = next(i for i, t in enumerate(sphere.patches.buckets) if facet in t.facet)
-    templates, relief = sphere.patches.buckets[bucket], sphere.buckets[bucket]
+    templates, height_field = sphere.patches.buckets[bucket], sphere.buckets[bucket]
     row = int(torch.nonzero(templates.facet == facet)[0, 0])
-    depth = relief.depth.clone()
+    depth = height_field.depth.clone()
     beyond = templates.barycentric[row, ..., 0] > 0.8
     depth[row] = depth[row] + 0.2 * beyond
     buckets = list(sphere.buckets)
-    buckets[bucket] = relief.replace(depth=depth)
+    buckets[bucket] = height_field.replace(depth=depth)
     stepped = sphere.replace(buckets=tuple(buckets))
 
     def others(outlier):
@@ -214,20 +222,20 @@ def test_a_step_in_one_patch_is_left_standing_instead_of_tilting_it(sphere):
 def test_samples_lose_three_quarters_at_the_outlier_distance():
     distance = torch.tensor([[1.0, 1.0, 1.0, 5.0, 1e3]])
     met = torch.tensor([[True, True, True, True, False]])
-    trust = trust_by_distance(distance, met, outlier=5.0)
-    assert_close(trust[0, 3], torch.tensor(0.25))
-    assert trust[0, 0] > 0.9
+    reliability = trust_by_distance(distance, met, outlier=5.0)
+    assert_close(reliability[0, 3], torch.tensor(0.25))
+    assert reliability[0, 0] > 0.9
 
 
 def test_gradients_run_from_depths_to_aligned_depths(
-    facets_over, reliefs, sphere_relief, generator
+    facets_over, height_fields, sphere_height_field, generator
 ):
     patches = facets_over(cap, side=3, sample=0.06, overlap=4.0)
     bad = spoiled(
-        reliefs(patches, sphere_relief(CENTER, RADIUS)),
+        height_fields(patches, sphere_height_field(CENTER, RADIUS)),
         random_transforms(patches.num_patches, generator),
     )
-    align = Align(AlignConfig(rounds=2))
+    align = Align(AlignConfig(iterations=2))
     probe = [torch.randn(b.depth.shape, generator=generator).double() for b in bad.buckets]
     change = 0.1 * random_transforms(patches.num_patches, generator)
 
@@ -246,7 +254,7 @@ def test_gradients_run_from_depths_to_aligned_depths(
 @pytest.mark.parametrize(
     "setting",
     [
-        {"rounds": 0},
+        {"iterations": 0},
         {"anchor": -1.0},
         {"prior": 0.0},
         {"scale_limit": 1.0},

@@ -12,15 +12,15 @@ def bumps(x, y):
 
 
 def along_z(height, scale=1.0, offset=0.0):
-    """The relief of coplanar facets in z = 0, whose patch frames have the world's z."""
+    """The height field of coplanar facets in z = 0, whose patch frames have the world's z."""
 
-    def relief(points, patch_from_world):
+    def height_field(points, patch_from_world):
         world = (points - patch_from_world[:, None, None, :3, 3]) @ patch_from_world[
             :, None, :3, :3
         ]
         return scale * height(world[..., 0], world[..., 1]) + offset
 
-    return relief
+    return height_field
 
 
 def with_points(depths, height, generator, per_facet=6, spread=1e-4, outliers=0.0):
@@ -48,11 +48,17 @@ def with_coarse(depths, **changes):
 
 def by_facet(depths):
     facets = torch.cat([templates.facet for templates in depths.patches.buckets])
-    return torch.cat([relief.transform for relief in depths.buckets])[torch.argsort(facets)]
+    return torch.cat([height_field.transform for height_field in depths.buckets])[
+        torch.argsort(facets)
+    ]
 
 
 def mean_height(depths):
-    return float(torch.cat([relief.depth[relief.valid] for relief in depths.buckets]).mean())
+    return float(
+        torch.cat(
+            [height_field.depth[height_field.valid] for height_field in depths.buckets]
+        ).mean()
+    )
 
 
 @pytest.fixture
@@ -66,10 +72,10 @@ def test_certainty_is_one_over_the_variance_next_to_the_seams_noise():
     assert_close(found, torch.tensor([1.0, 0.5, 0.2, 0.0]), atol=1e-7, rtol=1e-6)
 
 
-def test_anchors_know_the_relief_over_them_and_their_spread_along_the_normal(
-    flat, reliefs, generator
+def test_anchors_know_the_height_field_over_them_and_their_spread_along_the_normal(
+    flat, height_fields, generator
 ):
-    depths = with_points(reliefs(flat, along_z(bumps, offset=0.2)), bumps, generator)
+    depths = with_points(height_fields(flat, along_z(bumps, offset=0.2)), bumps, generator)
     long = torch.diag(torch.tensor([1.0, 1.0, 9.0], dtype=torch.float64))
     cloud = depths.patches.coarse.points
     cloud = cloud.replace(covariance_world=long.expand(len(cloud.facet), 3, 3))
@@ -86,8 +92,8 @@ def test_anchors_know_the_relief_over_them_and_their_spread_along_the_normal(
     assert (corners.variance == 0).all()
 
 
-def test_the_common_scale_of_coplanar_facets_is_told_by_points_only(flat, reliefs, generator):
-    halved = reliefs(flat, along_z(bumps, scale=0.5))
+def test_the_common_scale_of_coplanar_facets_is_told_by_points_only(flat, height_fields, generator):
+    halved = height_fields(flat, along_z(bumps, scale=0.5))
     without = by_facet(Align(AlignConfig(anchor=0.0))(halved))
     assert_close(without[:, 2], torch.ones(len(without)).double(), atol=1e-3, rtol=0)
     hearing = Align(AlignConfig(anchor=0.0, prior=1e-6))
@@ -97,8 +103,8 @@ def test_the_common_scale_of_coplanar_facets_is_told_by_points_only(flat, relief
     assert_close(by_facet(deaf(with_points(halved, bumps, generator))), without)
 
 
-def test_of_points_and_vertices_the_certain_ones_decide(flat, reliefs, generator):
-    lifted = reliefs(flat, along_z(bumps, offset=0.1))
+def test_of_points_and_vertices_the_certain_ones_decide(flat, height_fields, generator):
+    lifted = height_fields(flat, along_z(bumps, offset=0.1))
 
     def offset(spread, vertex_spread):
         depths = with_points(
@@ -113,8 +119,8 @@ def test_of_points_and_vertices_the_certain_ones_decide(flat, reliefs, generator
     assert abs(offset(1.0, 1e-4)) < 0.01  # goes down to the vertices
 
 
-def test_a_point_far_off_is_not_followed(flat, reliefs, generator):
-    exact = reliefs(flat, along_z(bumps))
+def test_a_point_far_off_is_not_followed(flat, height_fields, generator):
+    exact = height_fields(flat, along_z(bumps))
     some = with_points(exact, bumps, generator, outliers=0.1)
     away = some.patches.coarse.points.points_world[:, 2].abs() > 0.2
     assert 5 < away.sum() < 0.2 * len(away)
@@ -124,8 +130,8 @@ def test_a_point_far_off_is_not_followed(flat, reliefs, generator):
     assert (found - identity)[:, 3].abs().mean() < 0.05 * (spoiled - identity)[:, 3].abs().mean()
 
 
-def test_a_mesh_from_elsewhere_needs_no_cloud(flat, reliefs):
-    depths = reliefs(flat, along_z(bumps, offset=0.1))
+def test_a_mesh_from_elsewhere_needs_no_cloud(flat, height_fields):
+    depths = height_fields(flat, along_z(bumps, offset=0.1))
     assert depths.patches.coarse.points is None
     assert depths.patches.coarse.covariance_world is None
     assert abs(mean_height(Align()(depths))) < 0.01

@@ -24,9 +24,11 @@ def random_transforms(count, generator):
 def changed(depths, change):
     """Replace each depth by ``change(x, y, depth, facet)``."""
     buckets = []
-    for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True):
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
         x, y, _ = templates.points_patch.unbind(dim=-1)
-        buckets.append(relief.replace(depth=change(x, y, relief.depth, templates.facet)))
+        buckets.append(
+            height_field.replace(depth=change(x, y, height_field.depth, templates.facet))
+        )
     return depths.replace(buckets=tuple(buckets))
 
 
@@ -54,12 +56,14 @@ def waves(depths, amplitude, generator):
 
 def by_facet(depths):
     facets = torch.cat([templates.facet for templates in depths.patches.buckets])
-    return torch.cat([relief.transform for relief in depths.buckets])[torch.argsort(facets)]
+    return torch.cat([height_field.transform for height_field in depths.buckets])[
+        torch.argsort(facets)
+    ]
 
 
 @pytest.fixture
-def sphere(facets_over, reliefs, sphere_relief):
-    return reliefs(facets_over(cap), sphere_relief(CENTER, RADIUS))
+def sphere(facets_over, height_fields, sphere_height_field):
+    return height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
 
 
 def test_the_preset_paper_is_the_published_system():
@@ -135,10 +139,10 @@ def test_three_numbers_a_patch_solve_the_dense_kronecker_equations(generator):
 def test_scales_do_not_shrink_after_random_transforms_and_noise(
     sphere, generator, curvature, noise, least
 ):
-    """Noise is up to a quarter of the relief's own root mean square."""
+    """Noise is up to a quarter of the height field's own root mean square."""
     put_on = random_transforms(sphere.patches.num_patches, generator)
     bad = waves(spoiled(sphere, put_on), noise, generator)
-    found = Align(AlignConfig(prior=1e-6, curvature=curvature, rounds=4))(bad)
+    found = Align(AlignConfig(prior=1e-6, curvature=curvature, iterations=4))(bad)
     scales = by_facet(found)[:, 2] * put_on[:, 2]
     assert scales.median() > least
     assert scales.median() < 1.05
@@ -147,7 +151,7 @@ def test_scales_do_not_shrink_after_random_transforms_and_noise(
 
 @pytest.mark.parametrize("curvature", [True, False])
 def test_flattening_costs_nothing_on_coplanar_facets_and_is_not_chosen(
-    facets_over, reliefs, generator, curvature
+    facets_over, height_fields, generator, curvature
 ):
     """All seams agree at h = 0 too: nothing but the gauge tells the two apart."""
 
@@ -156,9 +160,9 @@ def test_flattening_costs_nothing_on_coplanar_facets_and_is_not_chosen(
         world = world @ patch_from_world[:, None, :3, :3]
         return 0.03 * torch.sin(5 * world[..., 0]) * torch.cos(4 * world[..., 1])
 
-    flat = reliefs(facets_over(lambda x, y: 0 * x), bumps)
+    flat = height_fields(facets_over(lambda x, y: 0 * x), bumps)
     put_on = random_transforms(flat.patches.num_patches, generator)
-    config = AlignConfig(prior=1e-5, anchor=0.0, curvature=curvature, rounds=4)
+    config = AlignConfig(prior=1e-5, anchor=0.0, curvature=curvature, iterations=4)
     found = Align(config)(spoiled(flat, put_on))
     scales = by_facet(found)[:, 2] * put_on[:, 2]
     assert scales.std() < 0.05 * scales.mean()  # one common scale, which nothing tells
@@ -166,18 +170,18 @@ def test_flattening_costs_nothing_on_coplanar_facets_and_is_not_chosen(
 
 
 @pytest.fixture
-def disc(facets_over, reliefs, generator):
+def disc(facets_over, height_fields, generator):
     """Bumps, and in front of them a disc whose step every patch has as high as it likes.
 
-    So is relief across a depth edge: integration does not know how high the step is.
+    So is height field across a depth edge: integration does not know how high the step is.
     """
-    flat = reliefs(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
+    flat = height_fields(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
     mesh = flat.patches.coarse.mesh
-    middle = mesh.vertices_world[mesh.faces].mean(dim=1)
-    steps = 0.2 * torch.rand(len(middle), generator=generator, dtype=torch.float64)
+    centre = mesh.vertices_world[mesh.faces].mean(dim=1)
+    steps = 0.2 * torch.rand(len(centre), generator=generator, dtype=torch.float64)
 
     def world(x, y, facet):
-        return x + middle[facet, 0, None, None], y + middle[facet, 1, None, None]
+        return x + centre[facet, 0, None, None], y + centre[facet, 1, None, None]
 
     def in_front(x, y, facet):
         x, y = world(x, y, facet)
@@ -198,9 +202,9 @@ def disc(facets_over, reliefs, generator):
 def test_what_lies_beside_a_depth_edge_is_not_pulled_by_it(disc):
     depths, behind = disc
 
-    share = torch.cat([where.flatten(1).double().mean(dim=1) for where in behind])
+    fraction = torch.cat([where.flatten(1).double().mean(dim=1) for where in behind])
     facets = torch.cat([templates.facet for templates in depths.patches.buckets])
-    untouched = facets[share == 1]
+    untouched = facets[fraction == 1]
     assert len(untouched) > 8
 
     def moved(outlier):

@@ -3,7 +3,7 @@ from torch.testing import assert_close
 
 from pimper_torch.paper.alignment.align import Align, AlignConfig
 from pimper_torch.paper.alignment.anchors import vertex_anchors
-from pimper_torch.paper.alignment.trust import (
+from pimper_torch.paper.alignment.reliability import (
     judge_patches,
     overlapping_seams,
     reliable_seams,
@@ -21,7 +21,7 @@ def cap(x, y):
 
 
 def statuses(depths):
-    return torch.cat([relief.status for relief in depths.buckets])
+    return torch.cat([height_field.status for height_field in depths.buckets])
 
 
 def with_first(depths, change):
@@ -31,26 +31,28 @@ def with_first(depths, change):
 
 
 def test_before_alignment_nobody_is_aligned_and_after_it_all_are(
-    facets_over, reliefs, sphere_relief
+    facets_over, height_fields, sphere_height_field
 ):
-    sphere = reliefs(facets_over(cap), sphere_relief(CENTER, RADIUS))
-    assert all(relief.status is None for relief in sphere.buckets)
-    assert not any(relief.aligned.any() for relief in sphere.buckets)
+    sphere = height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
+    assert all(height_field.status is None for height_field in sphere.buckets)
+    assert not any(height_field.aligned.any() for height_field in sphere.buckets)
     found = Align()(sphere)
     assert (statuses(found) == ALIGNED).all()
-    assert all(relief.aligned.all() for relief in found.buckets)
+    assert all(height_field.aligned.all() for height_field in found.buckets)
     assert "aligned_patches" not in figures(sphere)
     assert figures(found)["aligned_patches"] == found.patches.num_patches
     assert figures(found)["mismatch"] == float(found.mismatch[-1])
 
 
-def test_a_patch_without_relief_is_alone_and_stays_as_it_is(facets_over, reliefs, sphere_relief):
-    sphere = reliefs(facets_over(cap), sphere_relief(CENTER, RADIUS))
+def test_a_patch_without_height_field_is_alone_and_stays_as_it_is(
+    facets_over, height_fields, sphere_height_field
+):
+    sphere = height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
 
-    def blind(relief):
-        valid = relief.valid.clone()
+    def blind(height_field):
+        valid = height_field.valid.clone()
         valid[0] = False
-        return relief.replace(valid=valid)
+        return height_field.replace(valid=valid)
 
     found = Align()(with_first(sphere, blind))
     assert statuses(found)[0] == ALONE
@@ -59,14 +61,16 @@ def test_a_patch_without_relief_is_alone_and_stays_as_it_is(facets_over, reliefs
     assert_close(found.buckets[0].transform[0], identity)
 
 
-def test_a_patch_with_relief_in_its_middle_only_is_alone(facets_over, reliefs, sphere_relief):
+def test_a_patch_with_height_field_in_its_centre_only_is_alone(
+    facets_over, height_fields, sphere_height_field
+):
     patches = facets_over(cap, side=4)
-    sphere = reliefs(patches, sphere_relief(CENTER, RADIUS))
+    sphere = height_fields(patches, sphere_height_field(CENTER, RADIUS))
 
-    def islet(relief):
-        valid = relief.valid.clone()
+    def islet(height_field):
+        valid = height_field.valid.clone()
         valid[0] &= (patches.buckets[0].barycentric[0] > 0.25).all(dim=-1)
-        return relief.replace(valid=valid)
+        return height_field.replace(valid=valid)
 
     found = Align()(with_first(sphere, islet))
     assert statuses(found)[0] == ALONE
@@ -76,22 +80,22 @@ def test_a_patch_with_relief_in_its_middle_only_is_alone(facets_over, reliefs, s
 
 
 def test_a_patch_of_nonsense_is_disputed_put_on_its_vertices_and_drags_nobody(
-    facets_over, reliefs, sphere_relief, generator
+    facets_over, height_fields, sphere_height_field, generator
 ):
     patches = facets_over(cap)
-    sphere = reliefs(patches, sphere_relief(CENTER, RADIUS))
+    sphere = height_fields(patches, sphere_height_field(CENTER, RADIUS))
     x, y, _ = patches.buckets[0].points_patch[0].unbind(dim=-1)
     waves = 0.25 * torch.sin(23 * x + 1) * torch.cos(19 * y)
 
-    def nonsense(relief):
-        depth = relief.depth.clone()
+    def nonsense(height_field):
+        depth = height_field.depth.clone()
         depth[0] = waves + 0.6
-        return relief.replace(depth=depth)
+        return height_field.replace(depth=depth)
 
     found = Align()(with_first(sphere, nonsense))
     assert statuses(found)[0] == DISPUTED
     assert (statuses(found)[1:] == ALIGNED).all()
-    others = torch.cat([relief.transform for relief in found.buckets])[1:]
+    others = torch.cat([height_field.transform for height_field in found.buckets])[1:]
     away = others - torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
     assert away.abs().mean() < 0.01
     anchors = vertex_anchors(patches, found.buckets)
@@ -102,21 +106,21 @@ def test_a_patch_of_nonsense_is_disputed_put_on_its_vertices_and_drags_nobody(
 def test_a_seam_is_reliable_where_enough_of_it_agrees():
     met = torch.ones(4, 8, dtype=torch.bool)
     met[1, 1:] = False  # hardly met
-    trust = torch.ones(4, 8)
-    trust[2] = 0.2  # nearly all far apart
-    trust[3, :5] = 0.1  # the others agree
-    assert reliable_seams(trust, met).tolist() == [True, False, False, True]
+    reliability = torch.ones(4, 8)
+    reliability[2] = 0.2  # nearly all far apart
+    reliability[3, :5] = 0.1  # the others agree
+    assert reliable_seams(reliability, met).tolist() == [True, False, False, True]
     facets = torch.tensor([[0, 1], [1, 2], [2, 3], [4, 5]])
     overlapping = overlapping_seams(met)
     assert overlapping.tolist() == [True, False, True, True]
     overlapping[3] = False
-    found = judge_patches(facets, overlapping, reliable_seams(trust, met), 7)
+    found = judge_patches(facets, overlapping, reliable_seams(reliability, met), 7)
     wanted = [ALIGNED, ALIGNED, DISPUTED, DISPUTED, ALONE, ALONE, ALONE]
     assert found.tolist() == wanted
 
 
-def test_with_infinite_outlier_distance_nobody_is_disputed(facets_over, reliefs, generator):
-    wild = reliefs(
+def test_with_infinite_outlier_distance_nobody_is_disputed(facets_over, height_fields, generator):
+    wild = height_fields(
         facets_over(lambda x, y: 0 * x),
         lambda points, _: torch.randn(points.shape[:3], generator=generator, dtype=torch.float64),
     )

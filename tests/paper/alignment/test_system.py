@@ -102,8 +102,8 @@ def test_seams_name_each_inner_edge_once_with_rays_about_it(facets_over):
     for seam, (a, b) in enumerate(seams.facets.tolist()):
         shared = sorted(set(mesh.faces[a].tolist()) & set(mesh.faces[b].tolist()))
         start, end = mesh.vertices_world[shared]
-        middle = seams.origins[seam].mean(dim=(0, 1))
-        assert_close(middle, (start + end) / 2)
+        centre = seams.origins[seam].mean(dim=(0, 1))
+        assert_close(centre, (start + end) / 2)
         assert_close(seams.edge_lengths[seam], (end - start).norm())
         assert seams.seam_of.flatten()[seams.place_of[seam]].tolist() == [seam, seam]
         assert (seams.place_of[seam] // 3).tolist() == [a, b]
@@ -111,10 +111,12 @@ def test_seams_name_each_inner_edge_once_with_rays_about_it(facets_over):
     assert_close(spread, torch.full_like(spread, 10 * float(patches.buckets[0].spacing[0])))
 
 
-def test_two_reliefs_of_one_sphere_are_met_in_the_same_points(facets_over, reliefs, sphere_relief):
+def test_two_height_fields_of_one_sphere_are_met_in_the_same_points(
+    facets_over, height_fields, sphere_height_field
+):
     center = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
     patches = facets_over(lambda x, y: 2 - (4 - x**2 - y**2).sqrt())
-    depths = reliefs(patches, sphere_relief(center, 2.0))
+    depths = height_fields(patches, sphere_height_field(center, 2.0))
     seams = find_seams(patches, rows=5, columns=8, reach_samples=4.0)
     identity = IDENTITY.expand(patches.num_patches, 4)
     overlaps = meet_overlaps(seams, patches, depths.buckets, identity)

@@ -1,4 +1,4 @@
-"""Patches with closed-form relief on small coarse meshes."""
+"""Patches with closed-form height field on small coarse meshes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,8 +39,8 @@ class Builder:
         xy = torch.cat(places)
         faces = torch.tensor(Delaunay(xy.numpy()).simplices).long()
         vertices = torch.cat([xy, height(xy[:, 0], xy[:, 1])[:, None]], dim=1)
-        turned = face_normals(vertices, faces)[:, 2] > 0
-        faces = torch.where(turned[:, None], faces.flip(1), faces)
+        rotated = face_normals(vertices, faces)[:, 2] > 0
+        faces = torch.where(rotated[:, None], faces.flip(1), faces)
         normals = vertex_normals(vertices, faces)
         mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=normals)
         return CoarseMesh(mesh=mesh, reference=0, is_point=torch.ones(len(xy), dtype=torch.bool))
@@ -126,6 +126,6 @@ def ball(x: Tensor, y: Tensor) -> Tensor:
 
 @pytest.fixture(scope="session")
 def cap(builder: Builder) -> DepthPatches:
-    """A cap of the unit sphere round (0, 0, 1), 40 degrees to each side, exact relief."""
+    """A cap of the unit sphere round (0, 0, 1), 40 degrees to each side, exact height field."""
     coarse = builder.coarse(ball)
     return builder.patches(coarse, ball)

@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.fusion.union import ray_directions, unite, vertex_spacing
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.fusion.blend import blend_patches, ray_directions, vertex_spacing
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import boundary_vertices
 from pimper_torch.paper.refinement.refine import Refine, RefineConfig
 
@@ -16,10 +16,10 @@ def plane(x, y):
 
 
 def changed(depths, change):
-    """Replace the relief of every bucket by ``change(templates, relief)``."""
+    """Replace the height field of every bucket by ``change(templates, height field)``."""
     buckets = tuple(
-        relief.replace(**change(templates, relief))
-        for templates, relief in zip(depths.patches.buckets, depths.buckets, strict=True)
+        height_field.replace(**change(templates, height_field))
+        for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True)
     )
     return depths.replace(buckets=buckets)
 
@@ -27,19 +27,19 @@ def changed(depths, change):
 def shifted(depths, facets, by):
     """Move some patches along their z."""
 
-    def change(templates, relief):
+    def change(templates, height_field):
         chosen = torch.isin(templates.facet, torch.tensor(facets))
-        return {"depth": relief.depth + by * chosen[:, None, None]}
+        return {"depth": height_field.depth + by * chosen[:, None, None]}
 
     return changed(depths, change)
 
 
 def united(depths, outlier_samples=4.0):
     mesh = depths.patches.coarse.mesh
-    lattice = subdivide(mesh.vertices_world, mesh.faces, vertex_spacing(depths.patches, 1.0))
-    directions = ray_directions(lattice, depths.patches.coarse)
-    union = unite(depths, lattice, directions, outlier_samples)
-    return lattice, union, lattice.points + union.heights[:, None] * directions
+    subdivision = subdivide(mesh.vertices_world, mesh.faces, vertex_spacing(depths.patches, 1.0))
+    directions = ray_directions(subdivision, depths.patches.coarse)
+    blend = blend_patches(depths, subdivision, directions, outlier_samples)
+    return subdivision, blend, subdivision.points + blend.heights[:, None] * directions
 
 
 def off_sphere(points):
@@ -47,10 +47,10 @@ def off_sphere(points):
     return (points - centre).norm(dim=-1) - 1
 
 
-def test_exact_relief_on_a_cap_gives_the_sphere_back(cap):
-    lattice, union, points = united(cap)
-    assert union.supported.all()
-    flat = off_sphere(lattice.points).abs().mean()
+def test_exact_height_field_on_a_cap_gives_the_sphere_back(cap):
+    subdivision, blend, points = united(cap)
+    assert blend.supported.all()
+    flat = off_sphere(subdivision.points).abs().mean()
     # Bilinear cells sag by spacing^2 / 4 = 1e-4.
     assert off_sphere(points).abs().max() < 1.5e-4
     for radius, factor in ((1.0, 12), (2.0, 4)):  # smoothing flattens by about r^2 / 2 cells
@@ -63,7 +63,7 @@ def test_the_rim_of_a_cap_moves_less_than_a_sample(cap):
     surface = Refine()(cap)
     rim = boundary_vertices(surface.faces, len(points))
     assert (surface.vertices_world - points)[rim].norm(dim=-1).max() < 0.3 * SPACING
-    free = Refine(RefineConfig(hold_planes=False))(cap).vertices_world
+    free = Refine(RefineConfig(keep_planes=False))(cap).vertices_world
     assert (free - points)[rim].norm(dim=-1).max() > SPACING
 
 
@@ -88,8 +88,8 @@ def test_a_tilted_plane_stays_a_plane(builder):
 def test_the_union_is_continuous_across_a_step_between_patches(builder):
     depths = builder.patches(builder.coarse(plane, rings=1), plane)
     step = 4 * SPACING
-    lattice, _, points = united(shifted(depths, [0, 2], step))
-    edges = lattice.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    subdivision, _, points = united(shifted(depths, [0, 2], step))
+    edges = subdivision.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     heights = points[:, 2] - plane(points[:, 0], points[:, 1])
     jump = (heights[edges[:, 0]] - heights[edges[:, 1]]).abs()
     assert heights.abs().max() > 0.9 * step
@@ -97,14 +97,14 @@ def test_the_union_is_continuous_across_a_step_between_patches(builder):
     assert jump.max() < 0.3 * step
 
 
-def test_steps_at_seams_are_smoothed_and_the_middle_of_facets_is_kept(builder):
+def test_steps_at_seams_are_smoothed_and_the_centre_of_facets_is_kept(builder):
     depths = builder.patches(builder.coarse(plane, rings=1), plane, overlap=2.0)
     step = 3 * SPACING
     stepped = shifted(depths, [0, 2, 4], step)
-    lattice, _, points = united(stepped)
+    subdivision, _, points = united(stepped)
     surface = Refine(RefineConfig(smoothing_radius_samples=2.0))(stepped)
     edges = torch.unique(
-        lattice.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values, dim=0
+        subdivision.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values, dim=0
     )
 
     def steepest(vertices):
@@ -113,32 +113,34 @@ def test_steps_at_seams_are_smoothed_and_the_middle_of_facets_is_kept(builder):
 
     assert steepest(surface.vertices_world) < 0.4 * steepest(points)
     moved = (surface.vertices_world - points).norm(dim=-1)
-    middle = (lattice.barycentric - 1 / 3).abs().amax(dim=1) < 0.05
-    seam = (lattice.barycentric.amin(dim=1) < 0.02) & (lattice.barycentric.amax(dim=1) < 0.8)
-    assert moved[middle].max() < 0.2 * moved[seam].max()
+    centre = (subdivision.barycentric - 1 / 3).abs().amax(dim=1) < 0.05
+    seam = (subdivision.barycentric.amin(dim=1) < 0.02) & (
+        subdivision.barycentric.amax(dim=1) < 0.8
+    )
+    assert moved[centre].max() < 0.2 * moved[seam].max()
 
 
 def test_one_wild_patch_is_outvoted_where_three_meet(builder):
     depths = builder.patches(builder.coarse(plane, rings=1), plane)
     wild = shifted(depths, [1], 30 * SPACING)
-    lattice, _, points = united(wild)
+    subdivision, _, points = united(wild)
     _, _, plain = united(wild, outlier_samples=torch.inf)
-    centre = lattice.points[:, :2].norm(dim=1) < 1e-9
+    centre = subdivision.points[:, :2].norm(dim=1) < 1e-9
     assert centre.sum() == 1
     off = points[centre, 2].abs()
     assert off.max() < 2 * SPACING
     assert plain[centre, 2].abs().max() > 4 * SPACING
 
 
-def test_a_hole_in_the_relief_is_filled_and_marked(cap):
-    def change(templates, relief):
+def test_a_hole_in_the_height_field_is_filled_and_marked(cap):
+    def change(templates, height_field):
         world = templates.points_patch @ templates.patch_from_world[:, None, :3, :3]
         offset = templates.patch_from_world[:, :3, :3].mT @ templates.patch_from_world[:, :3, 3:]
         x, y = (world - offset.mT[:, None])[..., :2].unbind(-1)
         away = (x - 0.15).square() + (y - 0.1).square() < 0.08**2
         return {
-            "valid": relief.valid & ~away,
-            "depth": torch.where(away, torch.nan, relief.depth),
+            "valid": height_field.valid & ~away,
+            "depth": torch.where(away, torch.nan, height_field.depth),
         }
 
     surface = Refine(RefineConfig(smoothing_radius_samples=1.0))(changed(cap, change))
@@ -157,10 +159,10 @@ def test_gradients_reach_the_depth(builder):
     sizes = [bucket.depth.shape for bucket in depths.buckets]
     noise = [0.02 * torch.randn(size, generator=generator, dtype=torch.float64) for size in sizes]
 
-    def places(*relief):
+    def places(*height_field):
         buckets = tuple(
             bucket.replace(depth=bucket.depth + extra)
-            for bucket, extra in zip(depths.buckets, relief, strict=True)
+            for bucket, extra in zip(depths.buckets, height_field, strict=True)
         )
         return Refine()(depths.replace(buckets=buckets)).vertices_world
 
@@ -176,8 +178,8 @@ def test_gradients_reach_the_depth(builder):
     assert_close(analytic, ((up - down) * probe).sum() / (2 * small), rtol=1e-6, atol=1e-8)
 
 
-def test_relief_that_is_valid_nowhere_leaves_the_facets_without_confidence(cap):
-    nowhere = changed(cap, lambda _, relief: {"valid": torch.zeros_like(relief.valid)})
+def test_height_field_that_is_valid_nowhere_leaves_the_facets_without_confidence(cap):
+    nowhere = changed(cap, lambda _, height_field: {"valid": torch.zeros_like(height_field.valid)})
     surface = Refine()(nowhere)
     mesh = nowhere.patches.coarse.mesh
     flat = subdivide(mesh.vertices_world, mesh.faces, vertex_spacing(nowhere.patches, 1.0))

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.paper.refinement.energy import (
     assemble,
@@ -22,35 +22,35 @@ def square():
     return subdivide(vertices, facets, torch.full((2,), SPACING).double())
 
 
-def everywhere(lattice):
-    return torch.ones(len(lattice.points), dtype=torch.bool)
+def everywhere(subdivision):
+    return torch.ones(len(subdivision.points), dtype=torch.bool)
 
 
-def published(lattice, union, radius):
+def published(subdivision, blend, radius):
     fidelity = torch.full((2,), (radius * SPACING) ** -2, dtype=torch.float64)
-    parts = assemble(lattice, fidelity, everywhere(lattice))
-    factor = SparseCholesky(parts.rows, parts.cols, parts.values, size=len(union))
-    return factor.solve(parts.mass[:, None] * union)
+    parts = assemble(subdivision, fidelity, everywhere(subdivision))
+    factor = SparseCholesky(parts.rows, parts.cols, parts.values, size=len(blend))
+    return factor.solve(parts.mass[:, None] * blend)
 
 
-def published_energy(lattice, union, places, radius):
+def published_energy(subdivision, blend, places, radius):
     """The functional as printed, face by face, without a line of the package's assembly."""
-    a, b, c = lattice.barycentric.unbind(dim=1)
+    a, b, c = subdivision.barycentric.unbind(dim=1)
     weights = ((a - b).abs() + (a - c).abs() + (c - b).abs()).sqrt() / 2
-    corners, values = lattice.points[lattice.faces], places[lattice.faces]
+    corners, values = subdivision.points[subdivision.faces], places[subdivision.faces]
     frame = (corners[:, 1:] - corners[:, :1]).mT
     slope = (values[:, 1:] - values[:, :1]).mT @ torch.linalg.pinv(frame)
     area = torch.linalg.cross(*frame.unbind(dim=-1)).norm(dim=-1) / 2
-    apart = (1 - weights) * (union - places).square().sum(dim=-1) / (radius * SPACING) ** 2
-    smooth = weights[lattice.faces].mean(dim=1) * slope.square().sum(dim=(1, 2))
-    return (area * (apart[lattice.faces].mean(dim=1) + smooth)).sum()
+    apart = (1 - weights) * (blend - places).square().sum(dim=-1) / (radius * SPACING) ** 2
+    smooth = weights[subdivision.faces].mean(dim=1) * slope.square().sum(dim=(1, 2))
+    return (area * (apart[subdivision.faces].mean(dim=1) + smooth)).sum()
 
 
 def test_descent_on_the_printed_functional_arrives_at_the_solve(square):
     generator = torch.Generator().manual_seed(91)
     noise = torch.randn(square.points.shape, generator=generator, dtype=torch.float64)
-    union = square.points + 0.05 * noise
-    places = union.clone().requires_grad_()
+    blend = square.points + 0.05 * noise
+    places = blend.clone().requires_grad_()
     optimiser = torch.optim.LBFGS(
         [places],
         max_iter=500,
@@ -62,35 +62,35 @@ def test_descent_on_the_printed_functional_arrives_at_the_solve(square):
 
     def closure():
         optimiser.zero_grad()
-        energy = published_energy(square, union, places, 2.0)
+        energy = published_energy(square, blend, places, 2.0)
         energy.backward()
         return energy
 
     optimiser.step(closure)
-    assert (places.detach() - union).abs().max() > 0.02  # it moved
-    assert_close(places.detach(), published(square, union, 2.0), atol=1e-5, rtol=0)
+    assert (places.detach() - blend).abs().max() > 0.02  # it moved
+    assert_close(places.detach(), published(square, blend, 2.0), atol=1e-5, rtol=0)
 
 
-def test_the_middle_of_a_facet_is_kept_and_seams_are_smoothed_the_more_the_larger_g(square):
+def test_the_centre_of_a_facet_is_kept_and_seams_are_smoothed_the_more_the_larger_g(square):
     """White noise keeps what G leaves of it: all at G = 0, least at the vertices."""
     generator = torch.Generator().manual_seed(92)
     kept = torch.zeros(len(square.points), dtype=torch.float64)
     flat = torch.zeros_like(square.points)
     for _ in range(60):
         noise = torch.randn(len(kept), generator=generator, dtype=torch.float64)
-        union = flat.clone()
-        union[:, 2] = noise
-        kept += published(square, union, 0.5)[:, 2] * noise
-    kept = kept / 60  # the share of its own noise a vertex keeps
+        blend = flat.clone()
+        blend[:, 2] = noise
+        kept += published(square, blend, 0.5)[:, 2] * noise
+    kept = kept / 60  # the fraction of its own noise a vertex keeps
     inside = (square.barycentric > 0.02).all(dim=1)
     g = seam_weight(square.barycentric)
-    middle = (square.barycentric - 1 / 3).abs().amax(dim=1) < 0.04
-    assert middle.any()
-    assert kept[middle].mean() > 0.7  # a vertex's neighbours lie where G is 0.1 already
+    centre = (square.barycentric - 1 / 3).abs().amax(dim=1) < 0.04
+    assert centre.any()
+    assert kept[centre].mean() > 0.7  # a vertex's neighbours lie where G is 0.1 already
     steps = [(0.0, 0.25), (0.25, 0.35), (0.35, 0.45), (0.45, 0.6)]
-    shares = [float(kept[inside & (g >= low) & (g < high)].mean()) for low, high in steps]
-    assert shares == sorted(shares, reverse=True)
-    assert shares[0] > 1.7 * shares[-1]
+    fractions = [float(kept[inside & (g >= low) & (g < high)].mean()) for low, high in steps]
+    assert fractions == sorted(fractions, reverse=True)
+    assert fractions[0] > 1.7 * fractions[-1]
     edge = (square.barycentric.amin(dim=1) < 1e-9) & (g < 0.52)
     corner = square.barycentric.amax(dim=1) > 1 - 1e-9
     assert float(kept[corner].mean()) < float(kept[edge].mean()) < 0.45
@@ -107,7 +107,7 @@ def test_smoothing_at_a_seam_has_the_width_that_the_docstring_gives():
     faces = torch.cat([low, up])
     vertices = torch.tensor([[0.0, 0, 0], [8, 0, 0], [0, 8, 0]], dtype=torch.float64)
     template = subdivide(vertices, torch.tensor([[0, 1, 2]]), torch.full((1,), 4.0).double())
-    lattice = template.replace(
+    subdivision = template.replace(
         points=points,
         facet=torch.zeros(len(points), dtype=torch.long),
         barycentric=torch.tensor([0.5, 0.5, 0.0]).double().expand(len(points), 3),
@@ -115,10 +115,10 @@ def test_smoothing_at_a_seam_has_the_width_that_the_docstring_gives():
         face_facet=torch.zeros(len(faces), dtype=torch.long),
     )
     radius, wave = 3.0, 32
-    union = torch.zeros_like(points)
-    union[:, 2] = torch.cos(2 * torch.pi * x / (wave * SPACING)).reshape(-1)
-    found = published(lattice, union, radius)[:, 2].reshape(160, 5)[32:128]
-    share = (found * union[:, 2].reshape(160, 5)[32:128]).sum()
-    share = share / union[:, 2].reshape(160, 5)[32:128].square().sum()
+    blend = torch.zeros_like(points)
+    blend[:, 2] = torch.cos(2 * torch.pi * x / (wave * SPACING)).reshape(-1)
+    found = published(subdivision, blend, radius)[:, 2].reshape(160, 5)[32:128]
+    fraction = (found * blend[:, 2].reshape(160, 5)[32:128]).sum()
+    fraction = fraction / blend[:, 2].reshape(160, 5)[32:128].square().sum()
     wanted = 1 / (1 + (2 * torch.pi * radius / wave) ** 2)
-    assert_close(share, torch.tensor(wanted).double(), atol=0.01, rtol=0)  # finite elements
+    assert_close(fraction, torch.tensor(wanted).double(), atol=0.01, rtol=0)  # finite elements

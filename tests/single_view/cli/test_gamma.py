@@ -11,7 +11,8 @@ from pimper_torch.single_view.factorization.gamma import GammaEstimate
 
 @pytest.fixture
 def fixed(tmp_path):
-    """A ball under ten lamps in a dark room, gamma 1.8, on a bright card; and the ball's mask."""
+    """A ball under ten point lights in a dark room, gamma 1.8, on a bright card; and the ball's
+    mask."""
     generator = np.random.default_rng(3)
     y, x = np.mgrid[-1:1:40j, -1:1:40j]
     inside = x**2 + y**2 < 0.8
@@ -19,8 +20,8 @@ def fixed(tmp_path):
     albedo = 0.4 + 0.5 * generator.random((40, 40))
     (tmp_path / "photos").mkdir()
     for index in range(10):
-        lamp = np.append(0.6 * generator.standard_normal(2), -1)
-        radiance = albedo * np.clip(normals @ (lamp / np.linalg.norm(lamp)), 0, None)
+        point_light = np.append(0.6 * generator.standard_normal(2), -1)
+        radiance = albedo * np.clip(normals @ (point_light / np.linalg.norm(point_light)), 0, None)
         radiance = np.where(inside, radiance, generator.random())
         encoded = (255 * radiance ** (1 / 1.8)).round().astype(np.uint8)
         Image.fromarray(encoded).save(tmp_path / "photos" / f"{index}.png")

@@ -14,14 +14,14 @@ from pimper_torch.single_view.factorization.gamma import (
 
 
 def shaded(seed=0, views=10, samples=60, ambient=0.0, aside=0.6):
-    """Radiance of half a sphere's normals under lamps that stray to the side."""
+    """Radiance of half a sphere's normals under point lights that stray to the side."""
     generator = torch.Generator().manual_seed(seed)
     normals = torch.randn(samples, 3, generator=generator, dtype=torch.float64)
     normals = normalize(normals - torch.tensor([0, 0, 1.0]), dim=1)
     strayed = aside * torch.randn(views, 2, generator=generator, dtype=torch.float64)
-    lamps = normalize(torch.cat([strayed, -torch.ones(views, 1).double()], dim=1), dim=1)
+    point_lights = normalize(torch.cat([strayed, -torch.ones(views, 1).double()], dim=1), dim=1)
     albedo = 0.3 + 0.6 * torch.rand(samples, generator=generator, dtype=torch.float64)
-    return albedo * ((lamps @ normals.T).clamp_min(0) + ambient) / (1 + ambient)
+    return albedo * ((point_lights @ normals.T).clamp_min(0) + ambient) / (1 + ambient)
 
 
 def noisy(encoded, size, seed=0):
@@ -181,7 +181,7 @@ def test_photographs_or_masks_of_unlike_sizes_are_refused():
     [
         (lambda x: x.where(x != x[3, 5], torch.nan), 3, "1 encoded values are no numbers"),
         (lambda x: x.where(x != x[3, 5], torch.inf), 3, "1 encoded values are no numbers"),
-        (lambda x: 255 * x, 3, r"encoded values reach from .* needed: shares"),
+        (lambda x: 255 * x, 3, r"encoded values reach from .* needed: fractions"),
         (lambda x: x - 0.5, 3, r"encoded values reach from -0\.5"),
         (lambda x: x, 0, "rank is 0"),
         (lambda x: x[:4], 3, r"only \d+ samples are lit in more than 3 of 4 views"),

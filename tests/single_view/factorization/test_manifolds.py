@@ -67,8 +67,8 @@ def test_tangents_are_derivatives_of_albedo_and_of_turns_of_the_normal(manifold,
     for place, column in enumerate(manifold.tangents(vectors.mT)):
         ahead = manifold.retract(vectors + 1e-6 * column.mT)
         assert_close((ahead - vectors) / 1e-6, column.mT, rtol=0, atol=1e-5)
-        moved, turned = manifold.split(ahead)
-        angle = (turned - manifold.split(vectors)[1]).norm(dim=-1)
+        moved, rotated = manifold.split(ahead)
+        angle = (rotated - manifold.split(vectors)[1]).norm(dim=-1)
         assert_close(
             moved - albedo, torch.full_like(albedo, 1e-6 * (place == 0)), rtol=0, atol=1e-11
         )
@@ -118,7 +118,7 @@ def test_every_solver_explains_the_data_on_every_manifold(solve, tolerance, mani
         lights=start,
         anchor=start,
         shading=near,
-        pull=torch.zeros(2, 25, dtype=torch.float64),
+        regularization=torch.zeros(2, 25, dtype=torch.float64),
         manifold=manifold,
     )
     found = solve(problem, 600, tolerance)

@@ -20,7 +20,7 @@ def test_data_of_lower_rank_but_for_its_rounding_is_factorized_without_blowing_u
 def test_vectors_are_brought_to_the_cone_and_a_wrong_signature_is_told(problem, generator):
     _, lights, shading = problem(patches=2)
     hidden = torch.randn(2, 4, 4, generator=generator, dtype=torch.float64)
-    # The second patch's vectors lie on a quadric of another signature: no lamp lights those.
+    # The second patch's vectors lie on a quadric of another signature: no point light lights those.
     x, y, z = torch.randn(3, 150, generator=generator, dtype=torch.float64)
     fourth = (x**2 + z**2 - y**2).abs().sqrt()
     inside = x**2 + z**2 > y**2

@@ -8,8 +8,8 @@ from pimper_torch.single_view.factorization.starts import start_from_data
 def error(found, truth, weight, least=7):
     """Largest error of shading vectors seen often enough, the ambiguity undone."""
     often = (weight.sum(dim=1) >= least).double()
-    turn = align_factorizations(found, truth, often)
-    return ((turn.on_shading(found) - truth).abs().amax(dim=1) * often).max()
+    rotation = align_factorizations(found, truth, often)
+    return ((rotation.on_shading(found) - truth).abs().amax(dim=1) * often).max()
 
 
 def test_the_data_alone_are_a_start(problem):

@@ -117,10 +117,10 @@ def test_a_ball_before_a_pinhole_comes_back_with_the_order_of_the_cubic(method):
 def test_turning_the_raster_turns_the_answer(method):
     normals, _ = bumps(16)
     normals = normals[:, :11]
-    turned = normals.rot90(1, (0, 1))
-    turned = torch.stack([turned[..., 1], -turned[..., 0], turned[..., 2]], dim=-1)
+    rotated = normals.rot90(1, (0, 1))
+    rotated = torch.stack([rotated[..., 1], -rotated[..., 0], rotated[..., 2]], dim=-1)
     straight = integrate_normal_map(normals, method=method)
-    again = integrate_normal_map(turned, method=method)
+    again = integrate_normal_map(rotated, method=method)
     assert_close(again.depth, straight.depth.rot90(1, (0, 1)), rtol=0, atol=1e-7)
 
 
@@ -299,13 +299,13 @@ def test_normals_that_are_not_trusted_yield():
     spoilt[10:14, 10:14] = normalize(torch.tensor([1.0, 1.0, -1.0]).double(), dim=0)
     weight = torch.ones(30, 30).double()
     weight[10:14, 10:14] = 1e-4
-    trusted, not_trusted = (
+    reliable, not_reliable = (
         integrate_normal_map(spoilt, spacing=(2 / 30, 2 / 30), weight=one, method="weighted")
         for one in (None, weight)
     )
     around = weight == 1
-    assert misfit(trusted, z, around) > 0.03
-    assert misfit(not_trusted, z, around) < 1e-3
+    assert misfit(reliable, z, around) > 0.03
+    assert misfit(not_reliable, z, around) < 1e-3
     zero = weight.clone()
     zero[10:14, 10:14] = 0
     bridged = integrate_normal_map(spoilt, spacing=(2 / 30, 2 / 30), weight=zero)

@@ -55,8 +55,8 @@ def ball() -> Scene:
 
 
 @pytest.fixture
-def lamps(generator: torch.Generator) -> Callable[..., Tensor]:
-    """Lamps of strength one, on the viewer's side."""
+def point_lights(generator: torch.Generator) -> Callable[..., Tensor]:
+    """Point lights of strength one, on the viewer's side."""
 
     def make(views: int, spread: float = 0.6) -> Tensor:
         sideways = 2 * torch.rand(views, 2, generator=generator, dtype=torch.float64) - 1

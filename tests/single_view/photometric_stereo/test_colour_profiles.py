@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.scenes.one_view import ball, bumps, lamps, photograph, regions
+from pimper_torch.evidence.scenes.one_view import ball, bumps, photograph, point_lights, regions
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.chromaticity import (
     chromaticities,
@@ -32,7 +32,7 @@ def error_deg(shading, normals):
 
 def seen(generator, shape="ball", noise=0.0, views=10):
     normals, mask = ball(40) if shape == "ball" else bumps(40, generator)
-    lights = lamps(views, generator)
+    lights = point_lights(views, generator)
     return photograph(normals, regions(40, generator), mask, lights, generator, noise)
 
 
@@ -62,13 +62,13 @@ def test_one_per_cent_of_noise_costs_little_more_than_it_must(generator):
     assert error_deg(found.on_shading(b)[:, known], made.normals[:, known]) < floor + 0.3
 
 
-def test_lamps_of_different_colours_do_not_matter(generator):
+def test_point_lights_of_different_colours_do_not_matter(generator):
     made = seen(generator)
     tint = 0.5 + torch.rand(10, 3, 1, 1, generator=generator, dtype=torch.float64)
     plain, known = chromaticities(made.images, made.mask)
     tinted, _ = chromaticities(made.images * tint, made.mask)
     shift = (tinted - plain)[:, known]
-    # Pixels are seen by different lamps; the alternation connects them up to its last step.
+    # Pixels are seen by different point lights; the alternation connects them up to its last step.
     assert_close(shift, shift[:, :1].expand_as(shift), atol=1e-3, rtol=0)
     assert shift.abs().max() > 0.01 or tint.std() > 0.1
 
@@ -89,7 +89,7 @@ def test_pixels_of_one_normal_tell_the_ratio_of_albedos(generator):
     normals, mask = ball(40)
     albedo = torch.ones(40, 40, 1, dtype=torch.float64)
     albedo[::2] = 3.0
-    made = photograph(normals, albedo, mask, lamps(8, generator), generator)
+    made = photograph(normals, albedo, mask, point_lights(8, generator), generator)
     profiles = made.images[:, 0, mask]
     groups = (made.albedo[0] > 2).long()
     pairs = same_normals(profiles, groups, 0.05)
@@ -112,7 +112,7 @@ def test_linked_groups_resolve_what_none_of_them_can_alone(generator):
     ring = ((torch.acos(-normals[..., 2].clamp(-1, 0)) / 0.2).long() % 3)[..., None]
     palette = torch.tensor([[0.9, 0.3, 0.3], [0.2, 0.5, 0.2], [0.2, 0.3, 1.0]], dtype=torch.float64)
     albedo = palette[ring[..., 0]]
-    made = photograph(normals, albedo, mask, lamps(12, generator), generator)
+    made = photograph(normals, albedo, mask, point_lights(12, generator), generator)
     b, lights = HIDDEN.on_shading(made.shading), HIDDEN.on_lights(made.lights)
     found = resolve_by_colour_profiles(made.images, made.mask, b, lights)
     assert error_deg(found.on_shading(b), made.normals) < 0.1

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import ball, bumps, lamps, photograph, regions
+from pimper_torch.evidence.scenes.one_view import ball, bumps, photograph, point_lights, regions
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.diffuse_maxima import (
     _equations,
@@ -36,7 +36,7 @@ def resolved(made, radius=3):
     return error_deg(found.on_shading(b), made.normals)
 
 
-def test_equations_vanish_where_normals_point_to_their_lamps(generator):
+def test_equations_vanish_where_normals_point_to_their_point_lights(generator):
     n = torch.randn(3, 12, generator=generator, dtype=torch.float64)
     b, light = HIDDEN.on_shading(2 * n), HIDDEN.on_lights(3 * n.mT).mT
     relief = HIDDEN.inverse().matrix
@@ -47,9 +47,9 @@ def test_equations_vanish_where_normals_point_to_their_lamps(generator):
     assert torch.linalg.matrix_rank(equations[:2].flatten(0, 1)) == 3  # two give the metric
 
 
-def test_maxima_on_a_ball_are_where_it_faces_the_lamp(generator):
+def test_maxima_on_a_ball_are_where_it_faces_the_point_light(generator):
     normals, mask = ball(60)
-    made = photograph(normals, grey(60), mask, lamps(6, generator), generator)
+    made = photograph(normals, grey(60), mask, point_lights(6, generator), generator)
     maxima = find_maxima(made.images, mask, made.shading)
     assert (torch.bincount(maxima.view, minlength=6) == 1).all()
     # A pixel is 1.8 degrees and more; what quadratics miss is cubic, and grows towards the rim.
@@ -62,13 +62,13 @@ def test_maxima_on_a_ball_are_where_it_faces_the_lamp(generator):
 @pytest.mark.parametrize("shape", ["ball", "bumps"])
 def test_the_relief_of_a_surface_of_one_paint_is_found(generator, shape):
     normals, mask = ball(64) if shape == "ball" else bumps(64, generator)
-    made = photograph(normals, grey(64), mask, lamps(10, generator), generator)
+    made = photograph(normals, grey(64), mask, point_lights(10, generator), generator)
     assert resolved(made) < 0.3  # what the quadratics leave of a pixel of 2 degrees
 
 
 def test_maxima_that_paint_makes_are_outvoted(generator):
     normals, mask = ball(96)
-    made = photograph(normals, regions(96, generator), mask, lamps(12, generator), generator)
+    made = photograph(normals, regions(96, generator), mask, point_lights(12, generator), generator)
     wrong = find_maxima(made.images, mask, made.shading)
     towards = made.lights[wrong.view].mT
     cross = torch.linalg.cross(wrong.shading, towards, dim=0).norm(dim=0)
@@ -79,7 +79,7 @@ def test_maxima_that_paint_makes_are_outvoted(generator):
 
 def test_noise_moves_maxima_by_parts_of_a_pixel(generator):
     normals, mask = ball(64)
-    made = photograph(normals, grey(64), mask, lamps(10, generator), generator, noise=0.01)
+    made = photograph(normals, grey(64), mask, point_lights(10, generator), generator, noise=0.01)
     # Ten maxima, each some 3 degrees off.
     assert resolved(made, radius=5) < 2.5
 
@@ -89,12 +89,12 @@ def test_the_border_and_the_shadow_hold_no_maxima(generator):
     wide = torch.tensor([[1.0, 0.0, -0.05], [0.0, 0.1, -1.0]], dtype=torch.float64)
     made = photograph(normals, grey(64), mask, wide, generator)
     maxima = find_maxima(made.images, mask, made.shading)
-    assert maxima.view.tolist() == [1]  # the first lamp is faced at the rim only
+    assert maxima.view.tolist() == [1]  # the first point light is faced at the rim only
 
 
 def test_what_does_not_fit_is_refused(generator):
     normals, mask = ball(40)
-    made = photograph(normals, grey(40), mask, lamps(4, generator), generator)
+    made = photograph(normals, grey(40), mask, point_lights(4, generator), generator)
     b, lights = made.shading, made.lights
     with pytest.raises(InputError, match="one light a view"):
         resolve_by_diffuse_maxima(made.images, mask, b[:, 1:], lights)

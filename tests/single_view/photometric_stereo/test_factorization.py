@@ -21,8 +21,8 @@ def test_without_holes_it_is_the_singular_value_decomposition(generator):
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_holes_are_filled_by_the_rest(bumpy, lamps, patchwork, generator, robust):
-    lights = lamps(14, spread=0.2)
+def test_holes_are_filled_by_the_rest(bumpy, point_lights, patchwork, generator, robust):
+    lights = point_lights(14, spread=0.2)
     radiance = lights @ (patchwork(bumpy) * bumpy.columns)
     weight = (torch.rand(radiance.shape, generator=generator) > 0.4).double()
     weight = weight * (radiance > 0)
@@ -33,8 +33,8 @@ def test_holes_are_filled_by_the_rest(bumpy, lamps, patchwork, generator, robust
     assert_close((found.lights @ found.shading)[:, enough], radiance[:, enough], atol=1e-4, rtol=0)
 
 
-def test_shadows_do_not_disturb_the_lights(bumpy, lamps, generator):
-    lights = lamps(20, spread=1.3)
+def test_shadows_do_not_disturb_the_lights(bumpy, point_lights, generator):
+    lights = point_lights(20, spread=1.3)
     radiance = (lights @ bumpy.columns).clamp_min(0)
     cast = torch.rand(radiance.shape, generator=generator) < 0.07
     radiance = torch.where(cast, 0, radiance)
@@ -46,8 +46,8 @@ def test_shadows_do_not_disturb_the_lights(bumpy, lamps, generator):
     assert in_span(plain.lights, lights) > 10 * off
 
 
-def test_random_starts_reach_what_the_start_from_the_data_does(bumpy, lamps, generator):
-    lights = lamps(8, spread=0.2)
+def test_random_starts_reach_what_the_start_from_the_data_does(bumpy, point_lights, generator):
+    lights = point_lights(8, spread=0.2)
     radiance = lights @ bumpy.columns
     weight = (torch.rand(radiance.shape, generator=generator) > 0.3).double()
     found = factorize_photographs(radiance, weight, 3, robust=False, starts=2, generator=generator)

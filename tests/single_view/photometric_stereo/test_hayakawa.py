@@ -29,9 +29,11 @@ def test_pixels_of_one_albedo_are_measured_alike_and_others_let_go(bumpy, genera
     assert_close(exact.mT @ exact, torch.eye(3, dtype=torch.float64))
 
 
-def test_lamps_of_one_strength_are_measured_alike(lamps, generator):
+def test_point_lights_of_one_strength_are_measured_alike(point_lights, generator):
     mixing = torch.randn(3, 3, generator=generator, dtype=torch.float64)
-    lights = torch.cat([lamps(9), torch.zeros(1, 3, dtype=torch.float64)])  # one photograph empty
+    lights = torch.cat(
+        [point_lights(9), torch.zeros(1, 3, dtype=torch.float64)]
+    )  # one photograph empty
     whole = metric_from_strength(lights @ torch.linalg.inv(mixing)) @ mixing
     assert_close(whole.mT @ whole, torch.eye(3, dtype=torch.float64))
 
@@ -46,8 +48,8 @@ def test_a_relief_is_undone_by_pixels_of_one_albedo(bumpy, generator, shrunk):
 
 
 @pytest.mark.parametrize("shrunk", [0.05, 1.0, 20.0])
-def test_a_relief_is_undone_by_lamps_of_one_strength(bumpy, lamps, shrunk):
-    lights = lamps(12)
+def test_a_relief_is_undone_by_point_lights_of_one_strength(bumpy, point_lights, shrunk):
+    lights = point_lights(12)
     lights[3] *= 1.4  # an outlier
     shading = tilted(bumpy).on_shading(bumpy.columns)
     weight = torch.ones(shading.shape[1], dtype=torch.float64)
@@ -56,31 +58,31 @@ def test_a_relief_is_undone_by_lamps_of_one_strength(bumpy, lamps, shrunk):
     assert_close(found.after(tilted(bumpy)).matrix, torch.eye(3).double(), atol=2e-3, rtol=0)
 
 
-def test_too_few_are_refused(bumpy, lamps):
+def test_too_few_are_refused(bumpy, point_lights):
     weight = torch.zeros(bumpy.columns.shape[1], dtype=torch.float64)
     weight[:5] = 1
     with pytest.raises(InputError, match="5 are given; needed: six"):
         metric_from_albedo(bumpy.columns, weight)
     with pytest.raises(InputError, match="5 are given; needed: six"):
-        metric_from_strength(lamps(5))
+        metric_from_strength(point_lights(5))
     weight[3:] = 0
     with pytest.raises(InputError, match="3 are given; needed: four"):
         relief_from_albedo(bumpy.columns, weight, bumpy.mask)
     with pytest.raises(InputError, match="3 are given; needed: four"):
-        relief_from_strength(lamps(3), bumpy.columns, weight, bumpy.mask)
+        relief_from_strength(point_lights(3), bumpy.columns, weight, bumpy.mask)
 
 
-def test_lamps_on_one_cone_are_refused():
-    turn = torch.linspace(0, 6, 12, dtype=torch.float64)
-    ring = torch.stack([turn.cos(), turn.sin(), -torch.ones_like(turn)], dim=1)
+def test_point_lights_on_one_cone_are_refused():
+    rotation = torch.linspace(0, 6, 12, dtype=torch.float64)
+    ring = torch.stack([rotation.cos(), rotation.sin(), -torch.ones_like(rotation)], dim=1)
     with pytest.raises(InputError, match="on one cone"):
         metric_from_strength(ring)
 
 
 def test_what_no_measure_makes_equal_is_refused(generator):
     # On a hyperboloid x^2 + y^2 - z^2 = 1.
-    turn, height = torch.rand(2, 40, generator=generator, dtype=torch.float64)
+    rotation, height = torch.rand(2, 40, generator=generator, dtype=torch.float64)
     size = (1 + (3 * height) ** 2).sqrt()
-    points = torch.stack([size * (9 * turn).cos(), size * (9 * turn).sin(), 3 * height])
+    points = torch.stack([size * (9 * rotation).cos(), size * (9 * rotation).sin(), 3 * height])
     with pytest.raises(InputError, match="not positive"):
         metric_from_albedo(points, torch.ones(40, dtype=torch.float64))

@@ -7,7 +7,7 @@ from pimper_torch.single_view.factorization.bas_relief import align_reliefs
 from pimper_torch.single_view.photometric_stereo.integrability import (
     curls,
     integrable,
-    turn_to_surface,
+    rotation_to_surface,
     wedge,
 )
 
@@ -85,10 +85,10 @@ def test_depth_edges_are_outliers(bumpy, angles_deg):
 
 
 def test_a_rotation_is_undone_but_for_convex_and_concave(bumpy, generator, angles_deg):
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
-    back = turn_to_surface(turn @ bumpy.columns, even(bumpy), bumpy.mask)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+    back = rotation_to_surface(rotation @ bumpy.columns, even(bumpy), bumpy.mask)
     assert_close(back.mT @ back, torch.eye(3, dtype=torch.float64))
-    found = back @ turn @ bumpy.columns
+    found = back @ rotation @ bumpy.columns
     concave = found * torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
     off = min(angles_deg(one, bumpy.columns).mean() for one in (found, concave))
     assert off < 0.3

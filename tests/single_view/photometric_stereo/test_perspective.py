@@ -4,7 +4,12 @@ from torch.autograd.functional import jvp
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import bumps_in_perspective, lamps, photograph, regions
+from pimper_torch.evidence.scenes.one_view import (
+    bumps_in_perspective,
+    photograph,
+    point_lights,
+    regions,
+)
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.photometric_stereo.perspective import (
@@ -25,7 +30,7 @@ def error_deg(shading, normals):
 
 def seen_in_perspective(generator, noise=0.0, widest_deg=30.0, steepest=1.0):
     normals, mask, intrinsics, _ = bumps_in_perspective(64, generator, steepest=steepest)
-    lights = lamps(12, generator, widest_deg)
+    lights = point_lights(12, generator, widest_deg)
     made = photograph(normals, regions(64, generator), mask, lights, generator, noise)
     return made, intrinsics
 
@@ -75,7 +80,7 @@ def test_a_ball_which_has_two_solutions_is_refused(generator):
     depth = ball.intersect(torch.zeros_like(rays), rays)
     mask = depth < 2.9
     normals = ball.normals(torch.where(mask, depth, 1)[..., None] * rays)
-    lights = lamps(12, generator, 30.0)
+    lights = point_lights(12, generator, 30.0)
     made = photograph(normals, regions(size, generator), mask, lights, generator, 0.002)
     with pytest.raises(InputError, match="second surface"):
         factorize_in_perspective(made.images, mask, intrinsics, lit(made))
@@ -111,11 +116,11 @@ def test_oblong_and_skewed_pixels_are_followed(generator):
     change = torch.tensor([[1.0, 0.2, 3.0], [0.0, 0.7, -5.0], [0.0, 0.0, 1.0]]).double()
     # Rays K^-1 u of the new camera are change^-1 of the old, normals turn by its transpose.
     oblong = intrinsics @ change
-    turned = torch.nn.functional.normalize(change.mT @ made.normals, dim=0)
-    assert error_deg(turned, made.normals) > 1
+    rotated = torch.nn.functional.normalize(change.mT @ made.normals, dim=0)
+    assert error_deg(rotated, made.normals) > 1
     shading, _ = factorize_in_perspective(made.images, made.mask, oblong)
     # Lights turn by the inverse, and images stay the product: the truth for the new camera.
-    assert error_deg(shading, turned) < 0.2
+    assert error_deg(shading, rotated) < 0.2
 
 
 def test_dtype_and_pixels_without_enough_views(generator):

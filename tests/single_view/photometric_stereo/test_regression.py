@@ -28,8 +28,8 @@ def test_what_has_no_weight_does_not_matter_not_even_when_it_is_no_number(genera
         assert_close(lights @ found, radiance)
 
 
-def test_shadows_and_highlights_lose_their_weight(bumpy, lamps, generator, angles_deg):
-    lights = lamps(16, spread=1.5)
+def test_shadows_and_highlights_lose_their_weight(bumpy, point_lights, generator, angles_deg):
+    lights = point_lights(16, spread=1.5)
     exact = lights @ bumpy.columns
     assert (exact < 0).double().mean() > 0.05  # attached shadows there are
     radiance = exact.clamp_min(0)
@@ -48,8 +48,8 @@ def test_shadows_and_highlights_lose_their_weight(bumpy, lamps, generator, angle
     )
 
 
-def test_lights_from_behind_are_no_measurements(bumpy, lamps, angles_deg):
-    lights = lamps(16, spread=1.5)
+def test_lights_from_behind_are_no_measurements(bumpy, point_lights, angles_deg):
+    lights = point_lights(16, spread=1.5)
     radiance = (lights @ bumpy.columns).clamp_min(0)
     found = regress(radiance, torch.ones_like(radiance), lights)
     enough, spanned = determined(found.weight, lights)
@@ -57,8 +57,10 @@ def test_lights_from_behind_are_no_measurements(bumpy, lamps, angles_deg):
     assert (found.weight[radiance == 0] == 0).all()
 
 
-def test_a_base_that_all_views_share_is_found_beside_the_lamps(bumpy, lamps, generator):
-    lights = lamps(14)
+def test_a_base_that_all_views_share_is_found_beside_the_point_lights(
+    bumpy, point_lights, generator
+):
+    lights = point_lights(14)
     base = 0.1 + 0.3 * torch.rand(bumpy.columns.shape[1], generator=generator, dtype=torch.float64)
     radiance = (lights @ bumpy.columns).clamp_min(0) + base
     lit = ((lights @ bumpy.columns) > 0).sum(dim=0) >= 6

@@ -74,8 +74,8 @@ def test_lorentz_transformations_leave_the_span_of_nine(bumpy, patchwork):
     assert (normals - bumpy.columns).abs().mean() > 0.1
 
 
-def test_lamps_from_all_sides_come_near_to_four_harmonics(bumpy, angles_deg):
-    # Lamps over the viewer's half ball, evenly; 20 % of the samples lie in attached shadow.
+def test_point_lights_from_all_sides_come_near_to_four_harmonics(bumpy, angles_deg):
+    # Point lights over the viewer's half ball, evenly; 20 % of the samples lie in attached shadow.
     index = torch.arange(40, dtype=torch.float64) + 0.5
     cosine, around = 1 - index / 40, index * 2.39996
     sine = (1 - cosine**2).sqrt()

@@ -23,8 +23,10 @@ def photographed(scene, lights, albedo, colours=COLOURS):
         ("integrability", "equal_strength"),
     ],
 )
-def test_lamps_of_one_strength_are_enough(bumpy, lamps, patchwork, angles_deg, method, resolve):
-    lights = 1.3 * lamps(16, spread=0.5)
+def test_point_lights_of_one_strength_are_enough(
+    bumpy, point_lights, patchwork, angles_deg, method, resolve
+):
+    lights = 1.3 * point_lights(16, spread=0.5)
     images, lit = photographed(bumpy, lights, patchwork(bumpy))
     known = lights if method == "calibrated" else None
     found = photometric_stereo(images, bumpy.mask, method=method, resolve=resolve, lights=known)
@@ -44,8 +46,10 @@ def test_lamps_of_one_strength_are_enough(bumpy, lamps, patchwork, angles_deg, m
 @pytest.mark.parametrize(
     ("method", "resolve"), [("hayakawa", "equal_albedo"), ("integrability", "equal_albedo")]
 )
-def test_pixels_of_one_albedo_are_enough(bumpy, lamps, generator, angles_deg, method, resolve):
-    lights = lamps(12, spread=0.5) * (
+def test_pixels_of_one_albedo_are_enough(
+    bumpy, point_lights, generator, angles_deg, method, resolve
+):
+    lights = point_lights(12, spread=0.5) * (
         0.5 + torch.rand(12, 1, generator=generator, dtype=torch.float64)
     )
     images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
@@ -53,8 +57,10 @@ def test_pixels_of_one_albedo_are_enough(bumpy, lamps, generator, angles_deg, me
     assert angles_deg(found.normals[bumpy.mask].mT, bumpy.columns).mean() < 0.7
 
 
-def test_black_shadows_are_left_out_by_visibility_subspaces(bumpy, lamps, patchwork, angles_deg):
-    lights = 1.3 * lamps(16, spread=0.5)
+def test_black_shadows_are_left_out_by_visibility_subspaces(
+    bumpy, point_lights, patchwork, angles_deg
+):
+    lights = 1.3 * point_lights(16, spread=0.5)
     images, lit = photographed(bumpy, lights, patchwork(bumpy))
     cast = torch.zeros_like(images[:, :1], dtype=torch.bool)
     cast[2:6, :, 10:26, 8:30] = True  # an object that is not seen throws it
@@ -75,8 +81,8 @@ def test_black_shadows_are_left_out_by_visibility_subspaces(bumpy, lamps, patchw
     assert runs[True].lit[:, bumpy.mask][dark].double().mean() < 0.01
 
 
-def test_without_knowledge_a_convention_is_taken_and_named(ball, lamps, angles_deg):
-    lights = lamps(12, spread=0.5)
+def test_without_knowledge_a_convention_is_taken_and_named(ball, point_lights, angles_deg):
+    lights = point_lights(12, spread=0.5)
     images, _ = photographed(ball, lights, torch.ones(ball.columns.shape[1]).double())
     found = photometric_stereo(images, ball.mask, method="integrability", resolve="rounded")
     assert "bas-relief" in found.free
@@ -98,8 +104,10 @@ def test_soft_light_is_explained_by_harmonics(bumpy, patchwork, generator, angle
     assert ratio.std() < 0.05 * ratio.mean()
 
 
-def test_what_is_missing_may_be_no_number_or_without_weight(bumpy, lamps, generator, angles_deg):
-    lights = lamps(14, spread=0.3)
+def test_what_is_missing_may_be_no_number_or_without_weight(
+    bumpy, point_lights, generator, angles_deg
+):
+    lights = point_lights(14, spread=0.3)
     images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
     gone = torch.rand(14, 56, 56, generator=generator) < 0.2
     weight = torch.where(torch.rand(14, 56, 56, generator=generator) < 0.2, 0.0, 1.0).double()
@@ -114,8 +122,8 @@ def test_what_is_missing_may_be_no_number_or_without_weight(bumpy, lamps, genera
     assert blind.valid[bumpy.mask].double().mean() > 0.9
 
 
-def test_a_view_without_samples_is_told_and_has_no_light(bumpy, lamps):
-    lights = lamps(9, spread=0.3)
+def test_a_view_without_samples_is_told_and_has_no_light(bumpy, point_lights):
+    lights = point_lights(9, spread=0.3)
     images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
     images[4] = torch.nan
     for method in ("calibrated", "hayakawa"):
@@ -154,15 +162,15 @@ def test_pixels_that_cannot_be_determined_say_why():
     assert (found.normals[0, 4] == 0).all()
 
 
-def test_results_have_the_dtype_of_the_images(bumpy, lamps):
-    lights = lamps(9)
+def test_results_have_the_dtype_of_the_images(bumpy, point_lights):
+    lights = point_lights(9)
     images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
     found = photometric_stereo(images.float(), bumpy.mask, method="hayakawa")
     assert found.normals.dtype == found.albedo.dtype == found.lights.dtype == torch.float32
 
 
-def test_impossible_requests_are_refused(bumpy, lamps):
-    lights = lamps(6)
+def test_impossible_requests_are_refused(bumpy, point_lights):
+    lights = point_lights(6)
     images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
 
     def refuse(match, images=images, mask=bumpy.mask, **settings):
@@ -187,8 +195,8 @@ def test_impossible_requests_are_refused(bumpy, lamps):
     refuse("in one plane", lights=lights * torch.tensor([1.0, 0, 1]).double())
 
 
-def test_every_method_needs_what_it_says(bumpy, lamps):
-    images, _ = photographed(bumpy, lamps(9), torch.ones(bumpy.columns.shape[1]).double())
+def test_every_method_needs_what_it_says(bumpy, point_lights):
+    images, _ = photographed(bumpy, point_lights(9), torch.ones(bumpy.columns.shape[1]).double())
     for name, method in METHODS.items():
         few = method.unknowns - 1
         with pytest.raises(InputError, match="photographs have samples"):
@@ -196,6 +204,6 @@ def test_every_method_needs_what_it_says(bumpy, lamps):
                 images[:few],
                 bumpy.mask,
                 method=name,
-                lights=lamps(few) if method.calibrated else None,
+                lights=point_lights(few) if method.calibrated else None,
                 intrinsics=torch.eye(3).double() if method.perspective else None,
             )

@@ -3,14 +3,14 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import ball, lamps, photograph, regions
+from pimper_torch.evidence.scenes.one_view import ball, photograph, point_lights, regions
 from pimper_torch.single_view.photometric_stereo.visibility_subspaces import (
     _common_lights,
     find_subspaces,
     visibility_subspaces,
 )
 
-# Values nearer to zero than this share of the brightest are on the edge of a shadow.
+# Values nearer to zero than this fraction of the brightest are on the edge of a shadow.
 EDGE = 0.05
 
 
@@ -21,7 +21,7 @@ def generator():
 
 def shadowed(generator, noise=0.0, views=12):
     normals, mask = ball(56)
-    lights = lamps(views, generator, 60.0)
+    lights = point_lights(views, generator, 60.0)
     made = photograph(normals, regions(56, generator), mask, lights, generator, noise)
     product = made.lights @ made.shading
     enough = (product > EDGE * product.max()).sum(dim=0) >= 5
@@ -73,7 +73,7 @@ def test_values_that_are_too_bright_are_left_out(generator):
     assert (found != truth)[others].double().mean() < 0.005
 
 
-def test_pixels_of_one_subspace_share_their_lamps(generator):
+def test_pixels_of_one_subspace_share_their_point_lights(generator):
     made, truth, clear = shadowed(generator)
     found = find_subspaces(made.images, made.mask, generator)
     sizes = torch.bincount(found.subspace[found.subspace >= 0])
@@ -92,8 +92,8 @@ def test_common_lights_join_subspaces_that_share_four_views(generator):
     visibility[[0, 3], 2] = False
     bases = []
     for lit in visibility.mT:
-        turn = torch.randn(3, 3, generator=generator, dtype=torch.float64)
-        bases.append(torch.linalg.qr(lights * lit[:, None] @ turn).Q)
+        rotation = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+        bases.append(torch.linalg.qr(lights * lit[:, None] @ rotation).Q)
     found, covered = _common_lights(bases, visibility, torch.ones(3).double())
     assert covered.all()
     assert apart(found, lights) < 1e-7

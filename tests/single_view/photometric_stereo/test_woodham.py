@@ -8,8 +8,8 @@ COLOURS = torch.tensor([0.9, 0.5, 0.2], dtype=torch.float64)
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_colours_share_their_normal(bumpy, lamps, patchwork, angles_deg, robust):
-    lights = 1.7 * lamps(12, spread=0.3)
+def test_colours_share_their_normal(bumpy, point_lights, patchwork, angles_deg, robust):
+    lights = 1.7 * point_lights(12, spread=0.3)
     albedo = COLOURS[:, None] * patchwork(bumpy)
     shade = lights @ bumpy.columns
     lit = (shade > 0).all(dim=0)
@@ -20,8 +20,8 @@ def test_colours_share_their_normal(bumpy, lamps, patchwork, angles_deg, robust)
     assert (found.ambient == 0).all()
 
 
-def test_the_colour_that_says_most_counts_most(bumpy, lamps, generator, angles_deg):
-    lights = lamps(12, spread=0.3)
+def test_the_colour_that_says_most_counts_most(bumpy, point_lights, generator, angles_deg):
+    lights = point_lights(12, spread=0.3)
     albedo = torch.tensor([0.9, 0.05, 0.05], dtype=torch.float64)[:, None]
     shade = lights @ bumpy.columns
     noise = 0.02 * torch.randn(12, 3, shade.shape[1], generator=generator, dtype=torch.float64)
@@ -33,8 +33,8 @@ def test_the_colour_that_says_most_counts_most(bumpy, lamps, generator, angles_d
     assert off < 0.7 * angles_deg(of_gray.normals, bumpy.columns).mean()
 
 
-def test_ambient_light_is_told_from_the_lamp(bumpy, lamps, patchwork, angles_deg):
-    lights = lamps(12, spread=0.3)
+def test_ambient_light_is_told_from_the_point_light(bumpy, point_lights, patchwork, angles_deg):
+    lights = point_lights(12, spread=0.3)
     albedo = COLOURS[:, None] * patchwork(bumpy)
     shade = lights @ bumpy.columns
     lit = (shade > 0).all(dim=0)
@@ -47,8 +47,8 @@ def test_ambient_light_is_told_from_the_lamp(bumpy, lamps, patchwork, angles_deg
     assert angles_deg(without.normals, bumpy.columns)[lit].mean() > 2
 
 
-def test_a_black_pixel_has_no_normal(lamps):
-    lights = lamps(5)
+def test_a_black_pixel_has_no_normal(point_lights):
+    lights = point_lights(5)
     found = calibrated_stereo(
         torch.zeros(5, 3, 2, dtype=torch.float64), torch.ones(5, 2, dtype=torch.float64), lights
     )

@@ -3,7 +3,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from pimper_torch.geometry.lattice import Lattice, subdivide, transferred
+from pimper_torch.geometry.subdivision import Subdivision, subdivide, transferred
 from pimper_torch.geometry.surfaces import face_normals
 
 
@@ -52,12 +52,12 @@ SCENES = {
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
-def test_the_lattice_has_the_topology_of_the_coarse_mesh(scene):
+def test_the_subdivided_mesh_has_the_topology_of_the_coarse_mesh(scene):
     vertices, facets, length = scene
-    lattice = subdivide(vertices, facets, all_spacings(facets, length))
-    assert lattice.faces.unique().tolist() == list(range(len(lattice.points)))
-    assert euler(len(lattice.points), lattice.faces) == euler(len(vertices), facets)
-    _, counts = edge_counts(lattice.faces)
+    subdivision = subdivide(vertices, facets, all_spacings(facets, length))
+    assert subdivision.faces.unique().tolist() == list(range(len(subdivision.points)))
+    assert euler(len(subdivision.points), subdivision.faces) == euler(len(vertices), facets)
+    _, counts = edge_counts(subdivision.faces)
     assert counts.max() <= 2
     if edge_counts(facets)[1].min() == 2:
         assert counts.min() == 2
@@ -67,25 +67,28 @@ def test_the_lattice_has_the_topology_of_the_coarse_mesh(scene):
             ends, number = edge_counts(faces)
             return (points[ends[number == 1]].diff(dim=1)).norm(dim=-1).sum()
 
-        assert_close(rim(lattice.points, lattice.faces), rim(vertices, facets))
+        assert_close(rim(subdivision.points, subdivision.faces), rim(vertices, facets))
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
 def test_no_face_is_turned_and_areas_add_up(scene):
     vertices, facets, length = scene
-    lattice = subdivide(vertices, facets, all_spacings(facets, length))
-    normals, whole = face_normals(lattice.points, lattice.faces), face_normals(vertices, facets)
-    along = torch.nn.functional.normalize(whole, dim=-1)[lattice.face_facet]
+    subdivision = subdivide(vertices, facets, all_spacings(facets, length))
+    normals, whole = (
+        face_normals(subdivision.points, subdivision.faces),
+        face_normals(vertices, facets),
+    )
+    along = torch.nn.functional.normalize(whole, dim=-1)[subdivision.face_facet]
     assert ((normals * along).sum(-1) > 1e-6 * length**2).all()
-    areas = whole.new_zeros(len(facets)).index_add(0, lattice.face_facet, normals.norm(dim=-1))
+    areas = whole.new_zeros(len(facets)).index_add(0, subdivision.face_facet, normals.norm(dim=-1))
     assert_close(areas, whole.norm(dim=-1))
 
 
 def test_edges_are_about_one_spacing_long_where_facets_are_well_shaped():
     vertices, facets = icosphere()
-    lattice = subdivide(vertices, facets, all_spacings(facets, 0.05))
-    edges, _ = edge_counts(lattice.faces)
-    lengths = lattice.points[edges].diff(dim=1).norm(dim=-1)
+    subdivision = subdivide(vertices, facets, all_spacings(facets, 0.05))
+    edges, _ = edge_counts(subdivision.faces)
+    lengths = subdivision.points[edges].diff(dim=1).norm(dim=-1)
     assert 0.9 < float(lengths.median()) / 0.05 < 1.1
     assert float(lengths.max()) < 2 * 0.05
 
@@ -94,37 +97,37 @@ def test_a_narrow_facet_has_no_more_points_than_its_area_asks_for():
     spacing = 0.005
     for height in (1.0, 0.3, 0.1, 0.03):
         corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.4, height, 0]], dtype=torch.float64)
-        lattice = subdivide(corners, torch.tensor([[0, 1, 2]]), corners.new_tensor([spacing]))
+        subdivision = subdivide(corners, torch.tensor([[0, 1, 2]]), corners.new_tensor([spacing]))
         asked = height / 2 / spacing**2
-        assert 0.9 * asked < len(lattice.points) < 2.3 * asked  # 2, and the rim
+        assert 0.9 * asked < len(subdivision.points) < 2.3 * asked  # 2, and the rim
 
 
 def test_an_edge_follows_the_finer_of_its_facets():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    lattice = subdivide(vertices, facets, torch.tensor([0.05, 0.5], dtype=torch.float64))
-    coordinate = lattice.points[:, 0]
-    on_diagonal = (lattice.points[:, 0] - lattice.points[:, 1]).abs() < 1e-9
-    on_top = lattice.points[:, 1] > 1 - 1e-9
+    subdivision = subdivide(vertices, facets, torch.tensor([0.05, 0.5], dtype=torch.float64))
+    coordinate = subdivision.points[:, 0]
+    on_diagonal = (subdivision.points[:, 0] - subdivision.points[:, 1]).abs() < 1e-9
+    on_top = subdivision.points[:, 1] > 1 - 1e-9
     assert on_diagonal.sum() == 29  # sqrt(2) / 0.05 pieces
     assert on_top.sum() == 3
     assert coordinate.isfinite().all()
-    edges, counts = edge_counts(lattice.faces)
+    edges, counts = edge_counts(subdivision.faces)
     inside = ~(counts == 1)
-    middle = lattice.points[edges].mean(dim=1)
-    rim = (middle[:, :2].min(dim=1).values < 1e-9) | (middle[:, :2].max(dim=1).values > 1 - 1e-9)
+    centre = subdivision.points[edges].mean(dim=1)
+    rim = (centre[:, :2].min(dim=1).values < 1e-9) | (centre[:, :2].max(dim=1).values > 1 - 1e-9)
     assert (inside == ~rim).all()
 
 
 def test_every_vertex_lies_where_its_facet_and_coordinates_say():
     vertices, facets = ragged_fan()
-    lattice = subdivide(vertices, facets, all_spacings(facets, 0.05))
-    assert_close(lattice.interpolate(vertices, facets), lattice.points)
-    assert_close(lattice.barycentric.sum(dim=1), torch.ones(len(lattice.points)).double())
-    assert (lattice.barycentric >= 0).all()
+    subdivision = subdivide(vertices, facets, all_spacings(facets, 0.05))
+    assert_close(subdivision.interpolate(vertices, facets), subdivision.points)
+    assert_close(subdivision.barycentric.sum(dim=1), torch.ones(len(subdivision.points)).double())
+    assert (subdivision.barycentric >= 0).all()
     for corner in range(3):  # a face's corners lie in the closed triangle of its facet
-        points = lattice.points[lattice.faces[:, corner]]
-        a, b, c = vertices[facets[lattice.face_facet]].unbind(dim=1)
+        points = subdivision.points[subdivision.faces[:, corner]]
+        a, b, c = vertices[facets[subdivision.face_facet]].unbind(dim=1)
         normal = torch.linalg.cross(b - a, c - a)
         assert ((points - a) * normal).sum(-1).abs().max() < 1e-12
         for start, end in ((a, b), (b, c), (c, a)):
@@ -135,29 +138,29 @@ def test_every_vertex_lies_where_its_facet_and_coordinates_say():
 def test_vertices_the_coarse_mesh_does_not_use_are_left_out():
     vertices, facets = icosphere(0)
     more = torch.cat([torch.full((2, 3), 9.0, dtype=torch.float64), vertices])
-    lattice = subdivide(more, facets + 2, all_spacings(facets, 0.3))
-    assert lattice.points.abs().max() <= 1
-    assert isinstance(lattice, Lattice)
+    subdivision = subdivide(more, facets + 2, all_spacings(facets, 0.3))
+    assert subdivision.points.abs().max() <= 1
+    assert isinstance(subdivision, Subdivision)
 
 
 def test_points_carry_gradients_to_the_coarse_mesh():
     vertices, facets = icosphere(0)
     vertices = vertices.clone().requires_grad_()
-    lattice = subdivide(vertices, facets, all_spacings(facets, 0.5))
-    lattice.points.sum().backward()
+    subdivision = subdivide(vertices, facets, all_spacings(facets, 0.5))
+    subdivision.points.sum().backward()
     assert vertices.grad is not None
-    assert_close(vertices.grad.sum(), torch.tensor(3.0 * len(lattice.points)).double())
+    assert_close(vertices.grad.sum(), torch.tensor(3.0 * len(subdivision.points)).double())
 
 
-def test_what_is_smooth_is_transferred_from_a_coarser_lattice_over_the_same_facets():
+def test_what_is_smooth_is_transferred_from_a_coarser_subdivided_mesh_over_the_same_facets():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
     fine, rough = (
         subdivide(corners, facets, torch.full((2,), side).double()) for side in (0.02, 0.04)
     )
 
-    def wave(lattice):
-        return 1 + torch.sin(3 * lattice.points[:, 0]) * lattice.points[:, 1]
+    def wave(subdivision):
+        return 1 + torch.sin(3 * subdivision.points[:, 0]) * subdivision.points[:, 1]
 
     off = transferred(wave(rough), rough, fine) - wave(fine)
     assert off.abs().max() < 3.2 * 0.04 / 2  # the slope, over half a spacing

@@ -5,7 +5,7 @@ from torch.testing import assert_close
 
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.fusion.contacts import Ground, cloud_points, contour_tangents, passing
-from pimper_torch.fusion.evidence import (
+from pimper_torch.fusion.terms import (
     Common,
     kept_slopes,
     kept_steps,
@@ -13,7 +13,7 @@ from pimper_torch.fusion.evidence import (
     swept_heights,
     upright,
 )
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.records import ContourPoints, FacetPoints
 
@@ -31,7 +31,7 @@ def generator() -> torch.Generator:
 
 
 @pytest.fixture
-def lattice():
+def subdivision():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
     return subdivide(corners, facets, torch.full((2,), 0.1, dtype=torch.float64))
@@ -45,45 +45,45 @@ def paraboloid(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return height, torch.cat([-slope, torch.ones_like(slope[:, :1])], dim=1)
 
 
-def test_slopes_of_a_smooth_surface_are_met_by_it_and_by_no_other(lattice):
-    height, normals = paraboloid(lattice.points)
+def test_slopes_of_a_smooth_surface_are_met_by_it_and_by_no_other(subdivision):
+    height, normals = paraboloid(subdivision.points)
     along = UP.expand(len(height), 3)
-    edges = face_edges(lattice.faces)[0]
+    edges = face_edges(subdivision.faces)[0]
     ones = torch.ones_like(height)
-    found = slopes(edges, lattice.points, along, normalize(normals, dim=1), 1e-4 * ones)
+    found = slopes(edges, subdivision.points, along, normalize(normals, dim=1), 1e-4 * ones)
     # The mean of unit normals is that of slopes to third order in the edge's length.
     assert found.residual(height).abs().max() < 1e-4
     assert_close(found.residual(height + 0.7), found.residual(height), rtol=0, atol=1e-3)
     assert found.residual(1.1 * height).abs().median() > 1e-3
 
 
-def test_an_angles_error_moves_an_edges_end_by_its_length(lattice):
-    along = UP.expand(len(lattice.points), 3)
-    edges = face_edges(lattice.faces)[0]
-    variance = torch.full_like(lattice.points[:, 0], 4e-4)
-    found = slopes(edges, lattice.points, along, along, variance)
-    length = (lattice.points[edges[:, 1]] - lattice.points[edges[:, 0]]).norm(dim=1)
+def test_an_angles_error_moves_an_edges_end_by_its_length(subdivision):
+    along = UP.expand(len(subdivision.points), 3)
+    edges = face_edges(subdivision.faces)[0]
+    variance = torch.full_like(subdivision.points[:, 0], 4e-4)
+    found = slopes(edges, subdivision.points, along, along, variance)
+    length = (subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]]).norm(dim=1)
     assert_close(1 / found.information, 4e-4 * length.square())
     common = Common(variance=variance[0] / 2, count=torch.full_like(variance, 6.0))
-    together = slopes(edges, lattice.points, along, along, variance, common)
+    together = slopes(edges, subdivision.points, along, along, variance, common)
     assert_close(together.information, found.information / 4)
     # Each edge errs by its own variance and the common one: 1.5 of the 4.
     assert_close(together.correlated, torch.full_like(length, 4.0 / 1.5))
 
 
-def test_kept_slopes_are_those_of_the_surface_there_is(lattice, generator):
-    height = torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
+def test_kept_slopes_are_those_of_the_surface_there_is(subdivision, generator):
+    height = torch.rand(len(subdivision.points), generator=generator, dtype=torch.float64)
     along = UP.expand(len(height), 3)
-    edges = face_edges(lattice.faces)[0]
-    found = kept_slopes(edges, lattice.points, along, along, height, 0.01)
+    edges = face_edges(subdivision.faces)[0]
+    found = kept_slopes(edges, subdivision.points, along, along, height, 0.01)
     assert_close(found.residual(height), torch.zeros(len(edges)).double())
     assert_close(found.residual(height + 3), torch.zeros(len(edges)).double(), rtol=0, atol=1e-12)
     assert not found.judged
 
 
-def test_edges_across_a_contour_are_not_upright(lattice):
-    edges = face_edges(lattice.faces)[0]
-    across = lattice.points[:, 0] - 0.45  # from the contour
+def test_edges_across_a_contour_are_not_upright(subdivision):
+    edges = face_edges(subdivision.faces)[0]
+    across = subdivision.points[:, 0] - 0.45  # from the contour
     along = UP.expand(len(across), 3)
     lean = torch.stack([torch.ones_like(across), 0 * across, across], dim=1)
     both = (lean[edges].sum(dim=1)[:, 2] > 0.25).numpy()  # clearly on this side of it
@@ -92,30 +92,35 @@ def test_edges_across_a_contour_are_not_upright(lattice):
     assert not found[(across[edges] < 0).any(dim=1).numpy() & ~both].any()
     # Neither do normals that face the other way altogether, nor directions that do at one end.
     assert not upright(edges, along, -along).any()
-    turned = along.clone()
-    turned[0] = -UP
-    assert torch.equal(~upright(edges, turned, along), (edges == 0).any(dim=1))
+    rotated = along.clone()
+    rotated[0] = -UP
+    assert torch.equal(~upright(edges, rotated, along), (edges == 0).any(dim=1))
 
 
-def test_kept_steps_are_those_of_the_surface_there_is(lattice, generator):
-    height = torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
-    edges = face_edges(lattice.faces)[0]
-    found = kept_steps(edges, lattice.points, height, 0.01)
+def test_kept_steps_are_those_of_the_surface_there_is(subdivision, generator):
+    height = torch.rand(len(subdivision.points), generator=generator, dtype=torch.float64)
+    edges = face_edges(subdivision.faces)[0]
+    found = kept_steps(edges, subdivision.points, height, 0.01)
     assert_close(found.residual(height + 3), torch.zeros(len(edges)).double(), rtol=0, atol=1e-12)
     assert found.residual(1.1 * height).abs().max() > 0.01
     flat = kept_slopes(
-        edges, lattice.points, UP.expand(len(height), 3), UP.expand(len(height), 3), height, 0.01
+        edges,
+        subdivision.points,
+        UP.expand(len(height), 3),
+        UP.expand(len(height), 3),
+        height,
+        0.01,
     )
     assert_close(found.information, flat.information)
     assert not found.judged
 
 
 def test_offsets_along_slanting_normals_are_longer_along_the_direction():
-    carried = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
+    transferred = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
     offsets = torch.tensor([0.1, 0.1, 0.1], dtype=torch.float64)
     information = torch.tensor([4.0, 4.0, 0.0], dtype=torch.float64)
     facing = torch.tensor([1.0, 0.5, 1.0], dtype=torch.float64)
-    found = swept_heights(carried, offsets, information, facing, 25.0)
+    found = swept_heights(transferred, offsets, information, facing, 25.0)
     assert found.unknowns.flatten().tolist() == [0, 1]
     assert_close(found.targets, torch.tensor([1.1, 1.2], dtype=torch.float64))
     assert_close(found.information, torch.tensor([4.0, 1.0], dtype=torch.float64))
@@ -135,9 +140,9 @@ def test_heights_that_err_alike_know_no_more_together_than_their_common_error_le
     assert_close(1 / (found.information * found.correlated), 1 / (4 * own) + common.variance)
 
 
-def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice, generator):
-    along = normalize(UP + 0.1 * (lattice.points - 0.5), dim=1)  # directions fan out
-    carried = torch.zeros(len(along), dtype=torch.float64)
+def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivision, generator):
+    along = normalize(UP + 0.1 * (subdivision.points - 0.5), dim=1)  # directions fan out
+    transferred = torch.zeros(len(along), dtype=torch.float64)
     xy = 0.1 + 0.8 * torch.rand(40, 2, generator=generator, dtype=torch.float64)
     lift = 0.05 * (torch.rand(40, 1, generator=generator, dtype=torch.float64) - 0.5)
     points = torch.cat([xy, lift], dim=1)
@@ -146,9 +151,9 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
         points_world=points, covariance_world=covariance, facet=torch.zeros(40, dtype=torch.long)
     )
     ground = Ground(
-        places=lattice.points,
-        faces=lattice.faces,
-        heights=carried,
+        places=subdivision.points,
+        faces=subdivision.faces,
+        heights=transferred,
         directions=along,
         reach=1.0,
         finest=1e-9,
@@ -159,10 +164,10 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
     assert_close(found.coefficients, torch.ones(40, 1).double())
     assert_close(found.targets, lift[:, 0], rtol=0.02, atol=1e-4)
     # At the vertex next to it: vertices are 0.1 apart.
-    off = (lattice.points[found.unknowns[:, 0], :2] - xy).norm(dim=1)
+    off = (subdivision.points[found.unknowns[:, 0], :2] - xy).norm(dim=1)
     assert off.max() < 0.1
     # On a surface that leans, what it is lifted by is what it is off by at the point.
-    leaning = lattice.points + (0.3 * lattice.points[:, :1]) * UP
+    leaning = subdivision.points + (0.3 * subdivision.points[:, :1]) * UP
     raised = torch.cat([xy, 0.3 * xy[:, :1] + 0.02], dim=1)
     above = told_of(
         cloud_points,
@@ -177,25 +182,25 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(lattice
     assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())
 
 
-def test_contours_are_planes_that_touch_the_surface(lattice, generator):
+def test_contours_are_planes_that_touch_the_surface(subdivision, generator):
     # A plane that leans; directions that are not at right angles to it.
     slope = 0.3
-    tilted = lattice.points + (slope * lattice.points[:, :1]) * UP
+    tilted = subdivision.points + (slope * subdivision.points[:, :1]) * UP
     normal = normalize(torch.tensor([-slope, 0.0, 1.0]).double(), dim=0)
     along = normalize(torch.tensor([0.2, 0.1, 1.0]).double(), dim=0).expand_as(tilted)
     ground = Ground(
         places=tilted,
-        faces=lattice.faces,
+        faces=subdivision.faces,
         heights=torch.zeros(len(tilted), dtype=torch.float64),
         directions=along,
         reach=1.0,
         finest=1e-9,
     )
-    middle = torch.tensor([0.5, 0.5, 0.15]).double()
+    centre = torch.tensor([0.5, 0.5, 0.15]).double()
     ray = torch.linalg.cross(normal, normalize(torch.randn(3, generator=generator).double(), dim=0))
     # Where on its ray the place is taken does not matter: 0.04 above the plane, all along.
     shifts = 0.2 * (torch.rand(30, 1, generator=generator, dtype=torch.float64) - 0.5)
-    places = middle + 0.04 * normal + shifts * normalize(ray, dim=0)
+    places = centre + 0.04 * normal + shifts * normalize(ray, dim=0)
     contours = ContourPoints(
         points_world=places,
         normals_world=normal.expand(30, 3),
@@ -213,8 +218,8 @@ def test_contours_are_planes_that_touch_the_surface(lattice, generator):
 
 
 @pytest.mark.parametrize("kind", ["slopes", "kept_slopes", "kept_steps", "swept_heights"])
-def test_terms_agree_with_finite_differences(lattice, generator, kind):
-    count, edges = len(lattice.points), face_edges(lattice.faces)[0]
+def test_terms_agree_with_finite_differences(subdivision, generator, kind):
+    count, edges = len(subdivision.points), face_edges(subdivision.faces)[0]
 
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -244,7 +249,7 @@ def test_terms_agree_with_finite_differences(lattice, generator, kind):
         }
 
     inputs = {
-        "flat": lattice.points,
+        "flat": subdivision.points,
         "directions": UP + 0.2 * draw(count, 3),
         "normals": UP + 0.2 * draw(count, 3),
         "heights": draw(count),
@@ -259,10 +264,10 @@ def test_terms_agree_with_finite_differences(lattice, generator, kind):
     assert told >= 3
 
 
-def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(lattice, generator):
-    height = 0.1 * torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
+def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(subdivision, generator):
+    height = 0.1 * torch.rand(len(subdivision.points), generator=generator, dtype=torch.float64)
     along = UP.expand(len(height), 3)
-    places = lattice.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
+    places = subdivision.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
     cloud = FacetPoints(
         points_world=places,
         covariance_world=1e-4 * torch.eye(3).double().expand(len(places), 3, 3),
@@ -271,11 +276,11 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(lattice
 
     def target(x):
         raised = x["heights"] + x["all"]
-        surface = lattice.points + raised[:, None] * along
+        surface = subdivision.points + raised[:, None] * along
         points = cloud.replace(points_world=x["points"])
         ground = Ground(
             places=surface,
-            faces=lattice.faces,
+            faces=subdivision.faces,
             heights=raised,
             directions=along,
             reach=9.0,
@@ -295,9 +300,9 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(lattice
     assert checks["all", "target"].numeric.abs().max() < 1e-6
 
 
-def test_a_contour_stays_where_it_is_as_the_surface_is_raised(lattice, generator):
-    height = 0.1 * torch.rand(len(lattice.points), generator=generator, dtype=torch.float64)
-    places = lattice.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
+def test_a_contour_stays_where_it_is_as_the_surface_is_raised(subdivision, generator):
+    height = 0.1 * torch.rand(len(subdivision.points), generator=generator, dtype=torch.float64)
+    places = subdivision.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
     leaning = UP + 0.2 * torch.randn(places.shape, generator=generator, dtype=torch.float64)
     contours = ContourPoints(
         points_world=places,
@@ -311,8 +316,8 @@ def test_a_contour_stays_where_it_is_as_the_surface_is_raised(lattice, generator
         along = normalize(x["directions"], dim=1)
         raised = x["heights"] + x["all"]
         ground = Ground(
-            places=lattice.points + raised[:, None] * UP,
-            faces=lattice.faces,
+            places=subdivision.points + raised[:, None] * UP,
+            faces=subdivision.faces,
             heights=raised,
             directions=along,
             reach=9.0,

@@ -1,8 +1,8 @@
-"""Barycentric lattices: a coarse triangle mesh subdivided into a dense, conforming one.
+"""Barycentric subdivided meshes: a coarse triangle mesh subdivided into a dense, conforming one.
 
 Every edge of the coarse mesh is cut into as many pieces as its length asks for, and every
-facet carries the triangular lattice of its most finely cut edge. Where another edge has
-fewer pieces, the lattice points on it slide to the nearest cut, and triangles that vanish
+facet carries the triangular subdivided mesh of its most finely cut edge. Where another edge has
+fewer pieces, the subdivided mesh points on it slide to the nearest cut, and triangles that vanish
 thereby are left out. Both facets of an edge so use the same cuts, whatever their sizes.
 
 A long and narrow facet would be far too fine across its length, so the cuts of its edges are
@@ -21,7 +21,7 @@ from pimper_torch.records import Record
 
 # An edge has at most so many times the pieces that it would have if its facet were equilateral,
 # of the same area: those of a half square's diagonal, and at most 2 points a spacing squared,
-# where the equilateral lattice has 1.2.
+# where the equilateral subdivided mesh has 1.2.
 _MAX_PIECES = 1.32
 
 # Vertices that a value is blended from, as many as a face has; and a distance, scene units, at
@@ -30,7 +30,7 @@ _BLENDED, _TOGETHER = 3, 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Lattice(Record):
+class Subdivision(Record):
     """A coarse mesh, subdivided.
 
     Attributes:
@@ -65,7 +65,7 @@ def subdivide(
     vertices: Float[Tensor, "corner 3"],
     facets: Int[Tensor, "facet 3"],
     spacing: Float[Tensor, " facet"],
-) -> Lattice:
+) -> Subdivision:
     """Subdivide a triangle mesh into pieces of about ``spacing``.
 
     Args:
@@ -83,13 +83,14 @@ def subdivide(
     Differentiable in ``vertices`` through ``points``; the cuts are constants.
 
     >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    >>> lattice = subdivide(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.full((2,), 0.5))
-    >>> len(lattice.points), len(lattice.faces)
+    >>> faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    >>> subdivision = subdivide(square, faces, torch.full((2,), 0.5))
+    >>> len(subdivision.points), len(subdivision.faces)
     (12, 14)
     """
     edges, facet_edges = face_edges(facets)
     pieces = _pieces(vertices.detach(), facets, edges, facet_edges, spacing.detach())
-    # Slot 0 opposite to a longest edge: that edge carries the lattice's own cuts, so that
+    # Slot 0 opposite to a longest edge: that edge carries the subdivided mesh's own cuts, so that
     # only two edges ever slide, both counted from slot 0.
     first = pieces[facet_edges].argmax(dim=1)
     slots = (first[:, None] + torch.arange(3, device=first.device)) % 3
@@ -106,9 +107,9 @@ def subdivide(
 
 
 def transferred(
-    values: Float[Tensor, " vertex"], source: Lattice, target: Lattice
+    values: Float[Tensor, " vertex"], source: Subdivision, target: Subdivision
 ) -> Float[Tensor, " asked"]:
-    """Give values known on one lattice at the vertices of another over the same facets.
+    """Give values known on one subdivided mesh at the vertices of another over the same facets.
 
     They are blended from the three nearest vertices, by the inverse of the distance. For what is
     smooth. A constant to autograd but in ``values``.
@@ -118,8 +119,8 @@ def transferred(
     count = min(_BLENDED, len(source.points))
     apart, near = tree.query(asked, k=list(range(1, count + 1)), workers=-1)
     closeness = 1 / torch.from_numpy(apart).clamp_min(_TOGETHER)
-    share = (closeness / closeness.sum(dim=1, keepdim=True)).to(values)
-    return (share * values[torch.from_numpy(near).to(values.device)]).sum(dim=1)
+    fraction = (closeness / closeness.sum(dim=1, keepdim=True)).to(values)
+    return (fraction * values[torch.from_numpy(near).to(values.device)]).sum(dim=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,14 +138,14 @@ class _Cuts:
 
 def _assemble(
     vertices: Float[Tensor, "corner 3"], facets: Int[Tensor, "facet 3"], cuts: _Cuts
-) -> Lattice:
-    """Lay the lattices of all facets, like sizes together, and number their points."""
+) -> Subdivision:
+    """Lay the subdivided meshes of all facets, like sizes together, and number their points."""
     sizes = cuts.pieces[cuts.edge[:, 0]]
     inner_start = cuts.first_inner + _starts((sizes - 1) * (sizes - 2) // 2)
     names, places, owners, faces, owned = [], [], [], [], []
     for size in torch.unique(sizes).tolist():
         members = (sizes == size).nonzero()[:, 0]
-        steps, triangles = _lattice_of(size, device=facets.device)
+        steps, triangles = _subdivision_of(size, device=facets.device)
         slid = _slide(steps, cuts.pieces[cuts.edge[members]], size)
         named = _name(steps, slid, cuts, members, inner_start[members])
         cut = slid[..., 2] / slid[..., 3].clamp_min(1)
@@ -166,7 +167,7 @@ def _assemble(
     points = (barycentric[..., None] * vertices[facets[facet]]).sum(dim=1)
     whole = (face != face.roll(1, dims=1)).all(dim=1)
     renumbered = torch.searchsorted(used, face[whole])
-    return Lattice(
+    return Subdivision(
         points=points,
         facet=facet,
         barycentric=barycentric,
@@ -202,18 +203,18 @@ def _starts(counts: Int[Tensor, " group"]) -> Int[Tensor, " group"]:
     return counts.cumsum(dim=0) - counts
 
 
-def _lattice_of(
+def _subdivision_of(
     size: int, device: torch.device
 ) -> tuple[Int[Tensor, "point 3"], Int[Tensor, "triangle 3"]]:
-    """Give the lattice points of one facet, as steps that add up to ``size``, and its faces."""
+    """Give the vertices of one subdivided facet, as steps that add up to ``size``, and faces."""
     rows, columns = torch.tril_indices(size + 1, size + 1, device=device)
     steps = torch.stack([size - rows, rows - columns, columns], dim=1)
     row, column = torch.tril_indices(size, size, device=device)
     here = row * (row + 1) // 2 + column
     below = (row + 1) * (row + 2) // 2 + column
     upright = torch.stack([here, below, below + 1], dim=1)
-    turned = torch.stack([here, below + 1, here + 1], dim=1)[column < row]
-    return steps, torch.cat([upright, turned])
+    rotated = torch.stack([here, below + 1, here + 1], dim=1)[column < row]
+    return steps, torch.cat([upright, rotated])
 
 
 def _slide(
@@ -224,7 +225,7 @@ def _slide(
     Returns:
         The slots of the edge's two ends, the cut counted from the first of them, and the
         number of pieces; 0 pieces for points inside the facet. A point halfway between two
-        cuts goes towards slot 0: were it to go to the far end, the middle triangle of a
+        cuts goes towards slot 0: were it to go to the far end, the centre triangle of a
         facet with 1, 1 and 2 pieces would be flat.
     """
     edge = torch.full_like(steps[:, 0], -1)

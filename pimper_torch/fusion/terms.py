@@ -1,4 +1,4 @@
-r"""What is known of the surface, as linear equations in the heights of the lattice's vertices.
+r"""The residual terms of the fusion: linear equations in the heights of vertices.
 
 A vertex lies at ``x_v = q_v + h_v d_v``: its place on the flat facet, and the height along its
 direction. Every kind of evidence is a set of equations :math:`\sum_k c_k h_{u_k} = t`, each with
@@ -39,7 +39,7 @@ class Common(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Evidence(Record):
+class Terms(Record):
     """Equations of one kind.
 
     Attributes:
@@ -71,7 +71,7 @@ def slopes(
     normals: Float[Tensor, "vertex 3"],
     variance: Float[Tensor, " vertex"],
     common: Common | None = None,
-) -> Evidence:
+) -> Terms:
     r"""Say that edges are at right angles to the normals at their ends.
 
     :math:`(n_a + n_b) \cdot (x_b - x_a) = 0`, which is exact on a parabola. An error of the
@@ -86,7 +86,7 @@ def slopes(
         common: What neighbours' normals are turned by alike.
     """
     one, other = edges.unbind(dim=1)
-    middle = normalize(normals[one] + normals[other], dim=-1)
+    centre = normalize(normals[one] + normals[other], dim=-1)
     step = flat[other] - flat[one]
     own = (variance[one] + variance[other]) / 2
     each, together = own, own
@@ -94,12 +94,12 @@ def slopes(
         each = own + common.variance
         together = own + common.variance * (common.count[one] + common.count[other]) / 2
     leaning = torch.stack(
-        [-(middle * directions[one]).sum(dim=-1), (middle * directions[other]).sum(dim=-1)], dim=1
+        [-(centre * directions[one]).sum(dim=-1), (centre * directions[other]).sum(dim=-1)], dim=1
     )
-    return Evidence(
+    return Terms(
         unknowns=edges,
         coefficients=leaning,
-        targets=-(middle * step).sum(dim=-1),
+        targets=-(centre * step).sum(dim=-1),
         information=1 / (together * step.square().sum(dim=-1)),
         correlated=together / each,
     )
@@ -115,8 +115,8 @@ def upright(
     Others lie across a contour or a fold as seen along the directions: raising both ends alike
     would turn the edge. Constant.
     """
-    middle = normalize(normals[edges].detach().sum(dim=1), dim=-1)
-    return ((middle[:, None] * directions[edges].detach()).sum(dim=-1) > _UPRIGHT).all(dim=1)
+    centre = normalize(normals[edges].detach().sum(dim=1), dim=-1)
+    return ((centre[:, None] * directions[edges].detach()).sum(dim=-1) > _UPRIGHT).all(dim=1)
 
 
 def kept_slopes(
@@ -124,9 +124,9 @@ def kept_slopes(
     flat: Float[Tensor, "vertex 3"],
     directions: Float[Tensor, "vertex 3"],
     shape: Float[Tensor, "vertex 3"],
-    carried: Float[Tensor, " vertex"],
+    transferred: Float[Tensor, " vertex"],
     variance: float | Float[Tensor, ""],
-) -> Evidence:
+) -> Terms:
     """Say that edges lie as they do on the surface that there is, where light tells nothing.
 
     Args:
@@ -134,12 +134,12 @@ def kept_slopes(
         flat: ``q``.
         directions: ``d``, unit.
         shape: Normals of the surface.
-        carried: Its heights.
+        transferred: Its heights.
         variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
     """
-    found = slopes(edges, flat, directions, shape, variance * torch.ones_like(carried))
+    found = slopes(edges, flat, directions, shape, variance * torch.ones_like(transferred))
     return found.replace(
-        targets=(found.coefficients * carried[edges]).sum(dim=1),
+        targets=(found.coefficients * transferred[edges]).sum(dim=1),
         judged=False,
     )
 
@@ -147,23 +147,23 @@ def kept_slopes(
 def kept_steps(
     edges: Int[Tensor, "edge 2"],
     flat: Float[Tensor, "vertex 3"],
-    carried: Float[Tensor, " vertex"],
+    transferred: Float[Tensor, " vertex"],
     variance: float | Float[Tensor, ""],
-) -> Evidence:
+) -> Terms:
     """Say that heights go on differing as they do, where edges are not upright.
 
     Args:
         edges: Those.
         flat: ``q``.
-        carried: Heights of the surface that there is.
+        transferred: Heights of the surface that there is.
         variance: Of its slopes, squared radians.
     """
     one, other = edges.unbind(dim=1)
     square = (flat[other] - flat[one]).square().sum(dim=-1)
-    return Evidence(
+    return Terms(
         unknowns=edges,
         coefficients=flat.new_tensor([-1.0, 1.0]).expand(len(edges), 2),
-        targets=carried[other] - carried[one],
+        targets=transferred[other] - transferred[one],
         information=1 / (variance * square),
         correlated=torch.ones_like(square),
         judged=False,
@@ -171,17 +171,17 @@ def kept_steps(
 
 
 def swept_heights(
-    carried: Float[Tensor, " vertex"],
+    transferred: Float[Tensor, " vertex"],
     offsets: Float[Tensor, " vertex"],
     information: Float[Tensor, " vertex"],
     facing: Float[Tensor, " vertex"],
     correlated: float,
     common: Common | None = None,
-) -> Evidence:
+) -> Terms:
     """Say where the sweep has the surface.
 
     Args:
-        carried: Heights of the surface that was swept.
+        transferred: Heights of the surface that was swept.
         offsets: Along its normals.
         information: Of the offsets, each vertex's own share; one without says nothing.
         facing: Cosine between normals and directions.
@@ -195,10 +195,10 @@ def swept_heights(
     if common is not None:
         each = each + common.variance
         together = together + common.variance * common.count[known]
-    return Evidence(
+    return Terms(
         unknowns=known[:, None],
         coefficients=torch.ones_like(steep)[:, None],
-        targets=carried[known] + offsets[known] / steep,
+        targets=transferred[known] + offsets[known] / steep,
         information=1 / together,
         correlated=together / each,
     )

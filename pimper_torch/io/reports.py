@@ -12,14 +12,14 @@ from pimper_torch.io.version import installed_version
 from pimper_torch.records import Reconstruction
 
 # What JSON can hold.
-Account = dict[str, object]
+Report = dict[str, object]
 
-# Directions of a light that all samples together see with less than this share of the best seen
+# Directions of a light that all samples together see with less than this fraction of the best seen
 # one are left open.
 _UNDETERMINED = 1e-6
 
 
-def lights_account(result: Reconstruction) -> Account:
+def lights_report(result: Reconstruction) -> Report:
     """Tell the light of every view, for each patch and for all of them together.
 
     Lights are first-order harmonics ``l`` in the world frame: radiance is
@@ -77,8 +77,8 @@ def common_lights(
     mean = (lights * counted[..., None]).sum(dim=0) / counts[:, None].clamp_min(1)
     weight = _determined_by(result)
     known = torch.einsum("pij,pv->vij", weight, counted)
-    pull = torch.einsum("pij,pvj->vi", weight, counted[..., None] * (lights - mean))
-    step = torch.linalg.pinv(known, rtol=_UNDETERMINED, hermitian=True) @ pull[..., None]
+    regularization = torch.einsum("pij,pvj->vi", weight, counted[..., None] * (lights - mean))
+    step = torch.linalg.pinv(known, rtol=_UNDETERMINED, hermitian=True) @ regularization[..., None]
     return (mean + step[..., 0]).to(lights_world), counts.long()
 
 
@@ -117,7 +117,7 @@ def world_lights(
     return torch.cat(facets)[order], torch.cat(lights)[order], torch.cat(determined)[order]
 
 
-def summary_account(result: Reconstruction, about: Mapping[str, object]) -> Account:
+def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Report:
     """Count what went in and came out, and what every stage cost.
 
     Args:
@@ -139,7 +139,7 @@ def summary_account(result: Reconstruction, about: Mapping[str, object]) -> Acco
         "mesh_points": len(result.coarse.mesh.vertices_world),
         "triangles": len(result.coarse.mesh.faces),
         "samples": figures.get("samples"),
-        "missing_share": _finite(figures.get("missing_share", math.nan)),
+        "missing_fraction": _finite(figures.get("missing_fraction", math.nan)),
         "vertices": len(result.mesh.vertices_world),
         "faces": len(result.mesh.faces),
         "seconds": sum(report.seconds for report in result.report),

@@ -27,7 +27,7 @@ from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Record
 from pimper_torch.sfm.tangents import Tangents, plane_homographies
 
-# Share of the median radiance below which the logarithm fades: darker is noise.
+# Fraction of the median radiance below which the logarithm fades: darker is noise.
 _DARK = 0.02
 
 # Pixels from one to the next of those whose median is taken.
@@ -48,7 +48,7 @@ _TRIAL, _HOPELESS = 4, 0.4
 # Bounds of the contrast against the template's.
 _CONTRAST = (0.3, 3.0)
 
-# Share of a patch that a view may lack: padding, masked, saturated.
+# Fraction of a patch that a view may lack: padding, masked, saturated.
 _MAX_LACKING = 0.1
 
 _AT_ONCE = 4096
@@ -113,7 +113,7 @@ def log_pictures(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Sightings(Record):
+class TrackObservations(Record):
     """Where views show points.
 
     Attributes:
@@ -165,7 +165,7 @@ class _Window:
 
 def sight(
     pictures: Pictures, cameras: Cameras, tangents: Tangents, settings: SightingSettings
-) -> Sightings:
+) -> TrackObservations:
     """Find points in all views that may show them.
 
     A point's place in its reference view is where the cameras put it: there the template is
@@ -207,7 +207,7 @@ def sight(
         view_ = torch.cat([view_, tangents.reference[own]])
         pixels = torch.cat([pixels, _own(tangents, cameras)[own]])
         order = torch.argsort(point * len(pictures.log) + view_)
-        return Sightings(point=point[order], view=view_[order], pixels=pixels[order])
+        return TrackObservations(point=point[order], view=view_[order], pixels=pixels[order])
 
 
 def _templates(
@@ -368,8 +368,8 @@ def _shifted(
     homographies: Float[Tensor, "point 3 3"], shift: Float[Tensor, "point 2"]
 ) -> Float[Tensor, "point 3 3"]:
     """Begin the plane's steps elsewhere."""
-    middle = homographies[:, :, 2] + (homographies[:, :, :2] @ shift[..., None])[..., 0]
-    return torch.cat([homographies[:, :, :2], middle[..., None]], dim=2)
+    centre = homographies[:, :, 2] + (homographies[:, :, :2] @ shift[..., None])[..., 0]
+    return torch.cat([homographies[:, :, :2], centre[..., None]], dim=2)
 
 
 def _own(tangents: Tangents, cameras: Cameras) -> Float[Tensor, "point 2"]:
@@ -387,8 +387,8 @@ def _complete(
 ) -> Bool[Tensor, " point"]:
     """Tell whose patches a view shows nearly all of."""
     lacking = _look_up(unusable.float(), homographies, window, mode="nearest", outside=1.0)
-    share = (lacking * window.root.square()).sum(dim=1) / window.total
-    return share <= _MAX_LACKING
+    fraction = (lacking * window.root.square()).sum(dim=1) / window.total
+    return fraction <= _MAX_LACKING
 
 
 def _look_up(

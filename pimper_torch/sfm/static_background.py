@@ -23,8 +23,8 @@ _CLEARLY = 4.0
 # Of the moving matches. Simulated with 0.2 px of noise: 0.00 in rigid scenes; before a room at
 # rest 0.2 with the camera 2 degrees over the table's plane, 0.5 from 10, 0.8 from 25.
 _CONTRADICTION = 0.1
-# Of the fit: in simulation the share of violations changes by 0.01 at most after 5.
-_ROUNDS = 5
+# Of the fit: in simulation the fraction of violations changes by 0.01 at most after 5.
+_ITERATIONS = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -43,31 +43,31 @@ class Pair(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Rest(Record):
+class StaticBackground(Record):
     """What is at rest in photographs.
 
     Attributes:
         features: True for those of a room at rest, one tensor a photograph.
-        still_share: Of all matches, those whose features lie at the same pixel.
+        still_fraction: Of all matches, those whose features lie at the same pixel.
         moving_pairs: Pairs with still matches in which others move by one epipolar geometry.
-        violating_share: Of the moving matches in those, the ones that no geometry explains
+        violating_fraction: Of the moving matches in those, the ones that no geometry explains
             together with the still ones; 0 without such pairs.
     """
 
     features: tuple[Bool[Tensor, " _"], ...]
-    still_share: float
+    still_fraction: float
     moving_pairs: int
-    violating_share: float
+    violating_fraction: float
 
     @property
     def room(self) -> bool:
         """True where something is at rest while something else moves."""
-        return self.violating_share > _CONTRADICTION
+        return self.violating_fraction > _CONTRADICTION
 
     @property
     def nothing_moves(self) -> bool:
         """True where most matches are still, and nowhere do enough others move."""
-        return self.still_share > 0.5 and self.moving_pairs == 0
+        return self.still_fraction > 0.5 and self.moving_pairs == 0
 
 
 Keypoints = Sequence[Float[Tensor, "_ 2"]]  # one length a photograph
@@ -75,7 +75,7 @@ Ends = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ 2"]]  # of matches, in two p
 Verify = Callable[[Pair], Bool[Tensor, " match"]]
 
 
-def find_rest(
+def find_static_background(
     keypoints: Keypoints,
     pairs: Iterable[Pair],
     verify: Verify,
@@ -83,7 +83,7 @@ def find_rest(
     still_px: float,
     max_error_px: float,
     fewest: int,
-) -> Rest:
+) -> StaticBackground:
     """Tell features of a room at rest from those of what moves.
 
     Each pair that has both still matches and moving ones that one epipolar geometry explains
@@ -122,17 +122,17 @@ def find_rest(
         num_violating += int((sampson_errors(geometry, *ends) > max_error_px).sum())
         _count(votes, resting, 1)
         _count(votes, moving, -1)
-    share = num_violating / max(num_moving, 1)
-    return Rest(
-        features=tuple((one > 0) & (share > _CONTRADICTION) for one in votes),
-        still_share=num_still / max(num_matches, 1),
+    fraction = num_violating / max(num_moving, 1)
+    return StaticBackground(
+        features=tuple((one > 0) & (fraction > _CONTRADICTION) for one in votes),
+        still_fraction=num_still / max(num_matches, 1),
         moving_pairs=moving_pairs,
-        violating_share=share,
+        violating_fraction=fraction,
     )
 
 
 def moving_matches(
-    keypoints: Keypoints, pair: Pair, rest: Rest, still_px: float
+    keypoints: Keypoints, pair: Pair, rest: StaticBackground, still_px: float
 ) -> Bool[Tensor, " match"]:
     """Mark matches that are neither still nor of a feature at rest."""
     first, second = pair.matches.unbind(dim=1)
@@ -161,7 +161,7 @@ def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Float[Ten
     count = torch.tensor([len(still[0]), len(moving[0])])
     even = (1 / count.double()).repeat_interleave(count)
     geometry = fundamental_matrix(first, second, even)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         error = sampson_errors(geometry, first, second)
         slope = _slope(geometry, first, second)
         weight = even / (slope * (1 + (error / max_error_px).square()))

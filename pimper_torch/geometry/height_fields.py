@@ -1,6 +1,6 @@
-"""Height fields on templates: looking values up, and where rays meet the relief.
+"""Height fields on templates: looking values up, and where rays meet the height field.
 
-A relief is a depth z for every sample of a raster in the patch frame. Sample (row i,
+A height field is a depth z for every sample of a raster in the patch frame. Sample (row i,
 column j) lies at ``x = origin_x + j spacing``, ``y = origin_y + i spacing``, so counting
 from the first sample's centre is :func:`~pimper_torch.geometry.pixels.indices_from_pixels`
 already undone. Rasters have at least two samples a side.
@@ -17,7 +17,7 @@ from torch.nn.functional import pad
 # a row of samples must not miss because rounding put it a hair beside the row.
 _NEGLIGIBLE_WEIGHT = 1e-4
 
-# A ray has met the relief when it passes this close, in sample spacings.
+# A ray has met the height field when it passes this close, in sample spacings.
 _TOUCHING = 0.02
 
 
@@ -59,7 +59,7 @@ def sample_raster(
     return torch.where(total > 0, blend / torch.where(total > 0, total, 1), 0)
 
 
-def intersect_relief(
+def intersect_height_field(
     depth: Float[Tensor, "patch height width"],
     valid: Bool[Tensor, "patch height width"],
     origin: Float[Tensor, "patch 2"],
@@ -68,26 +68,26 @@ def intersect_relief(
     ray_directions: Float[Tensor, "patch ray 3"],
     steps: int = 3,
 ) -> tuple[Float[Tensor, "patch ray 3"], Bool[Tensor, "patch ray"]]:
-    r"""Find where rays meet the relief ``z = depth(x, y)``, bilinear between samples.
+    r"""Find where rays meet the height field ``z = depth(x, y)``, bilinear between samples.
 
     From the point on the plane z = 0, Newton's steps on
     :math:`f(t) = o_z + t d_z - \mathrm{depth}(o_{xy} + t d_{xy})`, with the slope of the
-    bilinear cell. One step is exact on a plane; three bring a smooth relief to rounding
-    for rays within some 60 degrees of the z axis. Rays that would cross the relief several
+    bilinear cell. One step is exact on a plane; three bring a smooth height field to rounding
+    for rays within some 60 degrees of the z axis. Rays that would cross the height field several
     times find the crossing Newton leads to, usually the one nearest to the plane.
 
     Args:
         depth: z, patch frame; what invalid samples hold does not matter.
-        valid: True where there is a relief.
+        valid: True where there is a height field.
         origin: x and y of the first sample.
         spacing: Between samples.
         ray_origins: Patch frame; any point of the ray. Their dtype is that of the answer:
-            float64 rays meet a float32 relief in float64.
+            float64 rays meet a float32 height field in float64.
         ray_directions: Any length and sign; the ray is the whole line.
         steps: Newton's steps.
 
     Returns:
-        The points, and whether each lies on the relief: all neighbours it is blended from
+        The points, and whether each lies on the height field: all neighbours it is blended from
         are valid, and the line passes it within a fiftieth of the spacing. A miss gives a
         point on the ray that means nothing, though it is finite.
 
@@ -128,7 +128,7 @@ def continued_level(
 ) -> Float[Tensor, "patch height width"]:
     """Give invalid samples the mean of the valid ones among their eight neighbours.
 
-    Rays that pass over the rim of the relief on their way are then not thrown off by what
+    Rays that pass over the rim of the height field on their way are then not thrown off by what
     lies beyond it. A sample without valid neighbours becomes 0, the facet's plane.
     """
     known = torch.where(valid, depth, 0)
@@ -156,10 +156,10 @@ class _Grid(NamedTuple):
 def _gap(
     grid: _Grid, rays: tuple[Float[Tensor, "patch ray"], ...], distance: Float[Tensor, "patch ray"]
 ) -> tuple[Float[Tensor, "patch ray"], Float[Tensor, "patch ray"]]:
-    """Give the ray's height over the relief along z, and its derivative along the ray.
+    """Give the ray's height over the height field along z, and its derivative along the ray.
 
     Args:
-        grid: The relief; every sample has a value.
+        grid: The height field; every sample has a value.
         rays: x, y and z of the rays' origins, and of their directions.
         distance: Along each ray.
     """

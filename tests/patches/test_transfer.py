@@ -4,8 +4,8 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
-from pimper_torch.patches.carry import carried_normals, carry, coarse_normals
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.patches.transfer import coarse_normals, transfer, transferred_normals
 from pimper_torch.patches.warp import Warp
 from pimper_torch.records import CoarseMesh, Mesh
 
@@ -44,8 +44,8 @@ def places(templates):
 
 
 def test_samples_come_to_lie_on_the_surface_above_their_places_on_the_facet(flat):
-    carried = carry(flat, surface())
-    for before, after in zip(flat.buckets, carried.buckets, strict=True):
+    transferred = transfer(flat, surface())
+    for before, after in zip(flat.buckets, transferred.buckets, strict=True):
         assert torch.equal(before.inside, after.inside)
         there, here = places(after)[after.inside], places(before)[before.inside]
         assert_close(there[:, :2], here[:, :2])
@@ -54,9 +54,9 @@ def test_samples_come_to_lie_on_the_surface_above_their_places_on_the_facet(flat
         assert after.depth.abs().max() > 0.05
 
 
-def test_the_surfaces_normals_are_carried_along(flat):
-    carried = carry(flat, surface())
-    for templates in carried.buckets:
+def test_the_surfaces_normals_are_transferred_along(flat):
+    transferred = transfer(flat, surface())
+    for templates in transferred.buckets:
         world = rotate(
             invert_rigid(templates.patch_from_world), templates.normals_patch.flatten(1, 2)
         )
@@ -66,35 +66,35 @@ def test_the_surfaces_normals_are_carried_along(flat):
         )
         inside = templates.inside.flatten(1)
         assert_close(world[inside], true[inside], rtol=0, atol=5e-3)
-        assert_close(carried_normals(carried.coarse, templates), templates.normals_patch)
-    flat_ones = carried_normals(flat.coarse, flat.buckets[0])
+        assert_close(transferred_normals(transferred.coarse, templates), templates.normals_patch)
+    flat_ones = transferred_normals(flat.coarse, flat.buckets[0])
     assert_close(flat_ones, coarse_normals(flat.coarse, flat.buckets[0]))
 
 
 def test_where_there_is_no_surface_there_is_no_sample(flat):
     whole = surface()
     left = whole.vertices_world[whole.faces][..., 0].amax(dim=1) < 0
-    carried = carry(flat, whole.replace(faces=whole.faces[left]))
-    for templates in carried.buckets:
+    transferred = transfer(flat, whole.replace(faces=whole.faces[left]))
+    for templates in transferred.buckets:
         x = places(templates)[..., 0]
         assert not templates.inside[x > 0.05].any()
-    assert any(bucket.inside.any() for bucket in carried.buckets)
+    assert any(bucket.inside.any() for bucket in transferred.buckets)
 
 
-def test_a_surface_seen_from_behind_is_not_carried(flat):
+def test_a_surface_seen_from_behind_is_not_transferred(flat):
     whole = surface()
-    turned = carry(flat, whole.replace(faces=whole.faces.flip(1)))
-    assert not any(bucket.inside.any() for bucket in turned.buckets)
+    rotated = transfer(flat, whole.replace(faces=whole.faces.flip(1)))
+    assert not any(bucket.inside.any() for bucket in rotated.buckets)
 
 
-def test_the_nearer_of_two_sheets_is_carried(flat):
+def test_the_nearer_of_two_sheets_is_transferred(flat):
     near, far = surface(), surface()
     lifted = far.vertices_world + far.vertices_world.new_tensor([0, 0, 0.4])
     both = Mesh(
         vertices_world=torch.cat([near.vertices_world, lifted]),
         faces=torch.cat([near.faces, far.faces + len(near.vertices_world)]),
     )
-    for one, other in zip(carry(flat, near).buckets, carry(flat, both).buckets, strict=True):
+    for one, other in zip(transfer(flat, near).buckets, transfer(flat, both).buckets, strict=True):
         assert_close(one.depth[one.inside], other.depth[one.inside])
 
 
@@ -109,8 +109,8 @@ def test_depth_has_the_slope_of_its_differences_as_vertices_move(flat, axes):
     along, step = along * torch.tensor(axes).double(), 1e-6
 
     def depths(places):
-        carried = carry(flat, whole.replace(vertices_world=places))
-        return torch.cat([bucket.depth.flatten() for bucket in carried.buckets])
+        transferred = transfer(flat, whole.replace(vertices_world=places))
+        return torch.cat([bucket.depth.flatten() for bucket in transferred.buckets])
 
     here = depths(vertices)
     weight = torch.randn(here.shape, generator=generator, dtype=torch.float64)
@@ -124,14 +124,14 @@ def test_depth_has_the_slope_of_its_differences_as_vertices_move(flat, axes):
     assert_close((vertices.grad * along).sum(), slope, rtol=1e-4, atol=0)
 
 
-def test_views_are_registered_on_what_is_carried(plane_scene, flat):
+def test_views_are_registered_on_what_is_transferred(plane_scene, flat):
     """On the true plane every view shows each sample's own albedo; on the facets none does."""
     normal = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64)
     whole = surface()
     xy = whole.vertices_world[:, :2]
     plane = whole.replace(vertices_world=torch.cat([xy, -(xy @ normal[:2, None])], dim=1))
-    carried = carry(flat, plane)
-    seen = Warp()(plane_scene.views, plane_scene.cameras, carried)
+    transferred = transfer(flat, plane)
+    seen = Warp()(plane_scene.views, plane_scene.cameras, transferred)
     for registered in seen.buckets:
         everywhere = registered.valid.all(dim=1)
         spread = registered.gray.amax(dim=1) - registered.gray.amin(dim=1)

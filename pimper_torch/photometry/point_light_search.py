@@ -1,8 +1,9 @@
-"""Where every view's lamp may be: a search over directions, before any descent.
+"""Where every view's point light may be: a search over directions, before any descent.
 
-What a lamp lights and what it leaves in shadow makes the fit of its direction a problem with many
-minima: a descent from lamps that shine along the mean normal ended 30 to 70 degrees beside the
-lamp in six of nine views of a potato on a table, with twice the residuals.
+What a point light lights and what it leaves in shadow makes the fit of its direction a problem with
+many
+minima: a descent from point lights that shine along the mean normal ended 30 to 70 degrees beside
+the point light in six of nine views of a potato on a table, with twice the residuals.
 """
 
 import torch
@@ -14,27 +15,28 @@ from pimper_torch.photometry.shown import Shown
 
 # Directions that are tried, 10 degrees apart, at so many samples at most; and rounds, in which
 # samples in cast shadow lose weight and albedo settles: none changed after the third.
-_DIRECTIONS, _SAMPLES, _ROUNDS = 400, 2000, 3
+_DIRECTIONS, _SAMPLES, _ITERATIONS = 400, 2000, 3
 
-# Of a sample's radiance over the views: it is lit in more than this share of them.
+# Of a sample's radiance over the views: it is lit in more than this fraction of them.
 _LIT_QUANTILE = 0.8
 
-# Directions whose costs differ by less than this share of what is shown are alike: the one next to
-# the mean normal is taken, as where the samples lie in a plane. And a lamp that is weaker than this
-# share of the ambient light is none: then albedo explains all, and any lamp would do.
+# Directions whose costs differ by less than this fraction of what is shown are alike: the one next
+# to the mean normal is taken, as where the samples lie in a plane. And a point light that is weaker
+# than this fraction of the ambient light is none: then albedo explains all, and any point light
+# would do.
 _ALIKE = 1e-3
 
-# Ambient light where any lamp would do, over the lamp's.
+# Ambient light where any point light would do, over the point light's.
 _AMBIENT = 0.2
 
 
-def search_lamps(
+def search_point_lights(
     shown: Shown, normals: Float[Tensor, "sample 3"]
 ) -> tuple[Float[Tensor, "view 4"], Float[Tensor, " sample"]]:
-    r"""Search the direction of each view's lamp, taken to be far away.
+    r"""Search the direction of each view's point light, taken to be far away.
 
     With albedo given, from what samples show where they are brightest, ambient light :math:`a`
-    and a lamp's strength :math:`s` follow for every direction :math:`d` in closed form from
+    and a point light's strength :math:`s` follow for every direction :math:`d` in closed form from
     :math:`\sum_i w_i (x_i - \rho_i (a + s \max(0, n_i \cdot d)))^2`, and the direction that
     leaves least is taken; then weights and albedo, in turn.
 
@@ -43,8 +45,8 @@ def search_lamps(
         normals: Unit, world.
 
     Returns:
-        Ambient light and the lamp's irradiance vector, one of each a view, neither negative; and
-        the samples' albedo. A constant to autograd.
+        Ambient light and the point light's irradiance vector, one of each a view, neither negative;
+        and the samples' albedo. A constant to autograd.
     """
     stride = -(-len(normals) // _SAMPLES)
     some = Shown(radiance=shown.radiance[::stride], seen=shown.seen[::stride])
@@ -56,7 +58,7 @@ def search_lamps(
     missing = torch.where(some.seen, some.radiance, torch.nan)
     albedo = missing.nanquantile(_LIT_QUANTILE, dim=1).nan_to_num(nan=0.0)
     weight = some.seen.to(normals)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         ambient, strength, left = _explained(some, albedo, facing, weight)
         power = (weight * some.radiance**2).sum(dim=0)[:, None]
         best = (left + power * aside).argmin(dim=1, keepdim=True)
@@ -65,11 +67,11 @@ def search_lamps(
         residual = some.residual(albedo, shading)
         weight = some.weights(residual, some.scale(residual))
         albedo = some.albedo_under(shading, weight).nan_to_num(nan=0.0)
-    lamp = strength[:, None] * directions[best[:, 0]]
+    point_light = strength[:, None] * directions[best[:, 0]]
     none = strength <= _ALIKE * ambient
-    lamp = torch.where(none[:, None], ambient[:, None] * ahead, lamp)
+    point_light = torch.where(none[:, None], ambient[:, None] * ahead, point_light)
     ambient = torch.where(none, _AMBIENT * ambient, ambient)
-    lights = torch.cat([ambient[:, None], lamp], dim=1)
+    lights = torch.cat([ambient[:, None], point_light], dim=1)
     shading = lights[:, 0] + (normals @ lights[:, 1:].mT).clamp_min(0)
     everywhere = shown.albedo_under(shading, shown.seen.to(normals))
     return lights, everywhere.nan_to_num(nan=0.0)
@@ -92,17 +94,17 @@ def _explained(
     cross = (weight * albedo[:, None]).mT @ lit
     square = weight.mT @ lit**2
     on_ambient = (weight * J * albedo[:, None]).sum(dim=0)[:, None]
-    on_lamp = (weight * J).mT @ lit
+    on_light = (weight * J).mT @ lit
     tiny = torch.finfo(J.dtype).tiny
     determinant = own * square - cross**2
     known = determinant > 1e-9 * own * square
-    ambient = (on_ambient * square - on_lamp * cross) / determinant.clamp_min(tiny)
+    ambient = (on_ambient * square - on_light * cross) / determinant.clamp_min(tiny)
     # Alone where both cannot be told apart, or where one would be negative.
     ambient = torch.where(known, ambient, 0).clamp_min(0)
-    strength = ((on_lamp - ambient * cross) / square.clamp_min(tiny)).clamp_min(0)
+    strength = ((on_light - ambient * cross) / square.clamp_min(tiny)).clamp_min(0)
     dark = (strength == 0) | (square <= tiny)
     strength = torch.where(dark, 0, strength)
     ambient = torch.where(dark, on_ambient / own.clamp_min(tiny), ambient)
-    explained = 2 * (ambient * on_ambient + strength * on_lamp)
+    explained = 2 * (ambient * on_ambient + strength * on_light)
     used = ambient**2 * own + 2 * ambient * strength * cross + strength**2 * square
     return ambient, strength, (weight * J**2).sum(dim=0)[:, None] - explained + used

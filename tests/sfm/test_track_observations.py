@@ -5,8 +5,8 @@ import torch
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.kernels.switch import using
-from pimper_torch.sfm.sightings import SightingSettings, log_pictures, sight
 from pimper_torch.sfm.tangents import tangents
+from pimper_torch.sfm.track_observations import SightingSettings, log_pictures, sight
 from tests.sfm import ball
 
 SETTINGS = SightingSettings(radius_px=8)
@@ -44,13 +44,13 @@ def test_points_are_found_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
 
 def test_the_kernel_finds_what_torch_finds(scene):
     cameras, planes, _ = scene
-    turned = cameras.cam_from_world.clone()
-    turned[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels: several steps, and some too far
+    rotated = cameras.cam_from_world.clone()
+    rotated[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels: several steps, and some too far
     views = ball.photographs(cameras, wall=True)
     images = views.images.clone()
     noise = torch.Generator().manual_seed(5)
     images[2] = torch.rand(images[2].shape, generator=noise, dtype=images.dtype)  # hopeless
-    shown, wrong = pictures(views.replace(images=images)), cameras.replace(cam_from_world=turned)
+    shown, wrong = pictures(views.replace(images=images)), cameras.replace(cam_from_world=rotated)
     settings = dataclasses.replace(SETTINGS, max_shift_px=2.2)
     with using("torch"):
         expected = sight(shown, wrong, planes, settings)
@@ -65,9 +65,9 @@ def test_the_kernel_finds_what_torch_finds(scene):
 
 def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
     cameras, planes, _ = scene
-    turned = cameras.cam_from_world.clone()
-    turned[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels
-    wrong = cameras.replace(cam_from_world=turned)
+    rotated = cameras.cam_from_world.clone()
+    rotated[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels
+    wrong = cameras.replace(cam_from_world=rotated)
     found = sight(
         pictures(ball.photographs(cameras, lit=False, wall=True)), wrong, planes, SETTINGS
     )

@@ -1,6 +1,6 @@
-"""The union of the patches, sampled on the lattice of the coarse mesh.
+"""The union of the patches, sampled on the subdivided mesh of the coarse mesh.
 
-A lattice vertex has one ray: from its place on the flat facet along the coarse mesh's
+A subdivided mesh vertex has one ray: from its place on the flat facet along the coarse mesh's
 smoothed normal, interpolated as Phong does, so that rays are continuous across facets. The
 vertex's own patch and the neighbours whose enlarged triangle the ray passes say how high
 the surface lies along it.
@@ -16,8 +16,8 @@ from torch.nn.functional import normalize
 from torch.nn.utils.rnn import pad_sequence
 
 from pimper_torch.geometry.frames import rotate, transform
-from pimper_torch.geometry.lattice import Lattice
-from pimper_torch.geometry.reliefs import intersect_relief, sample_raster
+from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
+from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import (
@@ -34,7 +34,7 @@ from pimper_torch.records import (
 # A ray turned more than this from the patch's own normal (cosine) says nothing of its height.
 _FACING = 0.2
 
-# How far outside the band a ray may cross the facet's plane and still meet its relief inside.
+# How far outside the band a ray may cross the facet's plane and still meet its height field inside.
 _SLACK_BANDS = 2.0
 
 # Samples at the border of a template whose cells are not whole, so that no ray meets them.
@@ -48,17 +48,17 @@ _MIN_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Union(Record):
-    """What the patches together say at every vertex of the lattice.
+class Blend(Record):
+    """What the patches together say at every vertex of the subdivided mesh.
 
     Attributes:
         heights: Along the vertex's ray, scene units; 0 where no patch supports the vertex.
-        supported: True where a patch has valid relief.
+        supported: True where a patch has valid height field.
         normals_world: Photometric, unit; zero where no patch has one.
         albedo: Linear; zero where no patch has one.
         seen: True where normal and albedo are photometric.
         confidence: In [0, 1]; 0 where not supported or not determined by the photographs.
-        offsets: How far outside the reliefs the sweep has the surface, along their normals;
+        offsets: How far outside the height fields the sweep has the surface, along their normals;
             0 where not swept.
         information: Inverse variance of the offsets; 0 where not swept.
     """
@@ -73,13 +73,13 @@ class Union(Record):
     information: Float[Tensor, " vertex"]
 
 
-def ray_directions(lattice: Lattice, coarse: CoarseMesh) -> Float[Tensor, "vertex 3"]:
-    """Give the lattice vertices' rays: smoothed normals of the coarse mesh, interpolated."""
+def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Float[Tensor, "vertex 3"]:
+    """Give the vertices' rays: smoothed normals of the coarse mesh, interpolated."""
     mesh = coarse.mesh
     normals = mesh.normals_world
     if normals is None:
         normals = vertex_normals(mesh.vertices_world, mesh.faces)
-    return normalize(lattice.interpolate(normals, mesh.faces), dim=-1)
+    return normalize(subdivision.interpolate(normals, mesh.faces), dim=-1)
 
 
 def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
@@ -89,18 +89,18 @@ def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor
     return torch.empty_like(spacing).index_put((facet,), spacing * samples_per_vertex)
 
 
-def unite(
+def blend_patches(
     depths: DepthPatches,
-    lattice: Lattice,
+    subdivision: Subdivision,
     directions: Float[Tensor, "vertex 3"],
     outlier_samples: float,
     swept: Sequence[Heights] | None = None,
-) -> Union:
-    r"""Blend the patches on the lattice.
+) -> Blend:
+    r"""Blend the patches on the subdivided mesh.
 
     Each patch counts with :math:`\prod_c s(b_c)` over its barycentric coordinates, where
     ``s`` climbs smoothly from 0 at the border of the enlarged triangle through 1/2 on the
-    facet's edge to 1 as far inside: the union is continuous across seams, and on the middle
+    facet's edge to 1 as far inside: the union is continuous across seams, and on the centre
     of a seam both patches count alike. Where three or more patches meet, one that lies
     ``d > outlier_samples`` samples from the weighted median has its weight divided by
     ``1 + 10 (d / outlier_samples - 1)^2``: a wild patch is outvoted. Swept offsets count by
@@ -111,7 +111,9 @@ def unite(
     """
     coarse = depths.patches.coarse
     faces = coarse.mesh.faces
-    vertices = _Lists.of(lattice.facet, torch.arange(len(lattice.points)).to(faces), len(faces))
+    vertices = _Lists.of(
+        subdivision.facet, torch.arange(len(subdivision.points)).to(faces), len(faces)
+    )
     around = _facets_around(faces)
     heights = swept if swept is not None else [None] * len(depths.buckets)
     buckets = zip(
@@ -119,7 +121,7 @@ def unite(
     )
     estimates = list(
         side_by_side(
-            lambda bucket: _estimates(coarse, *bucket, lattice, directions, around, vertices),
+            lambda bucket: _estimates(coarse, *bucket, subdivision, directions, around, vertices),
             list(buckets),
         )
     )
@@ -132,7 +134,7 @@ def unite(
         values=torch.cat([one.values for one in estimates]),
         swept=torch.cat([one.swept for one in estimates]),
     )
-    return _blend(joined, len(lattice.points), outlier_samples)
+    return _blend(joined, len(subdivision.points), outlier_samples)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,21 +156,23 @@ class _Estimates:
 def _estimates(
     coarse: CoarseMesh,
     templates: Templates,
-    relief: Depths,
+    height_field: Depths,
     photometry: Photometry,
     swept: Heights | None,
-    lattice: Lattice,
+    subdivision: Subdivision,
     directions: Float[Tensor, "vertex 3"],
     around: "_Lists",
     vertices: "_Lists",
 ) -> _Estimates:
-    """Intersect the rays near each patch of a bucket with its relief."""
+    """Intersect the rays near each patch of a bucket with its height field."""
     corners, bands = _bands(coarse, templates)
-    vertex, present = _rays_near(templates, corners, bands, lattice, directions, around, vertices)
-    origins = transform(templates.patch_from_world, lattice.points[vertex])
+    vertex, present = _rays_near(
+        templates, corners, bands, subdivision, directions, around, vertices
+    )
+    origins = transform(templates.patch_from_world, subdivision.points[vertex])
     along = rotate(templates.patch_from_world, directions[vertex])
-    points, hit = intersect_relief(
-        relief.depth, relief.valid, templates.origin, templates.spacing, origins, along
+    points, hit = intersect_height_field(
+        height_field.depth, height_field.valid, templates.origin, templates.spacing, origins, along
     )
     from_patch = _barycentric_map(corners)
     barycentric = points[..., :2] @ from_patch[..., :2].mT + from_patch[:, None, :, 2]
@@ -180,7 +184,7 @@ def _estimates(
     layers = torch.cat([normals_world, photometry.confidence[..., None], photometry.albedo], dim=-1)
     place = (xy, templates.origin, templates.spacing)
     values = sample_raster(layers.movedim(-1, 1), *place, valid=photometry.valid)
-    known = sample_raster(photometry.valid[:, None].to(relief.depth), *place)[:, 0]
+    known = sample_raster(photometry.valid[:, None].to(height_field.depth), *place)[:, 0]
     of_sweep = values.new_zeros(values.shape[0], 2, values.shape[2])
     if swept is not None:
         told = torch.stack([swept.information, swept.information * swept.offset], dim=1)
@@ -217,7 +221,7 @@ def _rays_near(
     templates: Templates,
     corners: Float[Tensor, "patch 3 2"],
     bands: Float[Tensor, "patch 3"],
-    lattice: Lattice,
+    subdivision: Subdivision,
     directions: Float[Tensor, "vertex 3"],
     around: "_Lists",
     vertices: "_Lists",
@@ -231,7 +235,7 @@ def _rays_near(
     place, vertex = vertices.take(facet)
     patch = patch[place]
     frame, from_patch = templates.patch_from_world, _barycentric_map(corners)
-    start = transform(frame[patch], lattice.points[vertex, None])[:, 0]
+    start = transform(frame[patch], subdivision.points[vertex, None])[:, 0]
     along = rotate(frame[patch], directions[vertex, None])[:, 0]
     facing = along[:, 2] < -_FACING
     distance = -start[:, 2] / torch.where(facing, along[:, 2], 1)
@@ -270,7 +274,7 @@ class _Lists:
 
 
 def _facets_around(faces: Int[Tensor, "facet 3"]) -> _Lists:
-    """List, for each facet, itself and the facets that share a corner with it, in order."""
+    """List, for each facet, itself and the facets that fraction a corner with it, in order."""
     own = torch.arange(len(faces), device=faces.device)[:, None].expand_as(faces).flatten()
     corner = faces.flatten()
     place, facet = _Lists.of(corner, own, int(corner.max()) + 1).take(corner)
@@ -288,11 +292,11 @@ def _taper(
     barycentric: Float[Tensor, "patch ray 3"], bands: Float[Tensor, "patch 3"]
 ) -> Float[Tensor, "patch ray"]:
     """Weigh a patch: 0 at the end of the band, 1/2 on the facet's edge, 1 as far inside."""
-    share = ((barycentric / bands[:, None] + 1) / 2).clamp(0, 1)
-    return (share * share * (3 - 2 * share)).prod(dim=-1)
+    fraction = ((barycentric / bands[:, None] + 1) / 2).clamp(0, 1)
+    return (fraction * fraction * (3 - 2 * fraction)).prod(dim=-1)
 
 
-def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Union:
+def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     """Average the estimates of each vertex."""
     vertex, height = estimates.vertex, estimates.height
     weight = estimates.weight * _agreement(estimates, count, outlier_samples)
@@ -307,7 +311,7 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Union:
     told = _sum_at(vertex, weight[:, None] * estimates.swept, count)
     information = told[:, 0]
     some = information > 0
-    return Union(
+    return Blend(
         heights=_sum_at(vertex, weight * height, count) * per_support,
         supported=supported,
         normals_world=normalize(normals * per_seen[:, None], dim=-1),
@@ -333,9 +337,9 @@ def _agreement(
         running = weight.cumsum(0)
         before = (total.cumsum(0) - total)[vertex]
         below = _sum_at(vertex, (running - before < total[vertex] / 2).long(), count)
-        middle = (number.cumsum(0) - number + below.clamp_max((number - 1).clamp_min(0)))[vertex]
+        centre = (number.cumsum(0) - number + below.clamp_max((number - 1).clamp_min(0)))[vertex]
         nearest = torch.empty_like(order)
-        nearest[order] = order[middle]
+        nearest[order] = order[centre]
     median = estimates.height[nearest]
     away = (estimates.height - median) / (outlier_samples * estimates.scale)
     many = number[estimates.vertex] >= 3

@@ -31,7 +31,7 @@ class Row:
     meaning: str
 
 
-def account(evaluation: Evaluation) -> dict[str, object]:
+def report(evaluation: Evaluation) -> dict[str, object]:
     """Give all figures as plain mappings, lists and numbers; what is not finite is ``None``.
 
     Names are those of the records; those that end in ``_percent``, ``_deg`` are in these
@@ -82,16 +82,16 @@ def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
     )
     if surface.accuracy is not None:
         yield _distance_row("accuracy", surface.accuracy, "result to truth: mean; median")
-    if surface.surroundings_share > 0:
+    if surface.surroundings_fraction > 0:
         yield Row(
-            name="surroundings_share",
-            value=_share(surface.surroundings_share),
+            name="surroundings_fraction",
+            value=_fraction(surface.surroundings_fraction),
             meaning="of the result lies nearer to the surroundings; left out of the accuracy",
         )
     if surface.whole is not None:
         yield from _two_sided_rows(surface.whole, "", "the whole truth")
-    if surface.seen is not None and surface.seen_share is not None:
-        part = f"the {_share(surface.seen_share)} of it seen from {surface.seen_from} places"
+    if surface.seen is not None and surface.seen_fraction is not None:
+        part = f"the {_fraction(surface.seen_fraction)} of it seen from {surface.seen_from} places"
         yield from _two_sided_rows(surface.seen, " (seen)", part)
     if surface.calibration is not None:
         yield from _calibration_rows(surface.calibration, surface.diagonal)
@@ -100,7 +100,7 @@ def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
 def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[Row]:
     yield Row(
         name="expected_error",
-        value=f"{found.ratio:.2f}; {_share(found.within_one)}, {_share(found.within_two)}; "
+        value=f"{found.ratio:.2f}; {_fraction(found.within_one)}, {_fraction(found.within_two)}; "
         f"{found.rank_correlation:.2f}",
         meaning="true over expected error, 1 if calibrated; true error within one and two "
         "expected, 68 and 95 % if calibrated; rank correlation",
@@ -130,9 +130,9 @@ def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[Row]:
     for at in figures.thresholds:
         yield Row(
             name=f"f_score{mark} at {at.threshold_percent:g} %",
-            value=_share(at.f_score),
-            meaning=f"precision {_share(at.precision)}, recall{mark} {_share(at.recall)}, nearer "
-            f"than {_number(at.threshold)}",
+            value=_fraction(at.f_score),
+            meaning=f"precision {_fraction(at.precision)}, recall{mark} {_fraction(at.recall)}, "
+            f"nearer than {_number(at.threshold)}",
         )
 
 
@@ -144,12 +144,16 @@ def _view_rows(view: ViewFigures) -> Iterator[Row]:
     )
     yield Row(
         name="coverage",
-        value=_share(view.coverage),
+        value=_fraction(view.coverage),
         meaning=f"of {view.pixels} true pixels are met by the result",
     )
     for name, angles, meaning in (
         ("shape_normals", view.shape_normals, "normals of the mesh's shape: mean; median; pitted"),
-        ("carried_normals", view.carried_normals, "normals the mesh carries: mean; median; pitted"),
+        (
+            "transferred_normals",
+            view.transferred_normals,
+            "normals the mesh carries: mean; median; pitted",
+        ),
     ):
         if angles is not None:
             value = (
@@ -221,13 +225,13 @@ def _dtu_rows(dtu: DtuFigures) -> Iterator[Row]:
         name="accuracy",
         value=f"{dtu.mean_accuracy:.4f} mm; {dtu.median_accuracy:.4f} mm",
         meaning=f"{dtu.judged} points in the mask, thinned to {THINNING_MM:g} mm: mean; median; "
-        f"{_share(dtu.capped_share)} {cap}",
+        f"{_fraction(dtu.capped_fraction)} {cap}",
     )
     yield Row(
         name="completeness",
         value=f"{dtu.mean_completeness:.4f} mm; {dtu.median_completeness:.4f} mm",
         meaning=f"{dtu.judged_true} points of the scan above the table: mean; median; "
-        f"{_share(dtu.capped_share_true)} {cap}",
+        f"{_fraction(dtu.capped_fraction_true)} {cap}",
     )
     yield Row(name="overall", value=f"{dtu.overall:.4f} mm", meaning="mean of the two means")
 
@@ -244,7 +248,7 @@ def _number(value: float) -> str:
     return f"{value:.4g}"
 
 
-def _share(value: float) -> str:
+def _fraction(value: float) -> str:
     return f"{100 * value:.1f} %"
 
 

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.fusion.evidence import Common, Evidence
-from pimper_torch.geometry.lattice import Lattice
+from pimper_torch.fusion.terms import Common, Terms
+from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.records import Record
 
 # Of the square of unit Gaussian noise.
@@ -27,7 +27,7 @@ MEDIAN_OF_TILT = 2 * math.log(2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Drift(Record):
+class NormalBias(Record):
     """The mean difference of normals on every facet.
 
     Attributes:
@@ -44,8 +44,10 @@ class Drift(Record):
         """Give the variance of a tilt, robustly, for normals that still have theirs."""
         return self.tilt[self.known].square().sum(dim=-1).median() / MEDIAN_OF_TILT
 
-    def at(self, lattice: Lattice, facets: Int[Tensor, "facet 3"]) -> Float[Tensor, "vertex 3"]:
-        """Blend the tilts over the lattice, continuous across facets."""
+    def at(
+        self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]
+    ) -> Float[Tensor, "vertex 3"]:
+        """Blend the tilts over the subdivided mesh, continuous across facets."""
         size = int(facets.max()) + 1
         corner = facets.flatten()
         weight = self.count.repeat_interleave(3)
@@ -53,20 +55,20 @@ class Drift(Record):
         summed = self.tilt.new_zeros(size, 3).index_add(
             0, corner, (self.count[:, None] * self.tilt).repeat_interleave(3, dim=0)
         )
-        return lattice.interpolate(summed / total[:, None], facets)
+        return subdivision.interpolate(summed / total[:, None], facets)
 
 
-def drift(
-    lattice: Lattice,
+def normal_bias(
+    subdivision: Subdivision,
     facets: Int[Tensor, "facet 3"],
     normals: Float[Tensor, "vertex 3"],
     shape: Float[Tensor, "vertex 3"],
     known: Bool[Tensor, " vertex"],
-) -> Drift:
+) -> NormalBias:
     """Compare normals with those of a shape, facet by facet.
 
     Args:
-        lattice: The facets, subdivided.
+        subdivision: The facets, subdivided.
         facets: The coarse mesh's faces.
         normals: Photometric, unit.
         shape: Of the surface, unit.
@@ -78,13 +80,13 @@ def drift(
     size = apart.norm(dim=-1, keepdim=True)
     apart = apart * (0.25 / size.clamp_min(0.25))
     held = known.to(apart)
-    count = held.new_zeros(len(facets)).index_add(0, lattice.facet, held)
-    summed = apart.new_zeros(len(facets), 3).index_add(0, lattice.facet, apart)
-    return Drift(tilt=summed / count.clamp_min(1)[:, None], count=count, known=count > 0)
+    count = held.new_zeros(len(facets)).index_add(0, subdivision.facet, held)
+    summed = apart.new_zeros(len(facets), 3).index_add(0, subdivision.facet, apart)
+    return NormalBias(tilt=summed / count.clamp_min(1)[:, None], count=count, known=count > 0)
 
 
 def common_variance(
-    found: Evidence,
+    found: Terms,
     heights: Float[Tensor, " vertex"],
     facet: Int[Tensor, " vertex"],
     held: Int[Tensor, " place"],

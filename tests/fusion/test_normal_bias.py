@@ -3,71 +3,74 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.drift import alike, common_variance, drift
-from pimper_torch.fusion.evidence import swept_heights
-from pimper_torch.geometry.lattice import subdivide
+from pimper_torch.fusion.normal_bias import alike, common_variance, normal_bias
+from pimper_torch.fusion.terms import swept_heights
+from pimper_torch.geometry.subdivision import subdivide
 
 FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 
 @pytest.fixture
-def lattice():
+def subdivision():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     return subdivide(corners, FACETS, torch.full((2,), 0.1, dtype=torch.float64))
 
 
-def test_a_tilt_that_all_normals_share_is_found_and_detail_is_not(lattice):
+def test_a_tilt_that_all_normals_share_is_found_and_detail_is_not(subdivision):
     generator = torch.Generator().manual_seed(73)
-    shape = torch.tensor([0.0, 0, 1]).double().expand(len(lattice.points), 3)
+    shape = torch.tensor([0.0, 0, 1]).double().expand(len(subdivision.points), 3)
     detail = 0.05 * torch.randn(shape.shape, generator=generator, dtype=torch.float64)
     tilted = shape + torch.tensor([0.08, -0.03, 0]).double() + detail * torch.tensor([1, 1, 0])
     known = torch.ones(len(shape), dtype=torch.bool)
-    found = drift(lattice, FACETS, tilted, shape, known)
+    found = normal_bias(subdivision, FACETS, tilted, shape, known)
     assert_close(
         found.tilt[:, :2], torch.tensor([[-0.08, 0.03]]).double().expand(2, 2), rtol=0, atol=0.02
     )
-    corrected = tilted + found.at(lattice, FACETS)
+    corrected = tilted + found.at(subdivision, FACETS)
     assert (corrected - shape - detail * torch.tensor([1, 1, 0])).norm(dim=1).max() < 0.03
 
 
-def test_the_blend_is_continuous_and_only_normals_that_are_known_count(lattice):
-    shape = torch.tensor([0.0, 0, 1]).double().expand(len(lattice.points), 3)
+def test_the_blend_is_continuous_and_only_normals_that_are_known_count(subdivision):
+    shape = torch.tensor([0.0, 0, 1]).double().expand(len(subdivision.points), 3)
     normals = shape.clone()
-    upper = lattice.facet == 1
+    upper = subdivision.facet == 1
     normals[upper] = normalize(torch.tensor([0.1, 0.0, 1.0]).double(), dim=0)
     normals[~upper] = torch.nan
-    found = drift(lattice, FACETS, normals.nan_to_num(), shape, upper)
+    found = normal_bias(subdivision, FACETS, normals.nan_to_num(), shape, upper)
     assert found.known.tolist() == [False, True]
     assert_close(found.tilt[0], torch.zeros(3).double())
-    at = found.at(lattice, FACETS)
+    at = found.at(subdivision, FACETS)
     assert at.isfinite().all()
     # On the diagonal both facets have the same blend: that of its two corners.
-    diagonal = (lattice.points[:, 0] - lattice.points[:, 1]).abs() < 1e-9
+    diagonal = (subdivision.points[:, 0] - subdivision.points[:, 1]).abs() < 1e-9
     assert_close(
         at[diagonal][:, 0], found.tilt[1, 0].expand(int(diagonal.sum())), rtol=1e-6, atol=0
     )
 
 
-def test_a_cliff_does_not_turn_a_facet_by_more_than_a_quarter(lattice):
-    shape = torch.tensor([0.0, 0, 1]).double().expand(len(lattice.points), 3)
+def test_a_cliff_does_not_turn_a_facet_by_more_than_a_quarter(subdivision):
+    shape = torch.tensor([0.0, 0, 1]).double().expand(len(subdivision.points), 3)
     sideways = torch.tensor([1.0, 0, 0]).double().expand_as(shape)
     known = torch.ones(len(shape), dtype=torch.bool)
-    assert drift(lattice, FACETS, sideways, shape, known).tilt.norm(dim=1).max() <= 0.25 + 1e-9
+    assert (
+        normal_bias(subdivision, FACETS, sideways, shape, known).tilt.norm(dim=1).max()
+        <= 0.25 + 1e-9
+    )
 
 
 def test_the_variance_of_tilts_is_told_whatever_their_number():
     corners = torch.rand(602, 3, generator=torch.Generator().manual_seed(76)).double()
     facets = torch.stack([torch.arange(600), torch.arange(1, 601), torch.arange(2, 602)], dim=1)
-    lattice = subdivide(corners, facets, torch.full((600,), 0.3, dtype=torch.float64))
+    subdivision = subdivide(corners, facets, torch.full((600,), 0.3, dtype=torch.float64))
     generator = torch.Generator().manual_seed(77)
-    shape = torch.tensor([0.0, 0, 1]).double().expand(len(lattice.points), 3)
+    shape = torch.tensor([0.0, 0, 1]).double().expand(len(subdivision.points), 3)
     tilts = 0.02 * torch.randn(600, 2, generator=generator).double()
-    normals = torch.cat([tilts, torch.ones(600, 1).double()], dim=1)[lattice.facet]
+    normals = torch.cat([tilts, torch.ones(600, 1).double()], dim=1)[subdivision.facet]
     known = torch.ones(len(shape), dtype=torch.bool)
-    variance = drift(lattice, facets, normals, shape, known).variance()
-    found = alike(variance, lattice.facet, known)
+    variance = normal_bias(subdivision, facets, normals, shape, known).variance()
+    found = alike(variance, subdivision.facet, known)
     assert float(found.variance) == pytest.approx(0.02**2, rel=0.15)
-    assert_close(found.count, torch.bincount(lattice.facet).double()[lattice.facet])
+    assert_close(found.count, torch.bincount(subdivision.facet).double()[subdivision.facet])
 
 
 def test_what_heights_of_a_facet_are_off_by_together_is_told_where_it_can_be():

@@ -16,11 +16,11 @@ from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
 # Normals are kept this far from the rim, so that all of them face the viewer.
 MIN_FACING = 0.05
 
-# A template finds its surface within this share of its own extent of the facet's plane.
+# A template finds its surface within this fraction of its own extent of the facet's plane.
 _REACH = 0.5
 
 
-def carry(patches: PatchSet, surface: Mesh) -> PatchSet:
+def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     """Let every template carry the surface: its depth, and its normals.
 
     A sample's place is where the surface, facing as the facet does, meets the sample's line
@@ -39,7 +39,7 @@ def carry(patches: PatchSet, surface: Mesh) -> PatchSet:
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
 
 
-def carried_normals(
+def transferred_normals(
     coarse: CoarseMesh, templates: Templates
 ) -> Float[Tensor, "patch height width 3"]:
     """Give the normals of what a template carries, patch frame: a surface's, or the mesh's."""
@@ -70,8 +70,8 @@ def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3
     """Make unit, and bring what faces away to just before the rim."""
     unit = normalize(normals, dim=-1)
     aside = (1 - MIN_FACING**2) ** 0.5 * normalize(unit[..., :2], dim=-1)
-    turned = torch.cat([aside, torch.full_like(unit[..., 2:], -MIN_FACING)], dim=-1)
-    return torch.where(unit[..., 2:] > -MIN_FACING, turned, unit)
+    rotated = torch.cat([aside, torch.full_like(unit[..., 2:], -MIN_FACING)], dim=-1)
+    return torch.where(unit[..., 2:] > -MIN_FACING, rotated, unit)
 
 
 def _carrying(
@@ -91,13 +91,13 @@ def _carrying(
     hits = hits.refined(surface.vertices_world, surface.faces, places, inward)
     found = hits.interpolate(surface.vertices_world, surface.faces)
     depth = transform(templates.patch_from_world, found)[..., 2]
-    turned = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
+    rotated = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
     met = met & (depth.abs() <= reach[:, None])
     raster = (num, height, width)
     return templates.replace(
         depth=torch.where(met, depth, 0).reshape(raster),
         normals_patch=normalize(
-            torch.where(met[..., None], turned, turned.new_tensor([0, 0, -1])), dim=-1
+            torch.where(met[..., None], rotated, rotated.new_tensor([0, 0, -1])), dim=-1
         ).reshape(*raster, 3),
         inside=templates.inside & met.reshape(raster),
     )

@@ -13,7 +13,7 @@ SAME_PLACE = 5e-3
 # what a sample at the outlier's distance keeps.
 _RELIABLE = 0.25
 
-# A seam that fewer rays than this share meet says nothing of its patches.
+# A seam that fewer rays than this fraction meet says nothing of its patches.
 _MET_ENOUGH = 0.25
 
 
@@ -30,7 +30,7 @@ def trust_by_distance(
     """Weight samples down that are apart by far more than most.
 
     Args:
-        distance: Between the two reliefs.
+        distance: Between the two height fields.
         met: Where it means something.
         outlier: A sample this many times the median apart keeps a quarter of its weight
             (Geman and McClure's function).
@@ -40,15 +40,15 @@ def trust_by_distance(
 
 
 def overlapping_seams(met: Bool[Tensor, "seam ray"]) -> Bool[Tensor, " seam"]:
-    """Mark the seams whose two reliefs lie over each other for enough of their length."""
+    """Mark the seams whose two height fields lie over each other for enough of their length."""
     return met.sum(dim=1) >= _MET_ENOUGH * met.shape[1]
 
 
 def reliable_seams(
-    trust: Float[Tensor, "seam ray"], met: Bool[Tensor, "seam ray"]
+    reliability: Float[Tensor, "seam ray"], met: Bool[Tensor, "seam ray"]
 ) -> Bool[Tensor, " seam"]:
-    """Mark the overlapping seams whose two reliefs lie in the same place."""
-    mean = (trust * met).sum(dim=1) / met.sum(dim=1).clamp_min(1)
+    """Mark the overlapping seams whose two height fields lie in the same place."""
+    mean = (reliability * met).sum(dim=1) / met.sum(dim=1).clamp_min(1)
     return overlapping_seams(met) & (mean >= _RELIABLE)
 
 
@@ -62,7 +62,7 @@ def judge_patches(
 
     Args:
         facets: The two patches of each seam.
-        overlapping: Whether their reliefs lie over each other.
+        overlapping: Whether their height fields lie over each other.
         reliable: Whether they also agree.
         count: Patches.
     """

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.geometry.reliefs import intersect_relief, sample_raster
+from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_rays_meet_a_tilted_plane_exactly_after_one_step(generator):
     x, y, origin, spacing = raster(0.1)
     depth = 0.1 + 0.3 * x - 0.2 * y
     starts, along = oblique_rays(40, generator, spread=0.3)
-    points, hit = intersect_relief(
+    points, hit = intersect_height_field(
         depth, torch.ones_like(depth, dtype=torch.bool), origin, spacing, starts, along, steps=1
     )
     assert hit.sum() >= 35
@@ -76,7 +76,7 @@ def test_rays_meet_a_sphere_with_an_error_of_second_order_in_the_spacing(generat
         x, y, origin, spacing = raster(step)
         depth = radius - (radius**2 - x**2 - y**2).sqrt()
         valid = torch.ones_like(depth, dtype=torch.bool)
-        points, hit = intersect_relief(depth, valid, origin, spacing, starts, along, steps=4)
+        points, hit = intersect_height_field(depth, valid, origin, spacing, starts, along, steps=4)
         assert hit.sum() >= 150
         center = torch.tensor([0.0, 0.0, radius], dtype=torch.float64)
         # Closed form: |o + t d - c| = R, the root nearer to the plane z = 0.
@@ -101,22 +101,22 @@ def test_a_ray_hits_only_where_all_samples_it_rests_on_are_valid():
     starts = torch.zeros(1, 5, 3, dtype=torch.float64)
     starts[0, :, 0] = torch.tensor([-0.3, 0.0, 0.3, 0.8, -1.2])
     down = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(starts)
-    points, hit = intersect_relief(depth, valid, origin, spacing, starts, down)
+    points, hit = intersect_height_field(depth, valid, origin, spacing, starts, down)
     assert hit.tolist() == [[True, True, False, False, False]]
     assert points.isfinite().all()
 
 
-def test_a_ray_along_the_relief_misses():
+def test_a_ray_along_the_height_field_misses():
     x, _, origin, spacing = raster(0.5)
     depth = torch.zeros_like(x)
     start = torch.tensor([[[0.0, 0.0, 0.3], [0.0, 0.0, 0.0]]], dtype=torch.float64)
     along = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]], dtype=torch.float64)
-    points, hit = intersect_relief(depth, depth == 0, origin, spacing, start, along)
+    points, hit = intersect_height_field(depth, depth == 0, origin, spacing, start, along)
     assert not hit.any()
     assert points.isfinite().all()
 
 
-def test_intersections_follow_the_relief_by_the_implicit_function(generator):
+def test_intersections_follow_the_height_field_by_the_implicit_function(generator):
     x, y, origin, spacing = raster(0.5)
     depth = (0.1 * x * x + 0.05 * y * x).requires_grad_()
     starts, along = oblique_rays(6, generator, spread=0.3)
@@ -126,7 +126,7 @@ def test_intersections_follow_the_relief_by_the_implicit_function(generator):
     valid = torch.ones_like(x, dtype=torch.bool)
 
     def meet(depth, starts, along):
-        points, hit = intersect_relief(depth, valid, origin, spacing, starts, along, steps=12)
+        points, hit = intersect_height_field(depth, valid, origin, spacing, starts, along, steps=12)
         return points[hit]
 
     assert torch.autograd.gradcheck(meet, (depth, starts, along), atol=1e-6)

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.at_rest import (
+from pimper_torch.sfm.static_background import (
     fundamental_matrix,
     is_still,
     moving_matches,
@@ -16,16 +16,16 @@ from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable
 
 # The violating share is smaller the nearer the camera is to the table's plane: all moves sideways,
 # as before a camera that only shifts.
-@pytest.mark.parametrize(("elevation_deg", "share"), [(2.0, 0.2), (10.0, 0.5), (25.0, 0.7)])
+@pytest.mark.parametrize(("elevation_deg", "fraction"), [(2.0, 0.2), (10.0, 0.5), (25.0, 0.7)])
 def test_a_room_behind_a_turntable_is_at_rest_and_what_turns_is_not(
-    elevation_deg, share, generator
+    elevation_deg, fraction, generator
 ):
     scene = turntable(generator, elevation_deg=elevation_deg)
     rest = scene.rest()
     assert rest.room
     assert not rest.nothing_moves
     assert rest.moving_pairs >= 12
-    assert rest.violating_share > share
+    assert rest.violating_fraction > fraction
     for thing, resting in zip(scene.thing, rest.features, strict=True):
         assert resting[thing < 500].double().mean() < 0.01
         assert resting[thing >= 500].double().mean() > 0.99
@@ -54,7 +54,7 @@ def test_far_points_that_do_not_move_before_a_camera_that_shifts_belong_to_the_s
     assert min(still) > 100  # the far ones lie still
     rest = scene.rest()
     assert rest.moving_pairs == len(scene.pairs)
-    assert rest.violating_share < 0.01
+    assert rest.violating_fraction < 0.01
     assert not rest.room
     assert not any(resting.any() for resting in rest.features)
 
@@ -70,8 +70,8 @@ def test_a_flat_object_that_hardly_moves_from_one_photograph_to_the_next_keeps_i
     scene = Captured(generator, pixels)
     rest = scene.rest()
     assert rest.moving_pairs > 20
-    assert rest.still_share > 0.05
-    assert rest.violating_share < 0.01
+    assert rest.still_fraction > 0.05
+    assert rest.violating_fraction < 0.01
     assert not rest.room
 
 
@@ -79,7 +79,7 @@ def test_photographs_that_are_there_twice_leave_nothing_out(generator):
     cameras = orbit(6, 90.0)
     once = seen_of_ball(generator, 400, cameras)
     scene = Captured(generator, once.repeat_interleave(3, dim=0))
-    assert scene.rest().still_share > 0.1
+    assert scene.rest().still_fraction > 0.1
     rest = scene.rest()
     assert not rest.room
     assert not rest.nothing_moves
