@@ -22,12 +22,21 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.cropping import cropped
-from pimper_torch.coarse.fine_surface import closed_surface, poisson, seen_surface, supports
+from pimper_torch.coarse.fine_surface import (
+    CELL_PX,
+    POINT_PX,
+    REACH_PX,
+    TOLERANCE_PX,
+    closed_surface,
+    poisson,
+    seen_surface,
+    supports,
+)
 from pimper_torch.coarse.matched import matched_cloud
-from pimper_torch.coarse.oriented import OrientedPoints, joined_points
-from pimper_torch.coarse.select import frontal_view
+from pimper_torch.coarse.oriented import OrientedPoints
+from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.surface import CoarseSurface
-from pimper_torch.coarse.trim import evidence, point_distances
+from pimper_torch.coarse.trim import point_distances, view_counts
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
@@ -90,11 +99,11 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
     reliable = builder.reliable(scene)
     inside = reliable[hull.depth_of(scene.points_world[reliable]) > 0]
     part = cropped(scene, silhouettes)
-    cloud, maps, pixel = matched_cloud(part, inside, builder.densify, builder.fine.point_px)
-    away, cell = builder.fine.tolerance_px * pixel, builder.fine.cell_px * pixel
+    cloud, maps, pixel = matched_cloud(part, inside, builder.densify, POINT_PX)
+    away, cell = TOLERANCE_PX * pixel, CELL_PX * pixel
     cloud = cloud.take(hull.depth_of(cloud.points_world) > -away)
-    vertices, faces, contour = closed_surface(cloud, contours, pixel, builder.outlined)
-    joined = joined_points(cloud, _oriented(contour))
+    vertices, faces, contour = closed_surface(cloud, contours, pixel)
+    joined = OrientedPoints.cat([cloud, _oriented(contour)])
 
     def given(masked: bool) -> Surface:
         some = scene.replace(views=scene.views.replace(masks=silhouettes.masks if masked else None))
@@ -104,11 +113,11 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
 
     def facets(some: Surface) -> Surface:
         vertices, faces = some
-        said = evidence(vertices, faces, maps.level, maps)
+        counts = view_counts(vertices, faces, maps.level, maps)
         centre = vertices[faces].mean(dim=1)
-        support = supports(centre, cloud, contour, said, builder.fine.reach_px * pixel)
+        support = supports(centre, cloud, contour, counts, REACH_PX * pixel)
         within = hull.depth_of(centre) > -max(away, float(hull.spacing))
-        kept = seen_surface(vertices, faces, support, said, within, pixel, builder.outlined)
+        kept = seen_surface(vertices, faces, support, counts, within, pixel, builder.fine)
         used, faces = torch.unique(faces[kept], return_inverse=True)
         if len(faces) <= builder.config.num_facets:
             return vertices[used], faces
@@ -129,12 +138,12 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
             normals_world=normalize(normals[unknown], dim=1),
             noise=torch.zeros(int(unknown.sum())),
         )
-        return poisson(joined_points(joined, filled), cell, builder.fine.max_depth)
+        return poisson(OrientedPoints.cat([joined, filled]), cell)
 
     return {
         "no silhouettes": lambda: given(False),
         "no silhouettes, photographs masked": lambda: given(True),
-        "Poisson of points": lambda: facets(poisson(cloud, cell, builder.fine.max_depth)),
+        "Poisson of points": lambda: facets(poisson(cloud, cell)),
         "min-cut of points": lambda: facets(cut_surface(cloud, maps, hull)),
         "min-cut of points and contours": lambda: facets(cut_surface(cloud, maps, hull, contour)),
         "Poisson of points, contours, and the cut between": lambda: facets(both()),
@@ -160,7 +169,7 @@ class Judge:
         self._truth_from_world = similarity_between_cameras(
             scene.cameras.take(ours.tolist()), capture.cameras.take(theirs.tolist())
         ).double()
-        view = capture.views.names.index(scene.views.names[frontal_view(scene)])
+        view = capture.views.names.index(scene.views.names[reference_view(scene)])
         self._maps = read_rendered(folder, views=[view], photographs=False)
         self._surface = TrueSurface(capture, samples=50_000)
 

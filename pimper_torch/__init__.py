@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pimper_torch.chains.published import Published, PublishedConfig
     from pimper_torch.coarse.remesh import Remesh
     from pimper_torch.coarse.surface import CoarseSurface
-    from pimper_torch.coarse.triangulate import Triangulate
     from pimper_torch.fusion.fuse import Fuse
     from pimper_torch.io.meshes import read_mesh
     from pimper_torch.io.photographs import load_views
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from pimper_torch.io.tensors import scene_of
     from pimper_torch.meshing.extract import Extract
     from pimper_torch.meshing.repair import Repair
+    from pimper_torch.paper.triangulate import Triangulate
     from pimper_torch.patches.decompose import Decompose
     from pimper_torch.patches.warp import Warp
     from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
@@ -142,7 +142,7 @@ _HOMES = {
     ),
     "pimper_torch.coarse.remesh": ("Remesh",),
     "pimper_torch.coarse.surface": ("CoarseSurface",),
-    "pimper_torch.coarse.triangulate": ("Triangulate",),
+    "pimper_torch.paper.triangulate": ("Triangulate",),
     "pimper_torch.fusion.fuse": ("Fuse",),
     "pimper_torch.io.meshes": ("read_mesh",),
     "pimper_torch.io.photographs": ("load_views",),

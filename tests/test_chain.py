@@ -10,7 +10,6 @@ from torch.nn.functional import normalize
 
 import pimper_torch as pt
 from pimper_torch.coarse.surface import CoarseSurface
-from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.metrics import compare_in_view, pair_views, similarity_between_cameras
 from pimper_torch.evidence.metrics.relative import ViewComparison, angles_deg
@@ -27,6 +26,7 @@ from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Plane, Shape, Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
 from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.records import (
     CoarseMesh,
     Mesh,

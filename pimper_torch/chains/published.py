@@ -9,12 +9,12 @@ from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
-from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.paper.alignment.align import Align, AlignConfig
 from pimper_torch.paper.integrate import Integrate, IntegrateConfig
 from pimper_torch.paper.refinement.refine import Refine, RefineConfig
+from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig

@@ -13,16 +13,15 @@ from pimper_torch.coarse.cropping import cropped
 from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.matched import matched_cloud, pixel_size_at
 from pimper_torch.coarse.matching import level_of
-from pimper_torch.coarse.oriented import OrientedPoints, joined_points, no_points
+from pimper_torch.coarse.oriented import OrientedPoints, no_points
 from pimper_torch.coarse.trim import (
-    Terms,
+    ViewCounts,
+    connected_to,
     enclosed_holes,
     fringes,
-    hanging_together,
     point_distances,
-    supported_pieces,
-    terms,
-    too_far,
+    supported_components,
+    view_counts,
     without_small_holes,
 )
 from pimper_torch.config import require
@@ -33,65 +32,58 @@ from pimper_torch.records import Cameras, ContourPoints, Record, SparseScene, Su
 from pimper_torch.sfm.surfaces import poisson_surface
 from pimper_torch.silhouettes.contours import Contours
 
-# Barycentric coordinates of the places that tell what supports a facet.
-_PLACES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
+# Lengths in pixels are those of the finest depth maps, at the cloud's median depth. Choices,
+# those of the surface through points and rims that benchmarks/README.md measures:
+# the finest grid of the cloud; the octree's cell; how far points and surface may lie outside the
+# visual hull; how near a face is to the points or contour points that support it.
+POINT_PX, CELL_PX, TOLERANCE_PX, REACH_PX = 1.0, 4.0, 4.0, 4.0
 
-# Cosine between a surface's normal and the ray to a camera, above which it faces that.
+# Of the octree, whatever the cell: 1024 cells along a side bound its memory.
+MAX_DEPTH = 10
+
+# How often contour points are found, each time on the surface before; the first time on the points.
+_ITERATIONS = 3
+
+# A component needs this fraction of the area that points or contours support. A choice.
+MIN_FRACTION = 0.01
+
+# Barycentric coordinates, times 6, of the points of a facet that vote for its support.
+_VOTES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
+
+# Cosine between a surface's normal and the ray to a camera, above which it faces that. A choice.
 _FACING = 0.1
 
-# Points that make a surface, with contours or without.
+# Points and contour points that a surface can be put through, at least. A choice.
 _MIN_POINTS = 16
 
-# Views that see something behind a face which is a lid; that show a lit one lit.
-_DENYING, _LIGHTING = 2, 2
+# Views that see something behind a face which is dropped; that see an illuminated one lit: one view
+# may be wrong.
+_MIN_BEHIND, _MIN_LIT = 2, 2
 
-# Without silhouettes: pixels from all points, beyond which seen faces without any go, and with them
-# what hangs together with them further than the second from all points.
-_GAP_PX, _BRINK_PX = 40.0, 10.0
+# Without silhouettes a face without points is dropped where it is further than the first from all
+# points, with all connected to it that are further than the second. Spans over gaps in potatoes
+# stay, and what hangs in the air beside the object is dropped (benchmarks/README.md, ablations).
+_GAP_PX, _MARGIN_PX = 40.0, 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FineSurfaceConfig:
-    """How points and contours become a surface.
-
-    Lengths in pixels are those of the finest depth maps, at the cloud's median depth.
+    """Which holes of the surface are closed.
 
     Attributes:
-        point_px: Of the cloud's finest grid.
-        cell_px: Of the surface's octree.
-        max_depth: Of the octree, whatever the cell.
-        touches: How often the places are found where contours touch the surface, each time on the
-            surface before; the first time on the points.
-        tolerance_px: By which points and surface may lie outside the visual hull.
-        reach_px: A face nearer to a point, or a contour point, than this is supported by it.
-        hole_px: Side of a square as large as the largest hole that is closed whatever made it.
-            Strips along a border that are narrower go, where they are small or unsupported.
+        hole_px: Side of a square as large as the largest hole that is closed whatever made it,
+            pixels of the finest depth maps. Strips along a border that are narrower go, where
+            they are small or unsupported.
         max_unseen: Fraction of the area seen that a hole may have which only lack of views made,
             such as the bottom of a deep concavity, to be closed.
-        min_fraction: Of the area that points or contours support, which a piece apart has to have.
     """
 
-    point_px: float = 1.0
-    cell_px: float = 4.0
-    max_depth: int = 10
-    touches: int = 3
-    tolerance_px: float = 4.0
-    reach_px: float = 4.0
     hole_px: float = 24.0
     max_unseen: float = 0.02
-    min_fraction: float = 0.01
 
     def __post_init__(self) -> None:
-        name = "fine_surface"
-        require(self.cell_px > 0, f"{name}.cell_px", self.cell_px, "above 0")
-        require(2 <= self.max_depth <= 12, f"{name}.max_depth", self.max_depth, "2 to 12")
-        require(self.touches >= 1, f"{name}.touches", self.touches, "1 or more")
-        require(self.tolerance_px >= 0, f"{name}.tolerance_px", self.tolerance_px, "0 or more")
-        require(self.point_px > 0, f"{name}.point_px", self.point_px, "above 0")
-        require(self.reach_px > 0, f"{name}.reach_px", self.reach_px, "above 0")
-        require(0 <= self.min_fraction < 1, f"{name}.min_share", self.min_fraction, "in [0, 1)")
-        require(self.hole_px >= 0, f"{name}.hole_px", self.hole_px, "0 or more")
-        require(0 <= self.max_unseen < 1, f"{name}.max_unseen", self.max_unseen, "in [0, 1)")
+        require(self.hole_px >= 0, "fine_surface.hole_px", self.hole_px, "0 or more")
+        require(0 <= self.max_unseen < 1, "fine_surface.max_unseen", self.max_unseen, "in [0, 1)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -101,8 +93,8 @@ class FineSurface(Record):
     Attributes:
         vertices_world: Its vertices.
         faces: Its faces.
-        support: What supports each, see :class:`~pimper_torch.records.Support`.
-        pixel: Size of one of the finest depth maps there, scene units.
+        support: Of each, a value of :class:`~pimper_torch.records.Support`.
+        pixel: Size of a pixel of the finest depth maps there, scene units.
     """
 
     vertices_world: Float[Tensor, "vertex 3"]
@@ -111,14 +103,13 @@ class FineSurface(Record):
     pixel: float
 
     def support_of(self, corners: Float[Tensor, "facet 3 3"]) -> Int[Tensor, " facet"]:
-        """Give facets the support that most of their places have on this surface."""
+        """Give facets the support that this surface has nearest to most of their points."""
         centre = self.vertices_world[self.faces].mean(dim=1)
-        weights = corners.new_tensor(_PLACES) / 6
-        places = torch.einsum("pk,fkc->fpc", weights, corners).flatten(0, 1)
+        points = torch.einsum("pk,fkc->fpc", corners.new_tensor(_VOTES) / 6, corners)
         tree = cKDTree(centre.detach().cpu().numpy())
-        _, nearest = tree.query(places.detach().cpu().numpy())
+        _, nearest = tree.query(points.flatten(0, 1).detach().cpu().numpy())
         found = self.support[torch.from_numpy(nearest).to(self.support.device)]
-        return found.reshape(len(corners), len(_PLACES)).mode(dim=1).values
+        return found.reshape(len(corners), len(_VOTES)).mode(dim=1).values
 
 
 def fine_surface(
@@ -130,47 +121,43 @@ def fine_surface(
 ) -> FineSurface:
     """Put a surface through matched points and contours, smooth where there are neither.
 
+    It is closed except where no view sees it, and where views look into an opening. Where
+    silhouettes constrain nothing, faces without points have to be near to some, and
+    illuminated in two views.
+
     Args:
         scene: Photographs, cameras and cloud.
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
-        contours: What silhouettes say about the surface.
+        contours: Rays and visual hull of the silhouettes.
         densify: How photographs are matched.
         config: Settings.
 
-    Returns:
-        What a view sees of the closed surface, inside the silhouettes. It is closed except where
-        nothing was photographed, and where views look into an opening. Where silhouettes leave
-        nothing out, faces without points have to be near to some, and to show something in two
-        views.
-
     Raises:
-        ReconstructionError: Silhouettes and photographs tell of no surface.
+        ReconstructionError: Silhouettes and photographs support no surface.
     """
     part = cropped(scene, contours.silhouettes)
     centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
     cloud, maps = no_points(centre), None
     if len(reliable) >= _MIN_POINTS or not contours.confine:
-        found, maps, pixel = matched_cloud(part, reliable, densify, config.point_px)
-        cloud = found.take(
-            contours.hull.depth_of(found.points_world) > -config.tolerance_px * pixel
-        )
+        found, maps, pixel = matched_cloud(part, reliable, densify, POINT_PX)
+        cloud = found.take(contours.hull.depth_of(found.points_world) > -TOLERANCE_PX * pixel)
         level = maps.level
     else:
         factor = densify.factors(max(part.views.images.shape[-2:]))[-1]
         pixel, level = factor * pixel_size_at(centre, scene.cameras), level_of(part, factor)
-    vertices, faces, contour = closed_surface(cloud, contours, pixel, config)
-    said = terms(vertices, faces, level, maps)
+    vertices, faces, contour = closed_surface(cloud, contours, pixel)
+    counts = view_counts(vertices, faces, level, maps)
     centres = vertices[faces].mean(dim=1)
-    support = supports(centres, cloud, contour, said, config.reach_px * pixel)
+    support = supports(centres, cloud, contour, counts, REACH_PX * pixel)
     if contours.confine:
-        inside = contours.hull.holds(centres, config.tolerance_px * pixel)
+        inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
     else:
-        inside = near_points(faces, centres, cloud, support, said, pixel)
-    kept = seen_surface(vertices, faces, support, said, inside, pixel, config)
+        inside = near_points(faces, centres, cloud, support, counts, pixel)
+    kept = seen_surface(vertices, faces, support, counts, inside, pixel, config)
     if not bool(kept.any()):
         raise ReconstructionError(
             f"coarse mesh: none of {len(faces)} faces is seen by the photographs inside the "
-            "silhouettes. Look at the masks, leave them out, or bring a mesh of your own."
+            "silhouettes. Look at the masks, leave them out, or give a mesh of your own."
         )
     used, faces = torch.unique(faces[kept], return_inverse=True)
     return FineSurface(
@@ -179,19 +166,18 @@ def fine_surface(
 
 
 def closed_surface(
-    cloud: OrientedPoints, contours: Contours, pixel: float, config: FineSurfaceConfig
+    cloud: OrientedPoints, contours: Contours, pixel: float
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"], ContourPoints]:
     """Put a closed surface through points, tangent to the rays through the silhouettes.
 
     Where each ray touches it follows from the surface, and the surface from where rays touch
-    it: they are found in turn, from the points on. Parts that no camera sees tell nothing: behind
-    an object seen from one side the hull is deep, and the surface fills it.
+    it: they are found in turn, from the points on. Parts that no camera sees do not count:
+    behind an object seen from one side the hull is deep, and the surface fills it.
 
     Args:
         cloud: Matched points inside the silhouettes.
         contours: Rays and visual hull of the same silhouettes.
         pixel: Size of one, scene units.
-        config: Settings.
 
     Returns:
         Vertices, faces, and the contour points that the surface goes through.
@@ -199,9 +185,9 @@ def closed_surface(
     Raises:
         ReconstructionError: Too few of both.
     """
-    places, normals = cloud.points_world, cloud.normals_world
-    for _ in range(config.touches):
-        touched = contours.touching(places, normals)
+    points, normals = cloud.points_world, cloud.normals_world
+    for _ in range(_ITERATIONS):
+        touched = contours.touching(points, normals)
         contour = OrientedPoints(
             points_world=touched.points_world.to(cloud.points_world),
             normals_world=touched.normals_world.to(cloud.points_world),
@@ -211,60 +197,58 @@ def closed_surface(
             raise ReconstructionError(
                 f"coarse mesh: {len(cloud.points_world)} points were matched inside the "
                 f"silhouettes, and {len(touched.ray)} rays touch the surface there; some hundreds "
-                "are needed. Take photographs that overlap more, look at the masks, or bring a "
+                "are needed. Take photographs that overlap more, look at the masks, or give a "
                 "mesh of your own."
             )
-        # Points alone know more than contours: an octree's cell is as wide as two of their grid.
-        cell = (config.cell_px if len(touched.ray) else 2 * config.point_px) * pixel
-        vertices, faces = poisson(joined_points(cloud, contour), cell, config.max_depth)
+        # Points are denser than contours: without these an octree's cell is two of their grid.
+        cell = (CELL_PX if len(touched.ray) else 2 * POINT_PX) * pixel
+        vertices, faces = poisson(OrientedPoints.cat([cloud, contour]), cell)
         if not len(touched.ray):
             break
         normals = vertex_normals(vertices, faces)
-        front = shown(vertices, faces, normals, contours.cameras, config.cell_px * pixel)
-        places, normals = vertices[front], normals[front]
+        front = visible_vertices(vertices, faces, normals, contours.cameras, CELL_PX * pixel)
+        points, normals = vertices[front], normals[front]
     return vertices, faces, touched
 
 
-def shown(
+def visible_vertices(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     normals: Float[Tensor, "vertex 3"],
     cameras: Cameras,
     tolerance: float,
 ) -> Bool[Tensor, " vertex"]:
-    """Mark the vertices that face a camera and are not hidden from it.
+    """Mark the vertices that face a camera and are not occluded.
 
     Args:
         vertices: Of a surface.
         faces: Of it.
         normals: Of its vertices.
-        cameras: That look at it.
-        tolerance: A surface closer than this in front of a vertex does not hide it.
+        cameras: Of all views.
+        tolerance: A surface closer than this in front of a vertex does not occlude it.
     """
     caster, found = RayCaster(vertices, faces), torch.zeros_like(vertices[:, 0], dtype=torch.bool)
     for center in cameras.centers_world.to(vertices):
         towards = normalize(center - vertices, dim=1)
-        asked = ((towards * normals).sum(dim=1) > _FACING) & ~found
-        found[asked] = ~caster.occluded(vertices[asked], center, tolerance)
+        facing = ((towards * normals).sum(dim=1) > _FACING) & ~found
+        found[facing] = ~caster.occluded(vertices[facing], center, tolerance)
     return found
 
 
 def poisson(
-    cloud: OrientedPoints, cell: float, max_depth: int
+    cloud: OrientedPoints, cell: float
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Put a closed surface through points.
+    """Put a closed surface through points with outward normals.
 
     Args:
-        cloud: Points with outward normals.
+        cloud: The points.
         cell: Side of the octree's cells, scene units.
-        max_depth: Of the octree, whatever the cell.
     """
     points = cloud.points_world
     # COLMAP works in single precision: a cloud far from the origin is brought there.
     centre = points.median(dim=0).values
     extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
-    cells = extent / cell
-    depth = min(max_depth, round(math.log2(cells)))
+    depth = min(MAX_DEPTH, round(math.log2(extent / cell)))
     vertices, faces = poisson_surface(
         points - centre, cloud.normals_world, depth=depth, point_weight=1.0
     )
@@ -276,44 +260,49 @@ def near_points(
     centre: Float[Tensor, "face 3"],
     cloud: OrientedPoints,
     support: Int[Tensor, " face"],
-    said: Terms,
+    counts: ViewCounts,
     pixel: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark faces with points, and those between points that views see and that are near to some.
+    """Mark faces with points, and illuminated faces between points that are near to some.
+
+    A component of faces further than the margin from all points is not marked if one of them is
+    further than the gap: surface that spans a gap inside the object is joined to surface in
+    the air beside it by strips along points, which the margin cuts through.
 
     Args:
         faces: Of the closed surface.
         centre: Of them.
         cloud: Matched points.
         support: Of each face.
-        said: What the photographs say about each.
+        counts: Of the views that see each.
         pixel: Size of one, scene units.
     """
     supported = support == Support.POINTS
     distance = point_distances(centre, cloud.points_world)
-    between = (said.lit >= _LIGHTING) & (said.denied < _DENYING) & ~supported
-    far = too_far(faces, between, distance, _GAP_PX * pixel, _BRINK_PX * pixel)
-    return (supported & (said.seen >= _LIGHTING)) | (between & ~far)
+    between = (counts.lit >= _MIN_LIT) & (counts.behind < _MIN_BEHIND) & ~supported
+    beyond = between & (distance > _MARGIN_PX * pixel)
+    far = connected_to(faces, beyond, distance > _GAP_PX * pixel)
+    return (supported & (counts.seen >= _MIN_LIT)) | (between & ~far)
 
 
 def supports(
     centre: Float[Tensor, "face 3"],
     cloud: OrientedPoints,
     contour: ContourPoints,
-    said: Terms,
+    counts: ViewCounts,
     reach: float,
 ) -> Int[Tensor, " face"]:
-    """Tell what supports each face of a fine surface.
+    """Give the :class:`~pimper_torch.records.Support` of each face of a fine surface.
 
     Args:
         centre: Of the faces.
         cloud: Matched points.
-        contour: TraceContours points.
-        said: What the photographs say about the faces.
+        contour: Contour points.
+        counts: Of the views that see each face.
         reach: Distance to a point, or a contour point, that supports a face.
     """
-    found = torch.full_like(said.seen, Support.NOTHING)
-    found[said.lit >= _LIGHTING] = Support.LIGHT
+    found = torch.full_like(counts.seen, Support.NOTHING)
+    found[counts.lit >= _MIN_LIT] = Support.LIGHT
     for points, support in (
         (contour.points_world, Support.CONTOUR),
         (cloud.points_world, Support.POINTS),
@@ -327,38 +316,38 @@ def seen_surface(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     support: Int[Tensor, " face"],
-    said: Terms,
+    counts: ViewCounts,
     inside: Bool[Tensor, " face"],
     pixel: float,
     config: FineSurfaceConfig,
 ) -> Bool[Tensor, " face"]:
-    """Mark the faces that stay: what a view sees, points and contours, in the visual hull.
+    """Mark the faces that stay: in the visual hull, and seen or supported.
 
-    A lid goes: a face without points behind which views see something. What no view sees stays
-    where it is a small hole in the rest; the back of an object seen from one side is a large one.
-    The border has no fringes.
+    A face without points that views see through is dropped: it closes an opening. Faces that no
+    view sees stay where they close a small hole; the back of an object seen from one side is a
+    large one. Narrow strips along the border are dropped.
 
     Args:
         vertices: Of the closed surface.
         faces: Of it.
         support: Of each face.
-        said: What the photographs say about each.
+        counts: Of the views that see each.
         inside: True for faces in the visual hull.
         pixel: Size of one, scene units.
         config: Settings.
     """
     known = support >= Support.CONTOUR
     small = (config.hole_px * pixel) ** 2
-    possible = inside & ((said.denied < _DENYING) | (support == Support.POINTS))
+    possible = inside & ((counts.behind < _MIN_BEHIND) | (support == Support.POINTS))
     possible = without_small_holes(vertices, faces, possible, small)
-    kept = possible & ((said.seen > 0) | known)
+    kept = possible & ((counts.seen > 0) | known)
     area = float(face_normals(vertices, faces[kept]).norm(dim=1).sum()) / 2
     holes = enclosed_holes(vertices, faces, kept, config.max_unseen * area)
-    kept = kept | (holes & ~hanging_together(faces, ~kept, ~possible))
+    kept = kept | (holes & ~connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
-    rings = int(config.hole_px / (2 * config.cell_px))
+    rings = int(config.hole_px / (2 * CELL_PX))
     kept &= ~fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)
     (chosen,) = torch.nonzero(kept, as_tuple=True)
-    pieces = supported_pieces(vertices, faces[chosen], known[chosen], config.min_fraction)
-    kept[chosen[~pieces]] = False
+    stays = supported_components(vertices, faces[chosen], known[chosen], MIN_FRACTION)
+    kept[chosen[~stays]] = False
     return kept

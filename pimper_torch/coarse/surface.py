@@ -1,54 +1,44 @@
-"""Coarse mesh all round: facets on everything that a few views see, without a reference view."""
+"""The coarse mesh: a surface through the cloud and the contours, simplified to facets."""
 
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from pimper_torch.coarse.brought import checked
-from pimper_torch.coarse.cloud import point_covariances
+from pimper_torch.coarse.covariances import point_covariances
 from pimper_torch.coarse.densify import DensifyConfig
-from pimper_torch.coarse.fine_surface import (
-    FineSurface,
-    FineSurfaceConfig,
-    fine_surface,
-)
+from pimper_torch.coarse.fine_surface import MIN_FRACTION, FineSurfaceConfig, fine_surface
+from pimper_torch.coarse.given_mesh import oriented_outward
 from pimper_torch.coarse.matched import pixel_size
-from pimper_torch.coarse.select import frontal_view, named_view
-from pimper_torch.coarse.triangulate import smooth_over_mesh
-from pimper_torch.coarse.trim import (
-    supported_pieces,
-)
+from pimper_torch.coarse.reference import reference_view
+from pimper_torch.coarse.trim import supported_components
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import triangulation_angles
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import face_edges, face_normals, vertex_normals
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 from pimper_torch.sfm.surfaces import simplified
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
 
-# Of a mesh's border against its surface, when vertices are merged.
+# Weight of a mesh's border against its area when vertices are merged. A choice.
 _BORDER_WEIGHT = 10.0
 
-# Pixels of the finest depth maps from its facet that a point of the sparse cloud may lie.
-_NEAR_PX = 4.0
+# Pixels of the finest depth maps between a facet and the points of the cloud on it. A choice.
+_ON_FACET_PX = 4.0
 
-# Of a point of the sparse cloud that is trusted: views that saw it, mean reprojection error, widest
-# angle between its rays.
+# Of a reliable point of the cloud: views, mean reprojection error, widest angle between its rays.
+# Choices: two views of a wrong match always agree, three seldom; narrower angles leave depth
+# uncertain.
 _MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 3, 1.5, 4.0
-
-# How often normals of vertices are averaged with their neighbours'.
-_SMOOTHING = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoarseSurfaceConfig:
-    """How the cloud becomes dense, the surface, and what of it stays.
-
-    Lengths in pixels are those of the finest depth maps, at the cloud's median depth.
+    """The reference view and the size of the coarse mesh.
 
     Attributes:
         reference: Name or stem of the frontal photograph; empty chooses it.
@@ -63,7 +53,7 @@ class CoarseSurfaceConfig:
 
 
 class CoarseSurface(Stage):
-    """CoarseSurface the object in facets; the result is a constant to autograd."""
+    """Give the object's surface in a few thousand facets; the result is a constant to autograd."""
 
     def __init__(
         self,
@@ -79,59 +69,56 @@ class CoarseSurface(Stage):
     def forward(
         self, scene: SparseScene, contours: Contours, mesh: Mesh | None = None
     ) -> CoarseMesh:
-        """Make the coarse mesh of depth maps and silhouettes, or of a mesh that is given.
+        """Make the coarse mesh of depth maps and silhouettes, or of a given mesh.
 
         Args:
             scene: Photographs, cameras and cloud.
-            contours: What silhouettes say: all of the object gets facets, and nothing else does.
-                Where they leave nothing out, what no point is near to gets none.
-            mesh: A surface in the scene's frame, used instead of the photographs' own.
+            contours: Of the silhouettes: all of the object gets facets, and nothing else does.
+                Where they constrain nothing, surface far from all points gets none.
+            mesh: A surface in the scene's frame, used in place of the photographs' own.
 
         Raises:
-            InputError: No registered photograph has the reference's name, or the mesh that
-                is given cannot be used.
-            ReconstructionError: Too few points can be trusted or matched, or no face is
-                borne out.
+            InputError: No registered photograph has the reference's name, or no camera sees the
+                given mesh.
+            ReconstructionError: Too few points are reliable or matched, or the photographs
+                support no face.
         """
-        config = self.config
-        if config.reference:
-            reference = named_view(scene.views, config.reference)
-        else:
-            reference = frontal_view(scene)
-        reliable = self.reliable(scene)
-        fine: FineSurface | None = None
+        reference = reference_view(scene, self.config.reference)
+        reliable, count = self.reliable(scene), self.config.num_facets
         if mesh is not None:
-            vertices, faces = checked(mesh, scene.cameras)
+            vertices, faces = _simplified(*oriented_outward(mesh, scene.cameras), count)
             pixel = pixel_size(scene, reliable) if len(reliable) else float("inf")
+            support = None
         else:
             reliable = reliable[contours.hull.depth_of(scene.points_world[reliable]) > 0]
             if len(reliable) < 4 and not contours.confine:
                 raise ReconstructionError(
-                    f"coarse mesh: {len(reliable)} of {len(scene.points_world)} sparse points can "
-                    f"be trusted ({_MIN_TRACK} views, {_MAX_ERROR_PX} px, {_MIN_ANGLE_DEG} "
+                    f"coarse mesh: {len(reliable)} of {len(scene.points_world)} sparse points are "
+                    f"reliable ({_MIN_TRACK} views, {_MAX_ERROR_PX} px, {_MIN_ANGLE_DEG} "
                     "degrees), and at least 4 are needed. Take more photographs."
                 )
             fine = fine_surface(scene, reliable, contours, self.densify, self.fine)
-            vertices, faces, pixel = fine.vertices_world, fine.faces, fine.pixel
-        if len(faces) > config.num_facets:
-            vertices, faces = _few(vertices, faces, config.num_facets)
-        if fine is not None:
+            vertices, faces = _simplified(fine.vertices_world, fine.faces, count)
             faces = two_faces_an_edge(vertices, faces)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
-            pieces = supported_pieces(vertices, faces, whole, self.fine.min_fraction)
-            vertices, faces = _used(vertices, faces[pieces])
-        normals = smooth_over_mesh(vertex_normals(vertices, faces), faces, _SMOOTHING)
+            kept = supported_components(vertices, faces, whole, MIN_FRACTION)
+            vertices, faces = _used(vertices, faces[kept])
+            pixel, support = fine.pixel, fine.support_of(vertices[faces])
         return CoarseMesh(
-            mesh=Mesh(vertices_world=vertices, faces=faces, normals_world=normals),
+            mesh=Mesh(
+                vertices_world=vertices,
+                faces=faces,
+                normals_world=smoothed_normals(vertices, faces),
+            ),
             reference=reference,
             is_point=torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device),
             covariance_world=torch.zeros_like(vertices)[:, :, None].expand(-1, 3, 3),
-            points=_on_facets(scene, reliable, vertices, faces, pixel),
-            support=None if fine is None else fine.support_of(vertices[faces]),
+            points=_on_facets(scene, reliable, vertices, faces, _ON_FACET_PX * pixel),
+            support=support,
         )
 
     def reliable(self, scene: SparseScene) -> Int[Tensor, " reliable"]:
-        """List the points of the cloud that enough views saw well enough."""
+        """List the points of the cloud with enough views, small residuals and wide angles."""
         observed = scene.observed
         angle = triangulation_angles(scene.points_world, observed, scene.cameras.centers_world)
         reliable = (
@@ -142,24 +129,15 @@ class CoarseSurface(Stage):
         return reliable.nonzero()[:, 0]
 
 
-def _on_facets(
-    scene: SparseScene,
-    reliable: Int[Tensor, " reliable"],
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    pixel: float,
-) -> FacetPoints:
-    """List the points of the cloud that lie near a facet."""
-    found = NearestSurface(Mesh(vertices_world=vertices, faces=faces)).query(
-        scene.points_world[reliable]
-    )
-    near = found.distance <= _NEAR_PX * pixel
-    chosen = reliable[near]
-    return FacetPoints(
-        points_world=scene.points_world[chosen],
-        covariance_world=point_covariances(scene, chosen),
-        facet=found.face[near],
-    )
+def smoothed_normals(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, "vertex 3"]:
+    """Average each vertex normal with the mean of those of its neighbours; unit."""
+    normals = vertex_normals(vertices, faces)
+    source = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1)
+    target = faces[:, [1, 0, 2, 1, 0, 2]].reshape(-1)
+    total = torch.zeros_like(normals).index_add(0, target, normals[source])
+    return normalize(normals + normalize(total, dim=-1), dim=-1)
 
 
 def two_faces_an_edge(
@@ -167,9 +145,9 @@ def two_faces_an_edge(
 ) -> Int[Tensor, "kept 3"]:
     """Drop the smallest face of edges with three or more until each has two at most."""
     while True:
-        edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
-        _, edge, counts = torch.unique(edges, dim=0, return_inverse=True, return_counts=True)
-        crowded = (counts[edge] > 2).reshape(-1, 3).any(dim=1)
+        edges, face_edge = face_edges(faces)
+        counts = torch.bincount(face_edge.flatten(), minlength=len(edges))
+        crowded = (counts[face_edge] > 2).any(dim=1)
         if not bool(crowded.any()):
             return faces
         area = face_normals(vertices, faces).norm(dim=-1)
@@ -177,9 +155,32 @@ def two_faces_an_edge(
         faces = torch.cat([faces[:smallest], faces[smallest + 1 :]])
 
 
-def _few(
+def _on_facets(
+    scene: SparseScene,
+    reliable: Int[Tensor, " reliable"],
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    max_distance: float,
+) -> FacetPoints:
+    """List the reliable points of the cloud that lie near a facet."""
+    found = NearestSurface(Mesh(vertices_world=vertices, faces=faces)).query(
+        scene.points_world[reliable]
+    )
+    near = found.distance <= max_distance
+    return FacetPoints(
+        points_world=scene.points_world[reliable[near]],
+        covariance_world=point_covariances(scene, reliable[near]),
+        facet=found.face[near],
+    )
+
+
+def _simplified(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], count: int
 ) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
+    """Simplify to a number of faces; a mesh with no more than that comes back as it is."""
+    if len(faces) <= count:
+        return vertices, faces
+    # COLMAP works in single precision: a mesh far from the origin is brought there.
     centre = vertices.median(dim=0).values
     fewer, left = simplified(
         vertices - centre, faces, num_faces=count, boundary_weight=_BORDER_WEIGHT

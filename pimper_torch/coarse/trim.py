@@ -1,4 +1,4 @@
-"""Which faces of a closed surface the photographs bear out."""
+"""Which faces of a closed surface the photographs support."""
 
 from dataclasses import dataclass
 
@@ -20,47 +20,49 @@ from pimper_torch.geometry.surfaces import (
 )
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import num_workers, side_by_side
-from pimper_torch.records import Cameras, Record
+from pimper_torch.records import Record
 
-# Cosine between a face's normal and the ray to a camera, above which the view shows it.
+# Cosine between a face's normal and the ray to a camera, above which a view counts. A choice: at
+# 84 degrees a face is a tenth as wide as it is long.
 _FACING = 0.1
 
-# Steps of inverse depth in front of what a view sees, beyond which it denies a face.
-_DENIED_STEPS = 4.0
+# Steps of inverse depth (see DepthMaps) by which a depth map lies behind a face that it
+# contradicts. A choice: depths that agree differ by a step at most, faces lie off points by some.
+_BEHIND_STEPS = 4.0
 
-# Tone (root of radiance over the bright level) above which a pixel shows something: a
-# twentieth of the bright level's radiance, the pedestal left out.
+# Tone (root of radiance over the bright level) of an illuminated pixel, at least. A choice: a
+# twentieth of the bright level's radiance, above the pedestal of a hundredth.
 _LIT_TONE = 0.06**0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Terms(Record):
-    """What the photographs say about faces.
+class ViewCounts(Record):
+    """Numbers of views, one of each a face.
 
     Attributes:
-        seen: In how many views a face is unhidden, within the picture, not turned away.
-        lit: In how many of them its pixel shows more than darkness.
-        denied: How many views see something behind it.
+        seen: In which the face is unoccluded, within the picture, and facing.
+        lit: In which, of these, its pixel is illuminated.
+        behind: Whose depth map lies behind the face: they look through it.
     """
 
     seen: Int[Tensor, " face"]
     lit: Int[Tensor, " face"]
-    denied: Int[Tensor, " face"]
+    behind: Int[Tensor, " face"]
 
 
-def terms(
+def view_counts(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     level: Level,
     maps: DepthMaps | None,
-) -> Terms:
-    """Ask every view about the centre of every face.
+) -> ViewCounts:
+    """Count the views that see the centre of each face, see it lit, and see through it.
 
     Args:
         vertices: Of the surface.
         faces: Of it.
         level: Photographs, at the resolution of the depth maps.
-        maps: What lies behind a face; without, nothing does.
+        maps: Of all views; without, none sees through a face.
     """
     cameras = level.cameras
     centre = vertices[faces].mean(dim=1)
@@ -68,74 +70,48 @@ def terms(
     side = side_lengths(vertices[faces]).amax(dim=1)
     caster = RayCaster(vertices, faces)
 
-    def said(view: int) -> Int[Tensor, "kind face"]:
-        seen, lit, denied = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
-        asked, column, row, depth = _shown(centre, cameras, view)
+    def of_view(view: int) -> Int[Tensor, "count face"]:
+        seen, lit, behind = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
         center = cameras.centers_world[view]
-        towards = normalize(center - centre[asked], dim=-1)
-        facing = (towards * normals[asked]).sum(dim=-1) > _FACING
-        asked, column, row, depth = asked[facing], column[facing], row[facing], depth[facing]
+        pixels, depth = project(centre, cameras.cam_from_world[view], cameras.intrinsics[view])
+        facing = (normalize(center - centre, dim=-1) * normals).sum(dim=-1) > _FACING
+        within = ((pixels >= 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
+        (chosen,) = torch.nonzero(within & facing, as_tuple=True)
+        column, row = pixels[chosen].floor().long().unbind(dim=-1)
         column = column.clamp_max(level.tone.shape[-1] - 1)
         row = row.clamp_max(level.tone.shape[-2] - 1)
         if maps is not None:
-            behind = maps.inverse_depth[view, row, column] + _DENIED_STEPS * maps.step[view]
-            denied[asked] = (maps.valid[view, row, column] & (1 / depth > behind)).long()
-        open_ = ~caster.occluded(centre[asked], center, 0.5 * side[asked])
-        open_ &= level.usable[view, row, column]
-        seen[asked] = open_.long()
-        lit[asked] = (open_ & (level.tone[view, row, column] > _LIT_TONE)).long()
-        return torch.stack([seen, lit, denied])
+            nearest = maps.inverse_depth[view, row, column] + _BEHIND_STEPS * maps.step[view]
+            through = maps.valid[view, row, column] & (1 / depth[chosen] > nearest)
+            behind[chosen] = through.long()
+        free = ~caster.occluded(centre[chosen], center, 0.5 * side[chosen])
+        free &= level.usable[view, row, column]
+        seen[chosen] = free.long()
+        lit[chosen] = (free & (level.tone[view, row, column] > _LIT_TONE)).long()
+        return torch.stack([seen, lit, behind])
 
-    total = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
-    for one in side_by_side(said, range(cameras.num_views), tracked=False):
-        total += one
-    seen, lit, denied = total
-    return Terms(seen=seen, lit=lit, denied=denied)
-
-
-def _shown(
-    points: Float[Tensor, "point 3"], cameras: Cameras, view: int
-) -> tuple[Int[Tensor, " shown"], Int[Tensor, " shown"], Int[Tensor, " shown"], Tensor]:
-    """List the points inside a view's picture: which, column, row, depth."""
-    pixels, depth = project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
-    within = ((pixels >= 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
-    column, row = pixels[within].floor().long().unbind(dim=-1)
-    return within.nonzero()[:, 0], column, row, depth[within]
+    counts = side_by_side(of_view, range(cameras.num_views), tracked=False)
+    seen, lit, behind = torch.stack(list(counts)).sum(dim=0)
+    return ViewCounts(seen=seen, lit=lit, behind=behind)
 
 
 def point_distances(
-    places: Float[Tensor, "place 3"], points: Float[Tensor, "point 3"]
-) -> Float[Tensor, " place"]:
-    """Give each place's distance to the nearest point."""
+    queries: Float[Tensor, "query 3"], points: Float[Tensor, "point 3"]
+) -> Float[Tensor, " query"]:
+    """Measure the distance of each query to the nearest point."""
     tree = cKDTree(points.detach().cpu().numpy())
-    distance, _ = tree.query(places.detach().cpu().numpy(), workers=num_workers())
-    return torch.from_numpy(distance).to(places)
+    distance, _ = tree.query(queries.detach().cpu().numpy(), workers=num_workers())
+    return torch.from_numpy(distance).to(queries)
 
 
-def hanging_together(
+def connected_to(
     faces: Int[Tensor, "face 3"], among: Bool[Tensor, " face"], marked: Bool[Tensor, " face"]
 ) -> Bool[Tensor, " face"]:
-    """Mark all faces that hang together with marked ones through faces ``among`` only."""
+    """Mark the connected components of the faces ``among`` that have a marked face."""
     pairs, _ = face_pairs(faces)
     label = graph_components(pairs[among[pairs].all(dim=1)], len(faces))
     count = torch.zeros_like(label).index_add(0, label, (marked & among).long())
     return among & (count[label] > 0)
-
-
-def too_far(
-    faces: Int[Tensor, "face 3"],
-    between: Bool[Tensor, " face"],
-    distance: Float[Tensor, " face"],
-    gap: float,
-    brink: float,
-) -> Bool[Tensor, " face"]:
-    """Mark faces between points that are further than ``gap`` from all, and their surroundings.
-
-    These are what hangs together with them further than ``brink`` from all points: what spans
-    a gap inside the object is joined to what hangs in the air by strips along points, which
-    cut nothing off here.
-    """
-    return hanging_together(faces, between & (distance > brink), distance > gap)
 
 
 def without_small_holes(
@@ -144,7 +120,7 @@ def without_small_holes(
     kept: Bool[Tensor, " face"],
     largest: float,
 ) -> Bool[Tensor, " face"]:
-    """Take back dropped faces that hang together over less than an area, in scene units."""
+    """Keep connected components of dropped faces too whose area is small, in scene units."""
     pairs, _ = face_pairs(faces)
     dropped = pairs[~kept[pairs].any(dim=1)]
     areas = component_areas(vertices, faces, graph_components(dropped, len(faces)))
@@ -157,9 +133,9 @@ def enclosed_holes(
     kept: Bool[Tensor, " face"],
     largest: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark connected dropped faces that kept ones enclose, of no more than an area together.
+    """Mark connected components of dropped faces, up to an area, that kept faces enclose.
 
-    What reaches the border of the surface is not enclosed.
+    A component that reaches the border of the surface is not enclosed.
     """
     found = torch.zeros_like(kept)
     (dropped,) = torch.nonzero(~kept, as_tuple=True)
@@ -181,19 +157,19 @@ def fringes(
     smallest: float,
     rings: int,
 ) -> Bool[Tensor, " face"]:
-    """Mark narrow strips and spurs beside dropped faces that little supports.
+    """Mark narrow strips and spurs beside dropped faces that are small or hardly supported.
 
-    Narrow is what a morphological opening takes away: erosion by so many rings of faces, then
-    dilation. Of that, components go that are smaller than an area, or less than half supported:
-    what is thin and supported, such as a handle seen from one side, stays.
+    Narrow is what a morphological opening removes: erosion by some rings of faces, then
+    dilation. Its components are marked that are smaller than an area, or less than half
+    supported: a thin part with support, such as a handle seen from one side, is not.
 
     Args:
         vertices: Of the surface.
         faces: Of it.
-        kept: Which are not dropped.
-        supported: Faces that something supports.
-        smallest: Area of a component that stays if it is supported.
-        rings: Half the width of the widest strip that is narrow, in faces.
+        kept: True for faces that are not dropped.
+        supported: True for faces with support.
+        smallest: Area from which a supported component is not marked.
+        rings: Half the width of the widest narrow strip, in faces.
     """
     core = ~_dilated(faces, ~kept, rings, len(vertices))
     narrow = kept & ~_dilated(faces, core, rings, len(vertices))
@@ -207,19 +183,19 @@ def fringes(
 def _dilated(
     faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], rings: int, num_vertices: int
 ) -> Bool[Tensor, " face"]:
-    """Mark some faces and so many rings of faces round them."""
+    """Mark some faces and a number of rings of faces round them."""
     for _ in range(rings):
         some = corners_of(faces, some, num_vertices)[faces].any(dim=1)
     return some
 
 
-def supported_pieces(
+def supported_components(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     supported: Bool[Tensor, " face"],
     fraction: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark the faces of components that hold a fraction of all the area that is supported."""
+    """Mark components with at least a fraction of the supported area of all."""
     everything = torch.zeros_like(faces[:, 0])
     own, total = (
         component_areas(vertices, faces, label, supported)

@@ -2,13 +2,14 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.coarse.densify import agreeing, median3, push_pull, sweep
+from pimper_torch.coarse.fine_surface import near_points
 from pimper_torch.coarse.matching import Matcher, Windows, level_of, mean_of_largest, pair
 from pimper_torch.coarse.oriented import OrientedPoints, fitted_planes, thinned
 from pimper_torch.coarse.trim import (
+    ViewCounts,
+    connected_to,
     fringes,
-    hanging_together,
-    supported_pieces,
-    too_far,
+    supported_components,
     without_small_holes,
 )
 from pimper_torch.evidence.scenes.cameras import arc_cameras
@@ -16,6 +17,7 @@ from pimper_torch.evidence.scenes.meshes import icosphere, table
 from pimper_torch.evidence.scenes.render import render_shape
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.records import Support
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
@@ -132,17 +134,17 @@ def test_poisson_puts_a_ball_through_points_of_a_ball_and_simplification_keeps_i
     assert (torch.linalg.cross(b - a, c - a) * (a + b + c)).sum(dim=-1).min() > 0
 
 
-def test_small_holes_are_closed_and_large_ones_and_crumbs_are_not():
+def test_small_holes_are_closed_and_large_ones_and_small_components_are_not():
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
     kept = (centre[:, 2] < 0.6) & ~(centre[:, 0] > 0.95)
     whole = torch.ones(len(faces), dtype=torch.bool)
-    assert (supported_pieces(vertices, faces, whole, 0.9)).all()
+    assert (supported_components(vertices, faces, whole, 0.9)).all()
     repaired = without_small_holes(vertices, faces, kept, 1.0)
     assert repaired[centre[:, 0] > 0.95].all()  # 0.3 of the area unit
     assert not repaired[centre[:, 2] > 0.6].any()  # 2.5
     crumbs = (centre[:, 2] < 0) | (centre[:, 2] > 0.97)
-    pieces = supported_pieces(vertices, faces[crumbs], whole[crumbs], 0.05)
+    pieces = supported_components(vertices, faces[crumbs], whole[crumbs], 0.05)
     assert (pieces == (centre[crumbs][:, 2] < 0)).all()
 
 
@@ -165,28 +167,38 @@ def test_narrow_strips_along_a_border_go_unless_they_are_long_and_supported():
     assert not bool(fringes(vertices, faces, kept, supported, 5.0, 0).any())
 
 
-def test_faces_go_with_what_they_hang_together_with():
+def test_faces_are_connected_to_marked_ones_through_their_kind_only():
     vertices, faces = icosphere(3)
     height = vertices[faces].mean(dim=1)[:, 2]
     caps = height.abs() > 0.5
-    found = hanging_together(faces, caps, height > 0.99)
+    found = connected_to(faces, caps, height > 0.99)
     assert (found == (height > 0.5)).all()
 
 
-def test_what_spans_a_gap_does_not_go_with_what_hangs_in_the_air_beside_it():
-    flat = table(half_side=12.0, cells=48)
-    centre = flat.vertices_world[flat.faces].mean(dim=1)[:, :2]
-    # Points all over, but in two discs of radius 6 and 3, and in a strip that joins them.
-    wide = (centre - centre.new_tensor([-5.0, 0.0])).norm(dim=-1)
-    narrow = (centre - centre.new_tensor([6.0, 0.0])).norm(dim=-1)
-    strip = torch.where((centre[:, 0] - 0.5).abs() < 5.5, 0.9 - centre[:, 1].abs(), 0.0)
-    distance = torch.stack([6 - wide, 3 - narrow, strip]).amax(dim=0).clamp_min(0)
-    between = distance > 0.2
-    hanging = hanging_together(flat.faces, between, distance > 4)
-    assert hanging[narrow < 2].all()  # the strip joins them
-    far = too_far(flat.faces, between, distance, 4.0, 1.0)
-    assert (far == (wide < 5)).all()
-    assert not too_far(flat.faces, between, distance, 6.0, 1.0).any()
+def test_surface_over_a_gap_stays_beside_surface_in_the_air_that_is_joined_to_it():
+    flat = table(half_side=72.0, cells=48)
+    centre = flat.vertices_world[flat.faces].mean(dim=1)
+    # Points all over, but in two discs and in a strip that joins them; a pixel is 1.
+    wide = (centre[:, :2] - centre.new_tensor([-20.0, 0.0])).norm(dim=-1)
+    narrow = (centre[:, :2] - centre.new_tensor([50.0, 0.0])).norm(dim=-1)
+    strip = (centre[:, 0].abs() < 50) & (centre[:, 1].abs() < 6)
+    empty = (wide < 48) | (narrow < 20) | strip
+    cloud = OrientedPoints(
+        points_world=centre[~empty],
+        normals_world=torch.zeros_like(centre[~empty]),
+        noise=torch.zeros_like(centre[~empty][:, 0]),
+    )
+    views = torch.full((len(centre),), 3)
+    counts = ViewCounts(seen=views, lit=views, behind=0 * views)
+    support = torch.where(empty, Support.LIGHT, Support.POINTS)
+    kept = near_points(flat.faces, centre, cloud, support, counts, 1.0)
+    assert not kept[wide < 36].any()  # 40 pixels from all points in the centre
+    assert kept[narrow < 20].all()
+    assert kept[~empty].all()
+    connected = connected_to(flat.faces, empty, wide < 8)
+    assert connected[narrow < 20].all()  # the strip joins them
+    dark = counts.replace(lit=0 * views)
+    assert (near_points(flat.faces, centre, cloud, support, dark, 1.0) == ~empty).all()
 
 
 def test_the_median_of_nine_is_that_of_a_sort():

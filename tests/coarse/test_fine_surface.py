@@ -7,7 +7,7 @@ from pimper_torch.coarse.cropping import cropped
 from pimper_torch.coarse.fine_surface import FineSurfaceConfig, closed_surface, seen_surface
 from pimper_torch.coarse.oriented import no_points
 from pimper_torch.coarse.surface import CoarseSurface
-from pimper_torch.coarse.trim import Terms
+from pimper_torch.coarse.trim import ViewCounts
 from pimper_torch.errors import ConfigError, ReconstructionError
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.meshes import icosphere
@@ -34,8 +34,8 @@ def half_mottled(points):
     return tone.expand_as(points)
 
 
-def enclosed(scene, some=lambda points: points[:, 2] > -2):
-    """CoarseSurface the ball with its silhouettes, on some points of its cloud."""
+def built(scene, some=lambda points: points[:, 2] > -2):
+    """The coarse mesh of a ball with its silhouettes, on some points of its cloud."""
     errors = torch.where(some(scene.points_world), 0.5, 100.0)
     scene = scene.replace(reprojection_errors_px=errors.to(scene.reprojection_errors_px))
     return CoarseSurface(*SETTINGS)(
@@ -48,9 +48,9 @@ def is_closed(mesh):
     return 2 * len(pairs) == 3 * len(mesh.faces) and int(face_components(mesh.faces).max()) == 0
 
 
-def test_a_ball_textured_on_one_half_is_enclosed_whole_and_says_what_supports_it(round_about):
+def test_a_ball_textured_on_one_half_is_closed_and_its_support_recorded(round_about):
     scene = photographed(round_about.cameras.to(torch.float64), half_mottled)
-    coarse = enclosed(scene, lambda points: points[:, 2] > 0)
+    coarse = built(scene, lambda points: points[:, 2] > 0)
     mesh = coarse.mesh
     assert is_closed(mesh)
     centre = mesh.vertices_world[mesh.faces].mean(dim=1)
@@ -66,9 +66,9 @@ def test_a_ball_textured_on_one_half_is_enclosed_whole_and_says_what_supports_it
     assert (coarse.support >= Support.LIGHT).float().mean() > 0.8
 
 
-def test_a_ball_of_one_colour_is_enclosed_by_its_silhouettes_alone(round_about):
+def test_a_ball_of_one_colour_follows_from_its_silhouettes_alone(round_about):
     scene = photographed(round_about.cameras.to(torch.float64), white)
-    coarse = enclosed(scene, lambda points: points[:, 2] > 2)
+    coarse = built(scene, lambda points: points[:, 2] > 2)
     assert is_closed(coarse.mesh)
     assert len(coarse.points.facet) == 0
     assert not bool((coarse.support == Support.POINTS).any())
@@ -80,7 +80,7 @@ def test_a_ball_of_one_colour_is_enclosed_by_its_silhouettes_alone(round_about):
 
 def test_what_no_view_sees_is_left_out():
     cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
-    mesh = enclosed(photographed(cameras)).mesh
+    mesh = built(photographed(cameras)).mesh
     # The hull reaches to -2.2; views 25 degrees off the centre see to -0.2, and Poisson runs on
     # along the last contours for a few facets.
     assert -0.75 < float(mesh.vertices_world[:, 2].min()) < 0.1
@@ -89,38 +89,38 @@ def test_what_no_view_sees_is_left_out():
     assert off[mesh.vertices_world[:, 2] > 0].mean() < 0.02
 
 
-def test_a_lid_goes_and_small_dents_stay():
+def test_a_surface_that_views_see_through_is_dropped_and_small_dents_stay():
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
-    lid, speck = centre[:, 2] > 0.8, centre[:, 2] < -0.97
+    cover, speck = centre[:, 2] > 0.8, centre[:, 2] < -0.97
     count = torch.full((len(faces),), 3)
-    said = Terms(seen=count, lit=count, denied=torch.where(lid | speck, 2, 0))
+    counts = ViewCounts(seen=count, lit=count, behind=torch.where(cover | speck, 2, 0))
     support = torch.full_like(count, Support.LIGHT)
     support[centre[:, 0] > 0.9] = Support.CONTOUR
-    everywhere = torch.ones_like(lid)
-    kept = seen_surface(vertices, faces, support, said, everywhere, 1.0, SMALL_HOLES)
-    assert bool((kept == ~lid).all())  # the lid's area is 1.2, the speck's 0.2
+    everywhere = torch.ones_like(cover)
+    kept = seen_surface(vertices, faces, support, counts, everywhere, 1.0, SMALL_HOLES)
+    assert bool((kept == ~cover).all())  # the cover's area is 1.2, the speck's 0.2
     # Nothing goes where points are.
-    support[lid] = Support.POINTS
-    assert bool(seen_surface(vertices, faces, support, said, everywhere, 1.0, SMALL_HOLES).all())
+    support[cover] = Support.POINTS
+    assert bool(seen_surface(vertices, faces, support, counts, everywhere, 1.0, SMALL_HOLES).all())
 
 
 def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes():
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
-    bottom, back, lid = centre[:, 2] > 0.97, centre[:, 2] < -0.5, centre[:, 0] > 0.97
+    bottom, back, cover = centre[:, 2] > 0.97, centre[:, 2] < -0.5, centre[:, 0] > 0.97
     assert 0.005 < bottom.double().mean() < 0.02 < back.double().mean()
     count = torch.full((len(faces),), 3)
-    seen = torch.where(bottom | back | lid, 0, count)
-    said = Terms(seen=seen, lit=seen, denied=torch.where(lid, 2, 0))
+    seen = torch.where(bottom | back | cover, 0, count)
+    counts = ViewCounts(seen=seen, lit=seen, behind=torch.where(cover, 2, 0))
     support = torch.where(seen > 0, Support.POINTS, Support.NOTHING)
-    everywhere = torch.ones_like(lid)
+    everywhere = torch.ones_like(cover)
     config = FineSurfaceConfig(hole_px=0.0)
 
     def kept(inside=everywhere, config=config):
-        return seen_surface(vertices, faces, support, said, inside, 1.0, config)
+        return seen_surface(vertices, faces, support, counts, inside, 1.0, config)
 
-    assert bool((kept() == ~(back | lid)).all())
+    assert bool((kept() == ~(back | cover)).all())
     # One face of it behind which something is seen, or outside the hull, opens all of it.
     assert bool((kept(inside=everywhere & (centre[:, 2] < centre[:, 2].max())) == (seen > 0)).all())
     none = FineSurfaceConfig(hole_px=0.0, max_unseen=0.0)
@@ -132,9 +132,9 @@ def test_pieces_that_neither_points_nor_contours_support_go():
     two = torch.cat([vertices, 0.3 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
     first = torch.arange(len(two[1])) < len(faces)
     count = torch.full((len(two[1]),), 3)
-    said = Terms(seen=count, lit=count, denied=0 * count)
+    counts = ViewCounts(seen=count, lit=count, behind=0 * count)
     support = torch.where(first, Support.POINTS, Support.LIGHT)
-    kept = seen_surface(*two, support, said, torch.ones_like(first), 1.0, FineSurfaceConfig())
+    kept = seen_surface(*two, support, counts, torch.ones_like(first), 1.0, FineSurfaceConfig())
     assert bool((kept == first).all())
 
 
@@ -175,11 +175,11 @@ def test_too_few_points_and_contours_are_refused(round_about):
     contours = TraceContours()(silhouettes_of(round_about.cameras), round_about.cameras)
     contours = contours.replace(rays=contours.rays.take(torch.arange(5)))
     with pytest.raises(ReconstructionError, match="0 points were matched inside the silhouettes"):
-        closed_surface(no_points(round_about.points_world), contours, 0.02, FineSurfaceConfig())
+        closed_surface(no_points(round_about.points_world), contours, 0.02)
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(ConfigError, match=r"fine_surface\.touches"):
-        FineSurfaceConfig(touches=0)
-    with pytest.raises(ConfigError, match=r"fine_surface\.cell_px"):
-        FineSurfaceConfig(cell_px=0.0)
+    with pytest.raises(ConfigError, match=r"fine_surface\.hole_px"):
+        FineSurfaceConfig(hole_px=-1.0)
+    with pytest.raises(ConfigError, match=r"fine_surface\.max_unseen"):
+        FineSurfaceConfig(max_unseen=1.0)

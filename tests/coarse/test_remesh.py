@@ -5,7 +5,6 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.coarse.fill import delaunay
 from pimper_torch.coarse.remesh import RemeshConfig, remesh, within
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.scenes.meshes import icosphere
@@ -16,6 +15,7 @@ from pimper_torch.geometry.surfaces import (
     face_normals,
     vertex_normals,
 )
+from pimper_torch.paper.fill import delaunay
 from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
 from pimper_torch.silhouettes.hull import Hull
 

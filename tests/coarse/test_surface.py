@@ -4,31 +4,36 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.coarse.densify import DensifyConfig
-from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig, two_faces_an_edge
+from pimper_torch.coarse.surface import (
+    CoarseSurface,
+    CoarseSurfaceConfig,
+    smoothed_normals,
+    two_faces_an_edge,
+)
 from pimper_torch.errors import ConfigError, InputError, ReconstructionError
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.geometry.surfaces import face_normals, face_pairs, vertex_normals
 from pimper_torch.records import Mesh, Silhouettes, Support
 from pimper_torch.silhouettes.contours import Contours
 from tests.coarse.ball import SETTINGS, photographed
 
 
 def built(scene, mesh=None):
-    """CoarseSurface what the photographs show, without silhouettes."""
+    """The coarse mesh of photographs without silhouettes."""
     contours = Contours.none(Silhouettes.everything(scene.views), scene.cameras)
     return CoarseSurface(*SETTINGS)(scene, contours, mesh)
 
 
 @pytest.fixture(scope="module")
-def enclosed(round_about):
+def whole(round_about):
     return built(round_about)
 
 
-def test_views_all_round_give_one_closed_surface(enclosed):
-    mesh = enclosed.mesh
+def test_views_all_round_give_one_closed_surface(whole):
+    mesh = whole.mesh
     pairs, _ = face_pairs(mesh.faces)
     assert 2 * len(pairs) == 3 * len(mesh.faces)  # every edge has two faces: no contour
     assert int(face_components(mesh.faces).max()) == 0
@@ -36,8 +41,8 @@ def test_views_all_round_give_one_closed_surface(enclosed):
     assert len(mesh.vertices_world) - len(pairs) + len(mesh.faces) == 2  # Euler: a ball
 
 
-def test_the_surface_is_where_the_ball_is_and_faces_outward(enclosed):
-    mesh = enclosed.mesh
+def test_the_surface_is_where_the_ball_is_and_faces_outward(whole):
+    mesh = whole.mesh
     centre = mesh.vertices_world[mesh.faces].mean(dim=1)
     # A pixel is 1 / 60 of the radius; facets of a ball of 600 lie up to 0.01 inside it.
     assert (centre.norm(dim=1) - 1).abs().mean() < 0.01
@@ -47,24 +52,24 @@ def test_the_surface_is_where_the_ball_is_and_faces_outward(enclosed):
     assert (mesh.normals_world * normalize(mesh.vertices_world, dim=-1)).sum(dim=-1).min() > 0.8
 
 
-def test_facets_carry_the_cloud(enclosed, round_about):
-    points = enclosed.points
+def test_facets_carry_the_cloud(whole, round_about):
+    points = whole.points
     assert len(points.facet) > 0.9 * len(round_about.points_world)
-    corners = enclosed.mesh.vertices_world[enclosed.mesh.faces[points.facet]]
+    corners = whole.mesh.vertices_world[whole.mesh.faces[points.facet]]
     reach = (corners - corners.mean(dim=1, keepdim=True)).norm(dim=-1).amax(dim=1)
     assert ((points.points_world - corners.mean(dim=1)).norm(dim=-1) < 1.2 * reach).all()
     assert points.covariance_world.shape == (len(points.facet), 3, 3)
-    assert not enclosed.is_point.any()
+    assert not whole.is_point.any()
     # A facet is 6 pixels wide, and a third of them have a point within 4.
-    assert (enclosed.support == Support.POINTS).float().mean() > 0.3
-    assert (enclosed.support >= Support.LIGHT).all()
+    assert (whole.support == Support.POINTS).float().mean() > 0.3
+    assert (whole.support >= Support.LIGHT).all()
 
 
 def test_a_few_views_on_an_arc_give_the_side_that_they_see():
     cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
     scene = photographed(cameras)
     mesh = built(scene).mesh
-    # Whatever is seen by nobody is gone, and black background gave nothing.
+    # What no view sees is gone, and black background gave nothing.
     assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 0.1
     assert mesh.vertices_world[:, 2].min() > -0.6
     # Two views at least see 50 degrees up, down and to the sides.
@@ -85,7 +90,7 @@ def test_masks_keep_the_rest_out():
     assert mesh.vertices_world[:, 1].max() > 0.6
 
 
-def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_about):
+def test_a_given_mesh_is_turned_to_the_cameras_and_simplified(round_about):
     vertices, faces = icosphere(3)
     inside_out = Mesh(vertices_world=vertices, faces=faces.flip(1))
     coarse = built(round_about, inside_out)
@@ -97,7 +102,7 @@ def test_a_mesh_that_is_brought_is_turned_to_the_cameras_and_simplified(round_ab
     assert len(coarse.points.facet) > 0.9 * len(round_about.points_world)
 
 
-def test_a_small_mesh_that_is_brought_stays_as_it_is(round_about):
+def test_a_small_given_mesh_stays_as_it_is(round_about):
     vertices, faces = icosphere(1)
     assert vertices.dtype == torch.float64  # as files give it
     coarse = built(round_about, Mesh(vertices_world=vertices, faces=faces))
@@ -120,7 +125,7 @@ def test_a_mesh_that_cannot_be_used_is_refused(round_about, change, told):
         built(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
 
 
-def test_without_points_to_trust_nothing_is_made(round_about):
+def test_a_cloud_without_reliable_points_is_refused(round_about):
     doubtful = round_about.replace(reprojection_errors_px=round_about.reprojection_errors_px + 100)
     with pytest.raises(ReconstructionError, match="0 of"):
         built(doubtful)
@@ -137,3 +142,27 @@ def test_of_three_faces_at_an_edge_the_smallest_goes():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.1]])
     faces = torch.tensor([[0, 1, 2], [1, 0, 4], [1, 0, 3]])
     assert two_faces_an_edge(vertices, faces).tolist() == [[0, 1, 2], [1, 0, 3]]
+
+
+def test_smoothing_normals_leaves_a_plane_alone_and_halves_a_crease():
+    line = torch.linspace(-1, 1, 3)
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    flat = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3)
+    corner = torch.tensor([0, 1, 3, 4])
+    faces = torch.cat(
+        [
+            torch.stack([corner, corner + 1, corner + 4], dim=1),
+            torch.stack([corner, corner + 4, corner + 3], dim=1),
+        ]
+    )
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(9, 3)
+    assert_close(smoothed_normals(flat, faces), up)
+    # A roof along y: normals (-1, 0, 1), up and (1, 0, 1) turn half the way to their neighbours'.
+    roof = flat - flat.new_tensor([0.0, 0.0, 1.0]) * flat[:, :1].abs()
+    before, after = vertex_normals(roof, faces), smoothed_normals(roof, faces)
+    tilt_before, tilt_after = (torch.atan2(one[3:6, 0], one[3:6, 2]) for one in (before, after))
+    assert_close(tilt_before, torch.tensor([-1.0, 0.0, 1.0]) * torch.pi / 4)
+    assert tilt_after[1].abs() < 1e-6
+    ratio = tilt_after[[0, 2]] / tilt_before[[0, 2]]
+    assert bool((ratio > 0.5).all() and (ratio < 0.8).all())
+    assert_close(after.norm(dim=1), torch.ones(9))

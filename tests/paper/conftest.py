@@ -11,6 +11,9 @@ from pimper_torch.records import (
     PhotometricPatches,
     Photometry,
 )
+from tests.coarse.conftest import dome_cloud
+
+__all__ = ["dome_cloud"]
 
 
 @pytest.fixture

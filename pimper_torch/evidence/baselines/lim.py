@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.coarse.fill import delaunay
 from pimper_torch.config import require
 from pimper_torch.evidence.baselines.anchoring import (
     apply_bas_relief,
@@ -42,6 +41,7 @@ from pimper_torch.evidence.baselines.template import (
     surface_of,
 )
 from pimper_torch.geometry.height_fields import sample_raster
+from pimper_torch.paper.fill import delaunay
 from pimper_torch.paper.integrate import integrate_normals
 from pimper_torch.patches.warp import WarpConfig
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, Record, SparseScene

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.chains.published import Published
-from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.evidence.metrics.derivatives import DerivativeCheck, Tensors, check_derivatives
 from pimper_torch.evidence.scenes import render_shape, sparse_scene
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

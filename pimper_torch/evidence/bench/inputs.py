@@ -4,7 +4,6 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pimper_torch.coarse.triangulate import Triangulate
 from pimper_torch.evidence.bench.config import BenchConfig
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.metrics.distances import TrueSurface
@@ -12,6 +11,7 @@ from pimper_torch.evidence.metrics.evaluate import prepared_surface
 from pimper_torch.evidence.metrics.similarity import pair_views
 from pimper_torch.evidence.scenes.write import render_scene
 from pimper_torch.io.photographs import load_views
+from pimper_torch.paper.triangulate import Triangulate
 from pimper_torch.records import Capture, CoarseMesh, Record, SparseScene
 from pimper_torch.sfm.cache import ModelCache
 from pimper_torch.sfm.reconstruct import (

@@ -3,13 +3,13 @@ from functools import cache
 import pytest
 import torch
 
-from pimper_torch.coarse.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.evidence.metrics.relative import compare_in_view
 from pimper_torch.evidence.scenes import render_shape, sparse_scene
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.noise import random_speckle, random_waves
 from pimper_torch.evidence.scenes.shapes import Bumps, Sphere
+from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 
 SPHERE = Sphere()
 BUMPS = Bumps(

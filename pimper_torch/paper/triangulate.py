@@ -7,19 +7,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from pimper_torch.coarse.cloud import with_cloud
-from pimper_torch.coarse.fill import delaunay, fill_pixels, interpolate_inverse_depth
-from pimper_torch.coarse.select import (
-    behind_others,
-    frontal_view,
-    named_view,
-    neighbours_agree,
-    on_hull,
-    spread,
-    spread_to_number,
-    views_near,
-    well_accompanied,
-)
+from pimper_torch.coarse.reference import reference_view
+from pimper_torch.coarse.surface import smoothed_normals
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.components import face_components
@@ -29,7 +18,17 @@ from pimper_torch.geometry.projection import project, rays_through, triangulatio
 from pimper_torch.geometry.surfaces import (
     face_normals,
     side_lengths,
-    vertex_normals,
+)
+from pimper_torch.paper.cloud import with_cloud
+from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
+from pimper_torch.paper.filters import (
+    behind_others,
+    neighbours_agree,
+    on_hull,
+    spread,
+    spread_to_number,
+    views_near,
+    well_accompanied,
 )
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
 from pimper_torch.stage import Stage
@@ -126,10 +125,7 @@ class Triangulate(Stage):
             ReconstructionError: Fewer than four points pass the filters, or no facet does.
         """
         config, cameras = self.config, scene.cameras
-        if config.reference:
-            reference = named_view(scene.views, config.reference)
-        else:
-            reference = frontal_view(scene)
+        reference = reference_view(scene, config.reference)
         index, quality = self._reliable(scene, reference)
         points = scene.points_world[index]
         pixels, _ = _project(points, cameras, reference)
@@ -159,9 +155,7 @@ class Triangulate(Stage):
             )
         used, faces = torch.unique(faces, return_inverse=True)
         vertices = vertices[used]
-        normals = smooth_over_mesh(
-            vertex_normals(vertices, faces), faces, self.details.smoothing_iterations
-        )
+        normals = smoothed_normals(vertices, faces)
         mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=normals)
         return with_cloud(scene, index, mesh, reference, source[used])
 
@@ -302,18 +296,6 @@ def largest_component(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
         return faces
     label = face_components(faces)
     return faces[label == label.bincount().argmax()]
-
-
-def smooth_over_mesh(
-    normals: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], iterations: int
-) -> Float[Tensor, "vertex 3"]:
-    """Average unit normals with those of neighbouring vertices, ``rounds`` times."""
-    source = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1)
-    target = faces[:, [1, 0, 2, 1, 0, 2]].reshape(-1)
-    for _ in range(iterations):
-        total = torch.zeros_like(normals).index_add(0, target, normals[source])
-        normals = normalize(normals + normalize(total, dim=-1), dim=-1)
-    return normals
 
 
 def _project(

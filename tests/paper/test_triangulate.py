@@ -2,18 +2,17 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.coarse.fill import delaunay, fill_pixels, interpolate_inverse_depth
-from pimper_torch.coarse.triangulate import (
+from pimper_torch.errors import ConfigError, InputError, ReconstructionError
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
+from pimper_torch.paper.triangulate import (
     Triangulate,
     TriangulateConfig,
     TriangulateDetails,
     largest_component,
     peel,
-    smooth_over_mesh,
 )
-from pimper_torch.errors import ConfigError, InputError, ReconstructionError
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import face_normals, face_pairs
 
 
 def test_the_mesh_of_a_ball_faces_out_hangs_together_and_lies_on_the_ball(dome_cloud):
@@ -145,16 +144,6 @@ def test_filled_pixels_keep_away_from_points_and_inside_the_faces():
     half = fill_pixels(known, faces[:1], 12.0)
     assert torch.cdist(all_filled, known).min() > 0.8 * 12
     assert 0.4 < len(half) / len(all_filled) < 0.6
-
-
-def test_smoothing_normals_leaves_a_plane_alone_and_halves_a_crease():
-    grid = torch.tensor([[u, v, 0.0] for v in range(4) for u in range(4)])
-    faces = delaunay(grid[:, :2] + 0.01 * torch.sin(5 * grid[:, :2].flip(1)))
-    up = torch.tensor([0.0, 0.0, -1.0]).expand(16, 3)
-    assert_close(smooth_over_mesh(up, faces, 3), up)
-    tilted = up.clone()
-    tilted[5] = torch.tensor([1.0, 0.0, 0.0])
-    assert smooth_over_mesh(tilted, faces, 1)[5, 2] < -0.5
 
 
 def test_components_hang_together_by_edges_only():

@@ -1,42 +1,11 @@
-"""Which view is frontal, and which points of the cloud can be trusted."""
+"""Which points of the cloud are reliable, and a well-spread subset of them."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
 
-from pimper_torch.errors import InputError
-from pimper_torch.records import Cameras, SparseScene, Views
-
-
-def frontal_view(scene: SparseScene) -> int:
-    """Choose the view that shares the most points with the others.
-
-    Each other view counts with the square root of the points shared, so that many views at
-    the side weigh more than one close twin.
-    """
-    observed = scene.observed.to(scene.points_world.dtype)
-    shared = (observed.mT @ observed).fill_diagonal_(0)
-    return int(shared.sqrt().sum(dim=1).argmax())
-
-
-def named_view(views: Views, name: str) -> int:
-    """Find a view by its file name or stem.
-
-    Raises:
-        InputError: No view, or more than one, has that name.
-    """
-    found = [
-        index
-        for index, known in enumerate(views.names)
-        if name == known or name == known.rsplit(".", 1)[0]
-    ]
-    if len(found) != 1:
-        raise InputError(
-            f"reference view: {len(found)} registered photographs are named {name!r}, and one "
-            f"is needed. Observations are: {', '.join(views.names)}."
-        )
-    return found[0]
+from pimper_torch.records import Cameras
 
 
 def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[Tensor, " view"]:

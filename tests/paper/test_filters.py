@@ -1,11 +1,8 @@
-import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.coarse.select import (
+from pimper_torch.paper.filters import (
     behind_others,
-    frontal_view,
-    named_view,
     neighbours_agree,
     on_hull,
     spread,
@@ -13,22 +10,6 @@ from pimper_torch.coarse.select import (
     views_near,
     well_accompanied,
 )
-from pimper_torch.errors import InputError
-
-
-def test_frontal_view_is_the_centre_of_the_arc(dome_cloud):
-    assert frontal_view(dome_cloud) == 2
-
-
-def test_a_view_is_found_by_file_name_and_by_stem(dome_cloud):
-    name = dome_cloud.views.names[3]
-    assert named_view(dome_cloud.views, name) == 3
-    assert named_view(dome_cloud.views, name.rsplit(".", 1)[0]) == 3
-
-
-def test_an_unknown_reference_is_refused_with_the_known_names(dome_cloud):
-    with pytest.raises(InputError, match=dome_cloud.views.names[0]):
-        named_view(dome_cloud.views, "nobody")
 
 
 def test_views_near_counts_from_the_optical_axis(dome_cloud):

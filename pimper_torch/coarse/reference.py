@@ -1,0 +1,31 @@
+"""The reference view: the frontal one, or the one that a setting names."""
+
+from pimper_torch.errors import InputError
+from pimper_torch.records import SparseScene
+
+
+def reference_view(scene: SparseScene, name: str = "") -> int:
+    """Choose the view that shares the most points with the others, or find one by name.
+
+    Each other view counts with the square root of the number of points shared, so that many
+    views at the side weigh more than one close twin.
+
+    Args:
+        scene: Views and tracks.
+        name: File name or stem; empty chooses the view.
+
+    Raises:
+        InputError: No view, or more than one, has that name.
+    """
+    if not name:
+        observed = scene.observed.to(scene.points_world.dtype)
+        shared = (observed.mT @ observed).fill_diagonal_(0)
+        return int(shared.sqrt().sum(dim=1).argmax())
+    names = scene.views.names
+    found = [index for index, known in enumerate(names) if name in (known, known.rsplit(".", 1)[0])]
+    if len(found) != 1:
+        raise InputError(
+            f"reference view: {len(found)} registered photographs are named {name!r}; needed: "
+            f"one of {', '.join(names)}."
+        )
+    return found[0]
