@@ -242,7 +242,10 @@ def test_settings_say_which_chain_they_are_for():
         ({"outline": {"num_voxels": 9}}, "`outline` is `silhouettes`, with object"),
         ({"enclose": {"gap_px": 9.0}}, "`enclose` is `coarse_surface`, with reference"),
         ({"rims": {"per_view": 9}}, "`rims` is no setting: `contour_rays` takes a `RayConfig` now"),
-        ({"triangulate": {"fill_smoothing": 9.0}}, "`Triangulate` takes `TriangulateDetails` now"),
+        (
+            {"triangulate": {"fill_smoothing": 9.0}},
+            "`triangulate.fill_smoothing` is a constant now",
+        ),
         ({"adapt": {"max_facets": 9}}, "`adapt` is `remesh` now"),
         ({"sweep": {"step_samples": 9.0}}, "`sweep.step_samples` is a constant now"),
     ],

@@ -39,7 +39,7 @@ def load_config(
 
 
 # Settings that had other names, and what each is now. Those that are the same for all photographs
-# are arguments of the stages in Python: `TriangulateDetails` and the like.
+# are constants, or arguments of the stages in Python.
 _FORMER = {
     "rounds.scales": "`scales`",
     "rounds.all_round": "`chain`: coarse-to-fine sees all round, published one side",
@@ -58,7 +58,7 @@ _FORMER = {
     "factorize.rank": "no setting: light is of first order; see single_view.factorization",
     "factorize.colour": "no setting: see solve_in_colour of single_view.factorization",
     **{
-        f"triangulate.{name}": "no setting: `Triangulate` takes `TriangulateDetails`"
+        f"triangulate.{name}": "a constant"
         for name in [
             *("facet_edge_px", "fill_smoothing", "max_view_angle_deg", "min_track_length"),
             *("max_reprojection_px", "min_angle_deg", "neighbours", "hiding_slope", "max_slope"),

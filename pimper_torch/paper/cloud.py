@@ -9,7 +9,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import barycentric_2d
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 
-# Tests of points against facets made at once; bounds memory.
+# Pairs of points and facets that are tested at once; bounds memory to some 100 MB.
 _TESTS_AT_ONCE = 2_000_000
 
 
@@ -20,14 +20,14 @@ def with_cloud(
     reference: int,
     source: Int[Tensor, " vertex"],
 ) -> CoarseMesh:
-    """Put a mesh beside what is known of the cloud's points on it.
+    """Make a coarse mesh of facets and the points of the cloud on them, with covariances.
 
     Args:
         scene: The cloud.
-        reliable: Its points that lie on the object.
+        reliable: Its points on the object.
         mesh: The facets.
         reference: The view they were triangulated in.
-        source: The point that each vertex is, -1 for a vertex that is none.
+        source: The point of the cloud at each vertex, -1 for none.
     """
     is_point = source >= 0
     at_vertices = point_covariances(scene, source.clamp_min(0))
@@ -53,7 +53,7 @@ def with_cloud(
 def facets_under(
     pixels: Float[Tensor, "point 2"], corners_px: Float[Tensor, "face 3 2"]
 ) -> Int[Tensor, " point"]:
-    """Find the facet that each point of an image lies in, -1 outside all.
+    """Find the facet that contains each point of an image, -1 outside all.
 
     Args:
         pixels: The points.

@@ -1,8 +1,7 @@
-"""Vertices where the cloud has none: a smooth surface between its points.
+"""More vertices between sparse points, on a thin-plate spline through them.
 
 A weakly textured region has few sparse points, so its facets would be large and flat where
-the object is round, and views would be registered many pixels off. Vertices on a thin-plate
-spline through the points keep the facets small.
+the object is round, and views would be registered many pixels off.
 """
 
 import math
@@ -14,9 +13,9 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import Delaunay, cKDTree
 from torch import Tensor
 
-# Points that each value of the spline is computed from. Thin-plate splines over all points
-# cost the cube of their number; beyond about 50 nearest ones the value hardly changes.
-NEIGHBOURS = 50
+# Points that each value of the spline is computed from: one of all points costs the cube of
+# their number. A choice; beyond about 50 nearest ones the value hardly changes.
+_NEIGHBOURS = 50
 
 
 def fill_pixels(
@@ -27,16 +26,15 @@ def fill_pixels(
     low, high = known.min(axis=0), known.max(axis=0)
     rows = np.arange(low[1], high[1], edge_px * math.sqrt(3) / 2)
     columns = np.arange(low[0], high[0], edge_px)
-    subdivision = np.concatenate(
+    grid = np.concatenate(
         [
             np.stack([columns + (index % 2) * edge_px / 2, np.full_like(columns, v)], axis=1)
             for index, v in enumerate(rows)
         ]
         or [np.zeros((0, 2))]
     )
-    distance, _ = cKDTree(known).query(subdivision)
-    subdivision = subdivision[distance > 0.8 * edge_px]
-    proposed = torch.from_numpy(subdivision).to(pixels)
+    distance, _ = cKDTree(known).query(grid)
+    proposed = torch.from_numpy(grid[distance > 0.8 * edge_px]).to(pixels)
     return proposed[_inside_any(proposed, pixels, faces)]
 
 
@@ -59,7 +57,7 @@ def interpolate_inverse_depth(
     spline = RBFInterpolator(
         (known - center) / unit,
         values,
-        neighbors=min(NEIGHBOURS, len(known)),
+        neighbors=min(_NEIGHBOURS, len(known)),
         smoothing=smoothing,
         kernel="thin_plate_spline",
     )
@@ -86,9 +84,8 @@ def _inside_any(
     pixels: Float[Tensor, "point 2"],
     faces: Int[Tensor, "face 3"],
 ) -> Tensor:
-    triangulation = delaunay(pixels)
     kept = {tuple(sorted(face)) for face in faces.tolist()}
     found = Delaunay(pixels.detach().cpu().double().numpy())
     simplex = found.find_simplex(points.detach().cpu().double().numpy())
-    allowed = np.array([tuple(sorted(face)) in kept for face in triangulation.tolist()] + [False])
+    allowed = np.array([tuple(sorted(face)) in kept for face in found.simplices.tolist()] + [False])
     return torch.from_numpy(allowed[simplex]).to(points.device)

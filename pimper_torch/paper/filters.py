@@ -23,14 +23,14 @@ def behind_others(
     neighbours: int,
     slope: float,
 ) -> Bool[Tensor, " point"]:
-    """Mark points that a nearer layer hides in the image, or may well hide.
+    """Mark points that a nearer surface occludes in the image, or probably does.
 
-    Another view may see past the contour of what is in front, and tracks now and then hold
-    a false match in the very view that cannot see the point. Of the nearest points in the
-    image those count that are nearer to the camera by more than ``slope`` times their
-    lateral distance; if three or more leave no open half-plane, the point is hidden. Where
-    a point is just beside a contour, or on a steep rim, they are all on one side; then it
-    is as likely just inside the contour, and only a point observed here is believed.
+    Another view may see past the contour of the nearer surface, and some tracks have a false
+    match in the very view that cannot see the point. Of the nearest points in the image those
+    count that are nearer to the camera by more than ``slope`` times their lateral distance; if
+    three or more leave no open half-plane, the point is occluded. Beside a contour, or where
+    the surface is steep, they are all on one side; then the point may lie just inside the
+    contour, and is not marked only if it is observed here.
 
     Args:
         pixels: In the view.
@@ -63,10 +63,10 @@ def neighbours_agree(
 ) -> Bool[Tensor, " point"]:
     """Mark points that lie on the same surface as those around them in the image.
 
-    Two tests against the nearest points in the image. A point of another layer (the far
+    Two tests against the nearest points in the image. A point of another surface (the far
     side, the background) is steep against most of them: ``|dz|`` over the lateral distance
-    exceeds ``max_slope``. A badly triangulated one is off the plane that its neighbours
-    span by more than ``max_deviation`` of the neighbourhood's radius.
+    exceeds ``max_slope``. A badly triangulated one is off the plane of its neighbours by more
+    than ``max_deviation`` of the neighbourhood's radius.
 
     Points are dropped worst first in a few rounds, so that one outlier does not take its
     neighbours along.
@@ -104,11 +104,11 @@ def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
 def well_accompanied(
     pixels: Float[Tensor, "point 2"], max_isolation: float
 ) -> Bool[Tensor, " point"]:
-    """Mark all points but corners of the hull that stand alone, one shell after another.
+    """Mark all points but isolated corners of the hull, one hull after another.
 
-    Neighbours all on one side say little about a corner's depth, and one that is wrong
-    makes the mesh reach out to it. What tells is its distance: that to its third nearest
-    point, over the median of the same distance of its neighbours.
+    Neighbours all on one side say little about a corner's depth, and the mesh would reach out
+    to a wrong one. Isolation is the distance to the third nearest point over the median of
+    its neighbours'.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
     while keep.sum() > 8:
@@ -138,23 +138,23 @@ def spread(
     return torch.tensor(chosen, dtype=torch.long, device=pixels.device)
 
 
-def spread_to_number(
-    pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], number: int
+def spread_to_count(
+    pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], target: int
 ) -> Int[Tensor, " chosen"]:
-    """Choose about ``number`` well-spread points by bisecting their distance."""
-    if number >= len(pixels):
+    """Choose about ``target`` well-spread points by bisecting their distance."""
+    if target >= len(pixels):
         return torch.arange(len(pixels), device=pixels.device)
     extent = pixels.amax(dim=0) - pixels.amin(dim=0)
     # Not from the whole image's size down: with such a distance all points are neighbours.
-    low, high = 0.0, float(torch.maximum((extent.prod() / number).sqrt(), extent.norm() / number))
+    low, high = 0.0, float(torch.maximum((extent.prod() / target).sqrt(), extent.norm() / target))
     chosen = spread(pixels, quality, high)
-    while len(chosen) > number:
+    while len(chosen) > target:
         low, high = high, 2 * high
         chosen = spread(pixels, quality, high)
     for _ in range(20):
-        centre = (low + high) / 2
-        chosen = spread(pixels, quality, centre)
-        low, high = (centre, high) if len(chosen) > number else (low, centre)
+        between = (low + high) / 2
+        chosen = spread(pixels, quality, between)
+        low, high = (between, high) if len(chosen) > target else (low, between)
     return chosen
 
 

@@ -16,6 +16,7 @@ from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
 from pimper_torch.geometry.surfaces import (
+    face_edges,
     face_normals,
     side_lengths,
 )
@@ -26,12 +27,41 @@ from pimper_torch.paper.filters import (
     neighbours_agree,
     on_hull,
     spread,
-    spread_to_number,
+    spread_to_count,
     views_near,
     well_accompanied,
 )
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
 from pimper_torch.stage import Stage
+
+# All constants are choices, the same for all photographs. A point of the cloud is reliable if a
+# view within this angle of the reference sees it, and by its number of views, its mean
+# reprojection error and the widest angle between its rays.
+_MAX_VIEW_ANGLE_DEG, _MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 40.0, 3, 1.5, 4.0
+
+# Points of the neighbourhood that a reliable one agrees with: in slope (depth over lateral
+# distance), in distance from the neighbours' plane (in radii of the neighbourhood), and in
+# isolation (distance to its neighbours over theirs to their own) where it is a corner of the hull.
+_NEIGHBOURS, _MAX_SLOPE, _MAX_DEVIATION, _MAX_ISOLATION = 12, 6.0, 0.5, 3.0
+
+# Points all round that are nearer to the reference by more than this times their lateral distance
+# occlude a point.
+_OCCLUDING_SLOPE = 3.0
+
+# Of the spline, relative to the spread of the values: it passes through the points all but exactly.
+_SMOOTHING = 1e-6
+
+# A facet turned further from the reference bridges a depth discontinuity; so does one turned by
+# more than the second with an edge so many times the median facet's.
+_MAX_TILT_DEG, _BRIDGE_TILT_DEG, _MAX_STRETCH = 80.0, 60.0, 3.0
+
+# On the border a facet is dropped with a smaller height over its longest edge in the image, or with
+# a smaller angle at a corner that it alone reaches, or with a smaller fraction of it on the object.
+_MIN_ALTITUDE, _MIN_TIP_DEG, _MIN_COVERAGE = 0.08, 45.0, 0.6
+
+# Radiance in the reference view, over the median at the mesh's vertices, at or below which a pixel
+# shows background.
+_DARK_FRACTION = 0.12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,69 +82,12 @@ class TriangulateConfig:
         require(self.num_points >= 4, "num_points", self.num_points, "4 or more")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TriangulateDetails:
-    """Which points and triangles count, the same for all photographs.
-
-    Attributes:
-        facet_edge_px: Distance of vertices in the reference view; 0 derives it from
-            ``num_points``.
-        fill_smoothing: Of that surface; 0 passes through every point.
-        max_view_angle_deg: Points count that were seen by a view turned less than this
-            from the reference.
-        min_track_length: Views that must have seen a point.
-        max_reprojection_px: Mean reprojection error a point may have.
-        min_angle_deg: Widest angle between rays a point must have.
-        neighbours: Points around a point that must agree with it.
-        hiding_slope: Points all round that are nearer to the reference by more than this
-            times their lateral distance hide a point.
-        max_slope: Depth over lateral distance between agreeing points.
-        max_deviation: From the plane of the neighbours, in radii of the neighbourhood.
-        max_isolation: Times further from its neighbours than they from theirs that a point
-            at the rim of the cloud may be.
-        max_tilt_deg: A facet turned further from the reference bridges a depth
-            discontinuity and is dropped.
-        max_stretch: Longest edge over the median facet's, in the scene, above which a facet
-            turned by more than 60 degrees is such a bridge too.
-        min_altitude: Height over longest edge, in the image, below which a facet at the rim
-            is dropped.
-        min_tip_deg: A facet that alone reaches out to a vertex of the rim, with a smaller
-            angle there, is a spike and dropped.
-        min_coverage: Fraction of a facet at the rim that must show the object.
-        dark_fraction: Radiance in the reference view, over the median at the mesh's vertices, at
-            or below which a pixel shows background.
-        smoothing_iterations: Of the vertex normals, over the mesh.
-    """
-
-    facet_edge_px: float = 0.0
-    fill_smoothing: float = 1e-6
-    max_view_angle_deg: float = 40.0
-    min_track_length: int = 3
-    max_reprojection_px: float = 1.5
-    min_angle_deg: float = 4.0
-    neighbours: int = 12
-    hiding_slope: float = 3.0
-    max_slope: float = 6.0
-    max_deviation: float = 0.5
-    max_isolation: float = 3.0
-    max_tilt_deg: float = 80.0
-    max_stretch: float = 3.0
-    min_altitude: float = 0.08
-    min_tip_deg: float = 45.0
-    min_coverage: float = 0.6
-    dark_fraction: float = 0.12
-    smoothing_iterations: int = 1
-
-
 class Triangulate(Stage):
-    """Span facets between trustworthy points; the result is a constant to autograd."""
+    """Triangulate reliable points of the cloud; the result is a constant to autograd."""
 
-    def __init__(
-        self, config: TriangulateConfig | None = None, details: TriangulateDetails | None = None
-    ) -> None:
+    def __init__(self, config: TriangulateConfig | None = None) -> None:
         super().__init__()
         self.config = config or TriangulateConfig()
-        self.details = details or TriangulateDetails()
 
     @torch.no_grad()
     def forward(self, scene: SparseScene) -> CoarseMesh:
@@ -130,14 +103,11 @@ class Triangulate(Stage):
         points = scene.points_world[index]
         pixels, _ = _project(points, cameras, reference)
         quality = torch.where(on_hull(pixels), quality + quality.amax(), quality)
-        edge_px = self.details.facet_edge_px
-        if edge_px > 0:
-            chosen = spread(pixels, quality, 0.8 * edge_px)
+        edge_px = _edge_for(config.num_points, pixels)
+        if config.fill:  # filled vertices count too: do not crowd where points are dense
+            chosen = spread(pixels, quality, 0.7 * edge_px)
         else:
-            edge_px = _edge_for(config.num_points, pixels)
-            chosen = spread_to_number(pixels, quality, config.num_points)
-            if config.fill:  # filled vertices count too: do not crowd where points are dense
-                chosen = spread(pixels, quality, 0.7 * edge_px)
+            chosen = spread_to_count(pixels, quality, config.num_points)
         vertices = points[chosen]
         source = index[chosen]
         faces = self._facets(vertices, scene.views, cameras, reference)
@@ -150,8 +120,7 @@ class Triangulate(Stage):
         if len(faces) == 0:
             raise ReconstructionError(
                 f"coarse mesh: all facets between {len(vertices)} points were dropped, and at "
-                "least one is needed. Raise `triangulate.max_tilt_deg`, lower "
-                "`triangulate.min_coverage`, or choose another `triangulate.reference`."
+                "least one is needed. Choose another `triangulate.reference`, or look at the masks."
             )
         used, faces = torch.unique(faces, return_inverse=True)
         vertices = vertices[used]
@@ -163,21 +132,21 @@ class Triangulate(Stage):
         self, scene: SparseScene, reference: int
     ) -> tuple[Int[Tensor, " reliable"], Float[Tensor, " reliable"]]:
         """List the points that pass every filter, and how good each is."""
-        details, cameras, observed = self.details, scene.cameras, scene.observed
+        cameras, observed = scene.cameras, scene.observed
         length = observed.sum(dim=1)
         angle = triangulation_angles(scene.points_world, observed, cameras.centers_world)
-        near = views_near(cameras, reference, details.max_view_angle_deg)
+        near = views_near(cameras, reference, _MAX_VIEW_ANGLE_DEG)
         pixels, depth = _project(scene.points_world, cameras, reference)
         within = ((pixels > 0) & (pixels < cameras.sizes_px[reference])).all(dim=1) & (depth > 0)
         tests = {
             f"in front of {scene.views.names[reference]} and inside its frame": within,
             "seen by a view near it": observed[:, near].any(dim=1),
-            f"seen by {details.min_track_length} views or more": length >= details.min_track_length,
-            f"reprojected within {details.max_reprojection_px} px": (
-                scene.reprojection_errors_px <= details.max_reprojection_px
+            f"seen by {_MIN_TRACK} views or more": length >= _MIN_TRACK,
+            f"reprojected within {_MAX_ERROR_PX} px": (
+                scene.reprojection_errors_px <= _MAX_ERROR_PX
             ),
-            f"seen under {details.min_angle_deg} degrees or more": (
-                angle >= torch.deg2rad(angle.new_tensor(details.min_angle_deg))
+            f"seen under {_MIN_ANGLE_DEG} degrees or more": (
+                angle >= torch.deg2rad(angle.new_tensor(_MIN_ANGLE_DEG))
             ),
         }
         keep = torch.stack(list(tests.values())).all(dim=0)
@@ -188,8 +157,8 @@ class Triangulate(Stage):
                     pixels[index],
                     transform(cameras.cam_from_world[reference], scene.points_world[index]),
                     observed[index, reference],
-                    neighbours=min(2 * details.neighbours, len(index) - 1),
-                    slope=details.hiding_slope,
+                    neighbours=min(2 * _NEIGHBOURS, len(index) - 1),
+                    slope=_OCCLUDING_SLOPE,
                 )
                 index = index[~hidden]
         if len(index) >= 4:
@@ -197,19 +166,19 @@ class Triangulate(Stage):
             agree = neighbours_agree(
                 pixels[index],
                 points_cam,
-                neighbours=min(details.neighbours, len(index) - 1),
-                max_slope=details.max_slope,
-                max_deviation=details.max_deviation,
+                neighbours=min(_NEIGHBOURS, len(index) - 1),
+                max_slope=_MAX_SLOPE,
+                max_deviation=_MAX_DEVIATION,
             )
             index = index[agree]
         if len(index) >= 4:
-            index = index[well_accompanied(pixels[index], details.max_isolation)]
+            index = index[well_accompanied(pixels[index], _MAX_ISOLATION)]
         if len(index) < 4:
             counts = "; ".join(f"{int(passed.sum())} {test}" for test, passed in tests.items())
             raise ReconstructionError(
-                f"coarse mesh: {len(index)} of {len(keep)} sparse points can be trusted, and at "
-                f"least 4 are needed ({counts}). Take more photographs near the frontal one, "
-                "choose another `triangulate.reference`, or relax the filters of `triangulate`."
+                f"coarse mesh: {len(index)} of {len(keep)} sparse points are reliable, and at "
+                f"least 4 are needed ({counts}). Take more photographs near the frontal one, or "
+                "choose another `triangulate.reference`."
             )
         quality = length[index].to(angle) - scene.reprojection_errors_px[index]
         seen = observed[index, reference].to(quality)
@@ -224,11 +193,11 @@ class Triangulate(Stage):
         reference: int,
         edge_px: float,
     ) -> Float[Tensor, "filled 3"]:
-        """Give new vertices between far-apart ones, on a spline through all trusted points."""
+        """Give new vertices between far-apart ones, on a spline through all reliable points."""
         pixels, _ = _project(vertices, cameras, reference)
         wanted = fill_pixels(pixels, faces, edge_px)
         known, depth = _project(points, cameras, reference)
-        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, self.details.fill_smoothing)
+        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, _SMOOTHING)
         possible = inverse > 0.5 / depth.amax()
         rays = rays_through(
             wanted[possible], cameras.cam_from_world[reference], cameras.intrinsics[reference]
@@ -242,7 +211,7 @@ class Triangulate(Stage):
         cameras: Cameras,
         reference: int,
     ) -> Int[Tensor, "face 3"]:
-        """Triangulate, drop bridges, and peel what shows no object off the rim."""
+        """Triangulate, drop bridges, and peel off the border what shows no object."""
         pixels, _ = _project(vertices, cameras, reference)
         faces = delaunay(pixels)
         normals = normalize(face_normals(vertices, faces), dim=-1)
@@ -250,20 +219,20 @@ class Triangulate(Stage):
             cameras.centers_world[reference] - vertices[faces].mean(dim=1), dim=-1
         )
         facing = (normals * to_camera).sum(dim=-1)
-        steepest = torch.deg2rad(facing.new_tensor(self.details.max_tilt_deg)).cos()
+        steepest, bridge = torch.deg2rad(facing.new_tensor([_MAX_TILT_DEG, _BRIDGE_TILT_DEG])).cos()
         longest = side_lengths(vertices[faces]).amax(dim=1)
-        far = longest > self.details.max_stretch * longest.median()
-        faces = faces[(facing > steepest) & ~(far & (facing < 0.5))]  # 0.5: turned by 60 degrees
+        far = longest > _MAX_STRETCH * longest.median()
+        faces = faces[(facing > steepest) & ~(far & (facing < bridge))]
         gray = views.images[reference].mean(dim=0)
         u, v = pixels.long().unbind(dim=1)
         at_vertices = gray[v.clamp(0, gray.shape[0] - 1), u.clamp(0, gray.shape[1] - 1)]
-        shows_object = gray > self.details.dark_fraction * at_vertices.median()
+        shows_object = gray > _DARK_FRACTION * at_vertices.median()
         if views.masks is not None:
             shows_object = shows_object & views.masks[reference]
         shown = _shown(pixels[faces], shows_object)
-        thin = _altitude(pixels[faces]) < self.details.min_altitude
-        spikes = _sharp(pixels[faces], self.details.min_tip_deg)
-        return peel(faces, (shown < self.details.min_coverage) | thin, spikes)
+        thin = _altitude(pixels[faces]) < _MIN_ALTITUDE
+        spikes = _sharp(pixels[faces], _MIN_TIP_DEG)
+        return peel(faces, (shown < _MIN_COVERAGE) | thin, spikes)
 
 
 def peel(
@@ -271,27 +240,28 @@ def peel(
     unwanted: Bool[Tensor, " face"],
     sharp: Bool[Tensor, "face 3"] | None = None,
 ) -> Int[Tensor, "kept 3"]:
-    """Drop unwanted faces that touch the rim, again and again; inner ones stay, no holes.
+    """Drop unwanted faces on the border, again and again; inner ones stay, so that no hole opens.
 
     Args:
-        faces: Of a mesh with a rim.
-        unwanted: Dropped as soon as they touch it.
-        sharp: Marks corners; a face that reaches out to one with both its edges on the rim
-            is a spike, and dropped too.
+        faces: Of a mesh with a border.
+        unwanted: Dropped as soon as they have an edge on it.
+        sharp: Marks corners; a face with a sharp corner between two edges on the border is a
+            spike, and dropped too.
     """
     if sharp is None:
         sharp = torch.zeros_like(faces, dtype=torch.bool)
     while True:
-        on_rim = _rim_edges(faces)
-        tips = on_rim & on_rim.roll(1, dims=1) & sharp  # corner i lies between edges i - 1 and i
-        drop = (on_rim.any(dim=1) & unwanted) | tips.any(dim=1)
+        on_border = _border_edges(faces)
+        # Corner i lies between edges i - 1 and i.
+        tips = on_border & on_border.roll(1, dims=1) & sharp
+        drop = (on_border.any(dim=1) & unwanted) | tips.any(dim=1)
         if not drop.any():
             return faces
         faces, unwanted, sharp = faces[~drop], unwanted[~drop], sharp[~drop]
 
 
 def largest_component(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
-    """Keep the largest set of faces that hang together by edges."""
+    """Keep the largest component of faces connected by edges."""
     if len(faces) == 0:
         return faces
     label = face_components(faces)
@@ -346,8 +316,8 @@ def _sharp(corners_px: Float[Tensor, "face 3 2"], max_angle_deg: float) -> Bool[
     return cosine > torch.deg2rad(cosine.new_tensor(max_angle_deg)).cos()
 
 
-def _rim_edges(faces: Int[Tensor, "face 3"]) -> Bool[Tensor, "face 3"]:
-    """Mark edges, the first from the first corner to the second, that no other face has."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
-    _, inverse, counts = torch.unique(edges, dim=0, return_inverse=True, return_counts=True)
-    return (counts[inverse] == 1).reshape(-1, 3)
+def _border_edges(faces: Int[Tensor, "face 3"]) -> Bool[Tensor, "face 3"]:
+    """Mark edges of one face only, the first of which runs from its first corner to its second."""
+    _, opposite = face_edges(faces)
+    count = torch.bincount(opposite.flatten())
+    return (count[opposite] == 1).roll(1, dims=1)  # the edge opposite to corner 2 comes first

@@ -6,7 +6,7 @@ from pimper_torch.paper.filters import (
     neighbours_agree,
     on_hull,
     spread,
-    spread_to_number,
+    spread_to_count,
     views_near,
     well_accompanied,
 )
@@ -89,10 +89,10 @@ def test_spread_keeps_its_distance_and_prefers_quality():
     assert (near & better).any(dim=1).all()
 
 
-def test_spread_to_number_comes_close_to_the_number():
+def test_spread_to_count_comes_close_to_the_number():
     generator = torch.Generator().manual_seed(3)
     pixels = 100 * torch.rand(1000, 2, generator=generator, dtype=torch.float64)
-    chosen = spread_to_number(pixels, torch.ones(1000, dtype=torch.float64), 60)
+    chosen = spread_to_count(pixels, torch.ones(1000, dtype=torch.float64), 60)
     assert abs(len(chosen) - 60) <= 6
 
 

@@ -9,7 +9,6 @@ from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_d
 from pimper_torch.paper.triangulate import (
     Triangulate,
     TriangulateConfig,
-    TriangulateDetails,
     largest_component,
     peel,
 )
@@ -112,11 +111,10 @@ def test_bridges_over_a_depth_discontinuity_are_dropped(dome_cloud):
     # Flatten the ball to two levels with a cliff at x = 0 that no facet may span.
     step[:, 2] = torch.where(step[:, 0] < 0, 0.0, 1.0)
     config = TriangulateConfig(fill=False)
-    details = TriangulateDetails(max_deviation=10.0, min_coverage=0.0)
     flat = dome_cloud.replace(
         points_world=step, reprojection_errors_px=torch.zeros_like(step[:, 0])
     )
-    coarse = Triangulate(config, details)(flat)
+    coarse = Triangulate(config)(flat)
     levels = coarse.mesh.vertices_world[coarse.mesh.faces][..., 2]
     assert (levels.amax(dim=1) - levels.amin(dim=1) < 0.5).all()
 
