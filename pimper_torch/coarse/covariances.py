@@ -7,28 +7,28 @@ from torch import Tensor
 from pimper_torch.geometry.frames import transform
 from pimper_torch.records import SparseScene
 
-# Degrees of freedom that the median over all points counts for next to a point's own
-# residuals, of which a track of three views leaves three.
+# Degrees of freedom that the median over all points counts for beside a point's own
+# residuals, of which a track of three views leaves three. A choice.
 _COMMON_FREEDOM = 6.0
 
-# Fraction of its mean information that a point is taken to have in every direction: a depth is
-# at most 1,000 times less certain than a place across, as where only one view sees it.
+# Fraction of its mean information that a point has at least in every direction: the standard
+# deviation of its depth is at most 1,000 times that across, as where only one view sees it.
 _MIN_INFORMATION = 1e-6
 
 
 def point_covariances(
     scene: SparseScene, index: Int[Tensor, " chosen"]
 ) -> Float[Tensor, "chosen 3 3"]:
-    r"""Give the covariance of points' places, as their rays leave it.
+    r"""Give the covariance of triangulated points.
 
     .. math:: C = \sigma^2 \Big( \sum_{views} J^T J \Big)^{-1}
 
-    with J the derivative of the pixel in the place: a point is uncertain along its rays, the
+    with J the derivative of the pixel by the point: a point is uncertain along its rays, the
     more so the farther it is and the narrower the angle between them. The pixel's noise
     :math:`\sigma` is estimated from the point's mean reprojection error :math:`e` over n
     views, :math:`\sigma^2 = (2 e^2 / \pi) \, 2n / (2n - 3)` for Gaussian noise, blended with
-    the median of the cloud, for a short track says little about its own noise. Cameras are
-    taken as known.
+    the median of the cloud, as a short track says little about its own noise. Cameras are
+    taken as exact.
 
     Args:
         scene: Cameras, cloud and tracks.
@@ -44,9 +44,9 @@ def point_covariances(
     view, count = scene.observation_view, len(scene.points_world)
     frames = cameras.cam_from_world[view].double()
     intrinsics = cameras.intrinsics[view].double()
-    place = transform(frames, scene.points_world[point, None].double())
-    depth = place[:, 0, 2, None, None]
-    pixel = (place @ intrinsics.mT)[:, 0, :2, None] / depth
+    points = transform(frames, scene.points_world[point, None].double())
+    depth = points[:, 0, 2, None, None]
+    pixel = (points @ intrinsics.mT)[:, 0, :2, None] / depth
     inward = intrinsics.new_tensor([0, 0, 1])
     rate = (intrinsics[:, :2] - pixel * inward) / depth @ frames[:, :3, :3]
     information = rate.new_zeros(count, 3, 3).index_add(0, point, rate.mT @ rate)[index]

@@ -7,21 +7,21 @@ from torch import Tensor
 from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Silhouettes, SparseScene
 
-# Pixels kept round the silhouettes: windows reach beyond what they match.
+# Pixels kept round the silhouettes, for windows that reach beyond what they match. A choice.
 _MARGIN = 8
 
 
 def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     """Cut every photograph to its silhouette's bounding box, and mask it.
 
-    The photographs share one raster: the largest box's. Views without an silhouette keep their
+    The photographs share one raster: the largest box's. Views without a silhouette keep their
     left upper corner, masked. Cameras follow; observations keep their pixels, which are those
     of the photographs before undistortion.
 
     Args:
         scene: Photographs and cameras.
-        silhouettes: Of all views; those not trusted mask their photographs too. What leaves nothing
-            out gives the scene as it is.
+        silhouettes: Of all views; unreliable ones mask their photographs too. Silhouettes that
+            constrain nothing give the scene as it is.
     """
     if silhouettes.source == "everything":
         return scene
@@ -49,9 +49,9 @@ def _boxes(silhouettes: Silhouettes, sizes_px: Int[Tensor, "view 2"]) -> Int[Ten
     masks = silhouettes.masks
     ends = []
     for along in (masks.any(dim=1), masks.any(dim=2)):  # columns, then rows
-        places = torch.arange(along.shape[1], device=along.device)
-        first = torch.where(along, places, along.shape[1]).amin(dim=1) - _MARGIN
-        last = torch.where(along, places, -1).amax(dim=1) + 1 + _MARGIN
+        index = torch.arange(along.shape[1], device=along.device)
+        first = torch.where(along, index, along.shape[1]).amin(dim=1) - _MARGIN
+        last = torch.where(along, index, -1).amax(dim=1) + 1 + _MARGIN
         ends.append(torch.stack([first, last], dim=1))
     boxes = torch.stack(ends, dim=2)
     empty = ~masks.flatten(1).any(dim=1)

@@ -1,4 +1,4 @@
-"""The cloud that the coarse surface goes through: matched densely, sparse where that is not."""
+"""The cloud that the coarse surface goes through: dense points, and sparse ones between them."""
 
 import torch
 from jaxtyping import Float, Int
@@ -7,7 +7,6 @@ from torch import Tensor
 from pimper_torch.coarse.densify import DensifyConfig, DepthMaps, depth_maps
 from pimper_torch.coarse.oriented import (
     OrientedPoints,
-    joined_points,
     oriented_points,
     sparse_oriented,
     thinned,
@@ -22,7 +21,7 @@ def matched_cloud(
     config: DensifyConfig,
     cell_px: float,
 ) -> tuple[OrientedPoints, DepthMaps, float]:
-    """Match the photographs densely, and make one cloud of what was found.
+    """Match the photographs densely, and merge the depth maps and the sparse points.
 
     Args:
         scene: Photographs, cameras and cloud.
@@ -35,14 +34,14 @@ def matched_cloud(
     """
     maps = depth_maps(scene, reliable, config)
     pixel = pixel_size(scene, reliable) * maps[-1].factor
-    # The coarsest windows of three reach past contours: they only say where to look.
+    # The coarsest windows of three reach past contours: they only initialize the finer ones.
     dense = with_common_normals(thinned(oriented_points(maps[-2:]), cell_px * pixel))
-    cloud = joined_points(dense, sparse_oriented(scene, reliable, dense, 3 * pixel))
+    cloud = OrientedPoints.cat([dense, sparse_oriented(scene, reliable, dense, 3 * pixel)])
     return cloud, maps[-1], pixel
 
 
 def pixel_size(scene: SparseScene, reliable: Int[Tensor, " reliable"]) -> float:
-    """Give the size of a photograph's pixel at the trusted observations; the median's."""
+    """Give the size of a photograph's pixel at reliable points; the median over observations."""
     chosen = torch.isin(scene.observation_point, reliable)
     view, point = scene.observation_view[chosen], scene.observation_point[chosen]
     frames = scene.cameras.cam_from_world[view]
@@ -50,7 +49,7 @@ def pixel_size(scene: SparseScene, reliable: Int[Tensor, " reliable"]) -> float:
     return float((depth / scene.cameras.intrinsics[view, 0, 0]).median())
 
 
-def pixel_size_at(place: Float[Tensor, " 3"], cameras: Cameras) -> float:
-    """Give the size of a photograph's pixel at a place; the median of the views'."""
-    away = (cameras.centers_world - place).norm(dim=1)
-    return float((away / cameras.intrinsics[:, 0, 0]).median())
+def pixel_size_at(point: Float[Tensor, " 3"], cameras: Cameras) -> float:
+    """Give the size of a photograph's pixel at a point; the median over views."""
+    distance = (cameras.centers_world - point).norm(dim=1)
+    return float((distance / cameras.intrinsics[:, 0, 0]).median())

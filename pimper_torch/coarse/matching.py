@@ -7,6 +7,7 @@ the field is, at the price of one sample a pixel.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,11 +18,11 @@ from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers, scale_
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.records import Cameras, Record, SparseScene
 
-# Added to radiance over its bright level before the root: without it, the noise of black
-# pixels would be stretched without limit.
+# Added to radiance over its bright level before the root, so that the noise of black pixels is not
+# stretched without limit. A choice.
 _PEDESTAL = 0.01
 
-# Of all pixels' radiance, the quantile that counts as bright: above it lie highlights.
+# Quantile of radiance that is the bright level: above it lie highlights. A choice.
 _BRIGHT = 0.98
 
 
@@ -42,7 +43,7 @@ class Level(Record):
 
 
 def level_of(scene: SparseScene, factor: int) -> Level:
-    """Reduce the photographs by a whole factor; rests at the right and the bottom fall away."""
+    """Reduce the photographs by a whole factor; remainders at the right and the bottom are cut."""
     views, cameras = scene.views, scene.cameras
     usable = views.inside if views.masks is None else views.inside & views.masks
     gray = torch.stack(
@@ -54,7 +55,8 @@ def level_of(scene: SparseScene, factor: int) -> Level:
     # All of a reduced pixel has to be usable: the smallest value is that of the pool's.
     usable = torch.stack([avg_pool2d(one[None].to(gray), factor)[0] > 1 - 1e-4 for one in usable])
     shown = gray[usable] if bool(usable.any()) else gray.reshape(-1)
-    bright = _quantile(shown, _BRIGHT).clamp_min(torch.finfo(gray.dtype).tiny)
+    rank = min(len(shown), int(_BRIGHT * len(shown)) + 1)
+    bright = shown.kthvalue(rank).values.clamp_min(torch.finfo(gray.dtype).tiny)
     return Level(
         tone=(gray / bright + _PEDESTAL).sqrt(),
         usable=usable,
@@ -88,7 +90,7 @@ class Pairing(Record):
     def look(
         self, inverse_depth: Float[Tensor, "*pixel"]
     ) -> tuple[Float[Tensor, "source 2 *pixel"], Float[Tensor, " source *pixel"]]:
-        """Give each pixel's place in the sources, and its depth there over its depth here."""
+        """Project pixels into the sources; also give depth there over depth here."""
         at = self.ray + self.shift.reshape(-1, 3, *(1,) * inverse_depth.dim()) * inverse_depth
         ratio = at[:, 2]
         return at[:, :2] / ratio.clamp_min(1e-6)[:, None], ratio
@@ -114,24 +116,24 @@ def pair(level: Level, view: int, sources: Int[Tensor, " source"]) -> Pairing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Windows:
-    """What is compared.
+    """How windows are compared. The values are choices.
 
     Attributes:
         radius: Windows are squares of ``2 radius + 1`` pixels.
         likeness: Difference of tone to the centre of the window at which a pixel's weight has
-            fallen to 0.6: what looks different may well lie at another depth.
-        contrast: Standard deviation of the tone in a window below which it says little.
-        best: Sources that are believed: the best ones of each pixel.
+            fallen to 0.6: different tones are often at different depths.
+        contrast: Standard deviation of the tone in a window below which its correlation fades.
+        best: Sources that count: the best ones of each pixel.
     """
 
-    radius: int
-    likeness: float
-    contrast: float
-    best: int
+    radius: int = 2
+    likeness: float = 0.2
+    contrast: float = 0.005
+    best: int = 3
 
 
 class Matcher:
-    """A view's windows, prepared to be compared through many fields.
+    """Normalized cross-correlation of a view's windows with its sources', through any field.
 
     Source: Yoon & Kweon, Adaptive support-weight approach, PAMI 28(4), 2006, for the weights;
     Schönberger et al., Pixelwise view selection, ECCV 2016, for correlation with them.
@@ -147,11 +149,11 @@ class Matcher:
         if self._compiled:
             self._weigh(tone)
             return
-        around = torch.stack(_shifted(tone, windows.radius))
+        around = torch.stack(shifted(tone, windows.radius, "replicate"))
         weight = _spatial(windows.radius).to(tone)[:, None, None] * torch.exp(
             -((around - tone) / windows.likeness).square() / 2
         )
-        weight = weight * torch.stack(_shifted(self._here.to(tone), windows.radius))
+        weight = weight * torch.stack(shifted(self._here.to(tone), windows.radius, "replicate"))
         self._weight = weight / weight.sum(dim=0).clamp_min(1e-12)
         self._mean = (self._weight * around).sum(dim=0)
         # Around the mean, so that no difference of large numbers is left for single precision.
@@ -178,7 +180,7 @@ class Matcher:
     def scores(
         self, field: Float[Tensor, "height width"], offsets: Sequence[float]
     ) -> Float[Tensor, "offset height width"]:
-        """Give the score of a field of inverse depths moved by each of some offsets."""
+        """Score a field of inverse depths moved by each of some offsets."""
         if not self._compiled:
             smallest = torch.finfo(field.dtype).tiny
             return torch.stack([self.score((field + one).clamp_min(smallest)) for one in offsets])
@@ -205,21 +207,26 @@ class Matcher:
     def score(self, inverse_depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
         """Give the mean correlation of the best sources, 0 where none sees the pixel."""
         height, width = inverse_depth.shape
-        place, ratio = self._pairing.look(inverse_depth)
-        grid = grid_from_pixels(place.movedim(1, -1), width, height)
+        pixels, ratio = self._pairing.look(inverse_depth)
+        grid = grid_from_pixels(pixels.movedim(1, -1), width, height)
         seen = grid_sample(self._sources, grid, padding_mode="border", align_corners=False)[:, 0]
         there = (grid_sample(self._usable, grid, mode="nearest", align_corners=False)[:, 0] > 0) & (
             ratio > 0
         )
         correlation = torch.stack([self._correlation(one) for one in seen])
         correlation = torch.where(there & self._here, correlation, 0)
-        return mean_of_largest(correlation, self._windows.best)
+        best = min(self._windows.best, len(correlation))
+        return correlation.topk(best, dim=0).values.mean(dim=0)
 
     def _correlation(self, seen: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
         radius, floor = self._windows.radius, self._windows.contrast**2
         mean, square, both = (torch.zeros_like(seen) for _ in range(3))
-        shifted = zip(_shifted(seen, radius), _shifted(seen.square(), radius), strict=True)
-        for index, (value, power) in enumerate(shifted):
+        maps = zip(
+            shifted(seen, radius, "replicate"),
+            shifted(seen.square(), radius, "replicate"),
+            strict=True,
+        )
+        for index, (value, power) in enumerate(maps):
             mean.addcmul_(self._weight[index], value)
             square.addcmul_(self._weight[index], power)
             both.addcmul_(self._deviation[index], value)
@@ -227,37 +234,17 @@ class Matcher:
         return both / ((spread + floor) * (self._power + floor)).sqrt()
 
 
-def _shifted(
-    values: Float[Tensor, "height width"], radius: int
+def shifted(
+    values: Float[Tensor, "height width"], radius: int, padding: Literal["replicate", "constant"]
 ) -> list[Float[Tensor, "height width"]]:
-    """Give every pixel's neighbours, one map a place in the window; borders are continued."""
+    """Give one map for each pixel of a window: the values shifted by its offset."""
     height, width = values.shape
-    wide = pad(values[None, None], (radius, radius, radius, radius), mode="replicate")[0, 0]
+    wide = pad(values[None, None], (radius,) * 4, mode=padding)[0, 0]
     side = range(2 * radius + 1)
     return [wide[row : row + height, column : column + width] for row in side for column in side]
 
 
-def _spatial(radius: int) -> Float[Tensor, " place"]:
-    """Give a bell over the window that has fallen to 0.6 at its radius."""
+def _spatial(radius: int) -> Float[Tensor, " pixel"]:
+    """Give a Gaussian over the window whose standard deviation is the radius."""
     along = torch.exp(-(torch.arange(-radius, radius + 1) / radius).square() / 2)
     return (along[:, None] * along).reshape(-1)
-
-
-def mean_of_largest(
-    values: Float[Tensor, "source height width"], count: int
-) -> Float[Tensor, "height width"]:
-    """Average the largest values over the first axis: bubbles, for few of them beat a sort."""
-    rest = list(values.unbind(dim=0))
-    count = min(count, len(rest))
-    total = torch.zeros_like(rest[0])
-    for first in range(count):
-        for here in range(len(rest) - 1, first, -1):
-            above, below = rest[here - 1], rest[here]
-            rest[here - 1], rest[here] = torch.maximum(above, below), torch.minimum(above, below)
-        total = total + rest[first]
-    return total / count
-
-
-def _quantile(values: Float[Tensor, " value"], fraction: float) -> Float[Tensor, ""]:
-    rank = min(len(values), int(fraction * len(values)) + 1)
-    return values.kthvalue(rank).values

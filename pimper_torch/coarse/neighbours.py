@@ -1,16 +1,15 @@
-"""Which views to match a view with, and where in depth to look."""
+"""Which views to match a view with, and the step of inverse depth that they resolve."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.matching import Pairing
-from pimper_torch.geometry.projection import project
-from pimper_torch.records import Cameras, SparseScene
+from pimper_torch.records import SparseScene
 
-# Angles between rays that match well: below about 5 degrees depth is poorly told, above
-# about 25 the windows look different. The centre and the widths of a bell round it.
+# Angles between rays that match well: below about 5 degrees depth is poorly determined, above
+# about 25 windows look different. Centre and standard deviations of a bell curve; a choice.
 _BEST_ANGLE_DEG = 12.0
 _BELOW_DEG = 4.0
 _ABOVE_DEG = 12.0
@@ -23,9 +22,9 @@ def choose_sources(
 
     Args:
         scene: Cameras and tracks.
-        points: Trusted ones.
-        view: That is matched.
-        count: At most so many.
+        points: Reliable ones.
+        view: The view that is matched.
+        count: Maximum number.
 
     Returns:
         The best first; fewer than ``count`` if the others share nothing.
@@ -43,15 +42,6 @@ def choose_sources(
     return order[score[order] > 0]
 
 
-def inverse_depths(
-    points_world: Float[Tensor, "point 3"], cameras: Cameras, view: int
-) -> tuple[Float[Tensor, "point 2"], Float[Tensor, " point"], Bool[Tensor, " point"]]:
-    """Give points' pixels and inverse depths in a view, and whether they lie in its picture."""
-    pixels, depth = project(points_world, cameras.cam_from_world[view], cameras.intrinsics[view])
-    within = ((pixels > 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
-    return pixels, 1 / torch.where(depth > 0, depth, 1), within
-
-
 def step_for_one_pixel(
     pairing: Pairing,
     pixels: Float[Tensor, "point 2"],
@@ -64,11 +54,8 @@ def step_for_one_pixel(
     height, width = pairing.ray.shape[-2:]
     column = pixels[:, 0].long().clamp(0, width - 1)
     row = pixels[:, 1].long().clamp(0, height - 1)
-    ray = pairing.ray[:, :, row, column]
+    there = pairing.replace(ray=pairing.ray[:, :, row, column])
     change = 0.01 * inverse_depth.median()
-    places = []
-    for q in (inverse_depth - change, inverse_depth + change):
-        at = ray + pairing.shift[:, :, None] * q
-        places.append(at[:, :2] / at[:, 2:].clamp_min(1e-6))
-    moved = (places[1] - places[0]).norm(dim=1).median()
+    before, after = (there.look(inverse_depth + sign * change)[0] for sign in (-1, 1))
+    moved = (after - before).norm(dim=1).median()
     return float(2 * change / moved.clamp_min(1e-6))

@@ -7,58 +7,61 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize, pad
+from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 
 from pimper_torch.coarse.densify import DepthMaps
+from pimper_torch.coarse.matching import shifted
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record, SparseScene
 
-# Radius of the windows that planes are fitted in, pixels.
+# Radius of the windows that planes are fitted in, pixels: that of the windows that were matched.
 _RADIUS = 2
 
 # Steps of inverse depth from the centre of a window at which a pixel's weight has fallen to
-# 0.6: more is another surface, or one so steep that views hardly show it.
+# 0.6: more is another surface, or one so steep that views hardly show it. A choice.
 _REACH_STEPS = 3.0
 
-# Fraction of a window that has to lie on the plane: where it is less, the pixel is beside the
-# contour of what is in front, which windows that match make too large.
+# Fraction of a window that has to lie on the plane: where it is less, the pixel is beside an
+# occluding contour, which windows that match make too large. A choice.
 _MIN_FRACTION = 0.7
 
-# How often planes are fitted, again with what lies off the last one left out; what is added to the
-# diagonal of their normal equations.
-_FITTINGS, _RIDGE = 3, 1e-3
+# Robust iterations of the plane's fit, and what is added to the diagonal of its normal equations,
+# which are of the order of 10. Choices.
+_ITERATIONS, _RIDGE = 3, 1e-3
 
-# Points round a sparse one that tell its normal; the standard deviation across their plane
-# over the smaller one along it that is still a plane; the cosine to the mean ray at least.
+# Neighbours of a sparse point that its normal is fitted to; largest ratio of standard deviations,
+# across a plane over the smaller one along it; least cosine of a normal to the mean ray. Choices.
 _NEIGHBOURS, _FLAT, _FACING = 12, 0.3, 0.2
 
-# Of a grid's cells, for noisy points.
+# Noisy points share cells of a grid up to 2 to this power times as wide. A choice.
 _MAX_DOUBLINGS = 3
 
 # Steps of inverse depth that a window's pixels may scatter round their plane: more is a match
-# without texture, and a coarser window knows better.
+# without texture, and a coarser window is more accurate. A choice: a step is a pixel.
 _MAX_NOISE_STEPS = 1.0
 
-# Points whose places make a normal, and how many normals are made at once; bounds memory.
+# Neighbours of a dense point that its normal is fitted to, a choice, and how many normals are
+# fitted at once, which bounds memory to tens of MB a thread.
 _COMMON, _AT_ONCE = 24, 10_000
 
 # Length of the mean of unit normals round a point, at least: that of normals which scatter by
-# 60 degrees.
+# 60 degrees. A choice.
 _MIN_AGREEMENT = 0.5
 
-# Steps in front of what another view sees, beyond which a point is denied by it.
+# Steps of inverse depth by which a view's depth map has to lie behind a point to contradict it. A
+# choice: depths that agree differ by a step at most.
 _DENIED_STEPS = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OrientedPoints(Record):
-    """Points of surfaces.
+    """Points of surfaces with normals and noise.
 
     Attributes:
-        points_world: Where.
+        points_world: Positions.
         normals_world: Unit, towards the cameras.
         noise: Standard deviation along the normal, scene units.
     """
@@ -74,20 +77,11 @@ def no_points(like: Float[Tensor, "..."]) -> OrientedPoints:
     return OrientedPoints(points_world=none, normals_world=none, noise=none[:, 0])
 
 
-def joined_points(*clouds: OrientedPoints) -> OrientedPoints:
-    """Put clouds in one."""
-    return OrientedPoints(
-        points_world=torch.cat([one.points_world for one in clouds]),
-        normals_world=torch.cat([one.normals_world for one in clouds]),
-        noise=torch.cat([one.noise for one in clouds]),
-    )
-
-
 def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
-    """Give every valid pixel's point, on the plane that its neighbours lie on.
+    """Give every valid pixel's point, on the plane fitted to its neighbours.
 
-    A point that more views look through than agree with it is dropped. Coarse pixels give
-    points where finer ones have none near: their windows reach across weaker texture.
+    A point that more views contradict than agree with is dropped. Coarse pixels give points
+    where no finer ones are near: their windows match weaker texture.
 
     Args:
         maps: Of all resolutions, the coarsest first.
@@ -101,9 +95,9 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
                 wanted &= ~_covered(finer, wanted)
             cloud, finer = _of_view(one, view, wanted)
             clouds.append(cloud)
-        return joined_points(*clouds)
+        return OrientedPoints.cat(clouds)
 
-    return joined_points(*side_by_side(of_view, range(maps[0].valid.shape[0])))
+    return OrientedPoints.cat(list(side_by_side(of_view, range(maps[0].valid.shape[0]))))
 
 
 def _covered(
@@ -118,29 +112,28 @@ def _covered(
 def _of_view(
     maps: DepthMaps, view: int, wanted: Bool[Tensor, "height width"]
 ) -> tuple[OrientedPoints, Bool[Tensor, "height width"]]:
-    """Give a view's points where they are wanted, and where they or finer ones are."""
+    """Give a view's points at wanted pixels, and mark the pixels that have these or finer ones."""
     intrinsics = maps.level.cameras.intrinsics[view]
     frame = maps.level.cameras.cam_from_world[view]
-    inverse_depth, slope, spread, fine = fitted_planes(
+    inverse_depth, slope, spread, fitted = fitted_planes(
         maps.inverse_depth[view], maps.valid[view], float(maps.step[view])
     )
-    fine &= wanted & (spread <= _MAX_NOISE_STEPS * maps.step[view])
-    height, width = fine.shape
-    pixels = pixel_centers(width, height, like=intrinsics)[fine]
-    q, slope, spread = inverse_depth[fine], slope[fine], spread[fine]
+    fitted &= wanted & (spread <= _MAX_NOISE_STEPS * maps.step[view])
+    height, width = fitted.shape
+    pixels = pixel_centers(width, height, like=intrinsics)[fitted]
+    q, slope, spread = inverse_depth[fitted], slope[fitted], spread[fitted]
     rays = rays_through(pixels, frame, intrinsics)
     points = maps.level.cameras.centers_world[view] + rays / q[:, None]
-    rest = q - (slope * pixels).sum(dim=-1)
-    plane = torch.cat([slope, rest[:, None]], dim=-1)  # q = plane . (u, v, 1)
+    constant = q - (slope * pixels).sum(dim=-1)
+    plane = torch.cat([slope, constant[:, None]], dim=-1)  # q = plane . (u, v, 1)
     normals = -normalize(plane @ intrinsics @ frame[:3, :3], dim=-1)
     # Along the ray dz = dq / q^2; along the normal as much less as the ray is oblique.
     oblique = -(normalize(rays, dim=-1) * normals).sum(dim=-1)
     noise = spread / q.square() * rays.norm(dim=-1) * oblique
     cloud = OrientedPoints(points_world=points, normals_world=normals, noise=noise)
-    borne_out = denied(maps, view, points) <= maps.agreed[view][fine]
-    kept = borne_out & (oblique > 0)
+    kept = (denied(maps, view, points) <= maps.agreed[view][fitted]) & (oblique > 0)
     known = ~wanted
-    known[fine] = kept
+    known[fitted] = kept
     return cloud.take(kept), known
 
 
@@ -156,37 +149,39 @@ def fitted_planes(
 
     Args:
         inverse_depth: Of the view.
-        valid: Which of them count.
-        step: Change of inverse depth that matters.
+        valid: Pixels that count.
+        step: Change of inverse depth that moves a pixel by one in the sources.
 
     Returns:
         The planes' inverse depths and slopes a pixel, the standard deviation of that inverse
-        depth, and where there were enough neighbours on the plane.
+        depth, and True where enough neighbours lie on the plane.
     """
     if inverse_depth.dtype == torch.float32 and compiled_for(inverse_depth):
         fits = _compiled_fits(inverse_depth, valid, max(step, 1e-30))
     else:
         fits = _fits(inverse_depth, valid, max(step, 1e-30))
     offset, across, down, variance, fraction = fits
-    fine = valid & (fraction >= _MIN_FRACTION) & (offset.abs() < 1)
-    # Neighbouring windows overlap, so that their errors are alike: no gain from averaging.
+    fitted = valid & (fraction >= _MIN_FRACTION) & (offset.abs() < 1)
+    # Neighbouring windows overlap, so that their errors are correlated: averaging gains nothing.
     spread = step * variance.sqrt().clamp_min(0.05)
-    return inverse_depth + step * offset, step * torch.stack([across, down], dim=-1), spread, fine
+    return inverse_depth + step * offset, step * torch.stack([across, down], dim=-1), spread, fitted
 
 
 def _fits(
     inverse_depth: Float[Tensor, "height width"], valid: Bool[Tensor, "height width"], step: float
 ) -> Float[Tensor, "5 height width"]:
-    """Give offset, slopes, variance and mean weight of the planes, in steps; 0 where not valid."""
+    """Give offset, slopes, variance and mean weight of planes, in steps; 0 where not valid."""
     steps = torch.arange(-_RADIUS, _RADIUS + 1).to(inverse_depth)
     v, u = (one.reshape(-1) for one in torch.meshgrid(steps, steps, indexing="ij"))
     basis = torch.stack([torch.ones_like(u), u, v], dim=-1)
-    around = torch.stack(_neighbours(inverse_depth), dim=-1) - inverse_depth[..., None]
-    counted = torch.stack(_neighbours(valid.to(inverse_depth)), dim=-1)
+    around = (
+        torch.stack(shifted(inverse_depth, _RADIUS, "constant"), dim=-1) - inverse_depth[..., None]
+    )
+    counted = torch.stack(shifted(valid.to(inverse_depth), _RADIUS, "constant"), dim=-1)
     around, counted = around[valid] / step, counted[valid]
     weight = counted * torch.exp(-(around / _REACH_STEPS).square() / 2)
     fit = torch.zeros_like(around[:, :3])
-    for _ in range(_FITTINGS):
+    for _ in range(_ITERATIONS):
         normal = torch.einsum("pk,ki,kj->pij", weight, basis, basis)
         normal = normal + _RIDGE * torch.eye(3).to(normal)
         fit = torch.linalg.solve(normal, torch.einsum("pk,ki,pk->pi", weight, basis, around))
@@ -212,21 +207,14 @@ def _compiled_fits(
         _RADIUS,
         _REACH_STEPS,
         _RIDGE,
-        _FITTINGS,
+        _ITERATIONS,
         results.numpy(),
     )
     return results
 
 
-def _neighbours(values: Float[Tensor, "height width"]) -> list[Float[Tensor, "height width"]]:
-    height, width = values.shape
-    wide = pad(values[None, None], (_RADIUS,) * 4, mode="constant")[0, 0]
-    side = range(2 * _RADIUS + 1)
-    return [wide[row : row + height, column : column + width] for row in side for column in side]
-
-
 def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
-    """Count the views that see something behind the points."""
+    """Count the views whose depth maps lie behind the points, and so contradict them."""
     cameras, count = maps.level.cameras, torch.zeros_like(points[:, 0], dtype=torch.long)
     if points.dtype == maps.inverse_depth.dtype == torch.float32 and compiled_for(points):
         from pimper_torch.kernels.denied import count_denied
@@ -255,15 +243,15 @@ def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[
 
 
 def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
-    """Average points that fraction a cell of a grid and face the same way.
+    """Average the points of each cell of a grid that face the same way.
 
-    Noisy points share larger cells, up to eight times as wide: a surface through them is then
-    as smooth as it can be known.
+    Noisy points share larger cells, up to eight times as wide, so that a surface through them
+    is smooth.
 
     Args:
-        cloud: Any.
-        cell: Side of the finest grid's cells, scene units; fine for points whose noise is
-            within a third of it.
+        cloud: Points.
+        cell: Side of the finest grid's cells, scene units; they hold points whose noise is a
+            third of it at most.
     """
     if len(cloud.points_world) == 0:
         return cloud
@@ -272,18 +260,18 @@ def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
         _averaged(cloud.take(doublings == rank), cell * 2**rank)
         for rank in range(_MAX_DOUBLINGS + 1)
     ]
-    return joined_points(*parts)
+    return OrientedPoints.cat(parts)
 
 
 def _averaged(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     points = cloud.points_world
     if len(points) == 0:
         return cloud
-    place = ((points - points.amin(dim=0)) / cell).floor().long()
-    side = place.amax(dim=0) + 1
+    index = ((points - points.amin(dim=0)) / cell).floor().long()
+    side = index.amax(dim=0) + 1
     facing = cloud.normals_world.abs().argmax(dim=-1)
     towards = cloud.normals_world.gather(1, facing[:, None])[:, 0] > 0
-    key = (place[:, 0] * side[1] + place[:, 1]) * side[2] + place[:, 2]
+    key = (index[:, 0] * side[1] + index[:, 1]) * side[2] + index[:, 2]
     key = key * 6 + 2 * facing + towards
     _, index, counts = torch.unique(key, return_inverse=True, return_counts=True)
     weight = 1 / cloud.noise.double().clamp_min(1e-12).square()
@@ -296,34 +284,34 @@ def _averaged(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     return OrientedPoints(
         points_world=(summed(points) / total).to(points),
         normals_world=normalize(summed(cloud.normals_world), dim=-1).to(points),
-        # Errors of windows that overlap, in one view, do not average out: each cell counts
-        # for one measurement of the weight its points have on average.
+        # Errors of windows that overlap in a view do not average out: a cell is one measurement,
+        # of the mean weight of its points.
         noise=(counts / total[:, 0]).sqrt().to(points),
     )
 
 
 def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
-    """Take the normals from where the neighbours lie, whichever view they come from.
+    """Fit the normals to the neighbours' positions, whichever view they come from.
 
-    A window's slope is less certain than its depth. Neighbours on the other side of a thin
-    wall do not count; where the rest lie on no plane, their normals are averaged. Points whose
-    neighbours face anywhere are no surface and are left out.
+    A window's slope is less accurate than its depth. Neighbours on the other side of a thin
+    wall do not count; where the others lie on no plane, their normals are averaged. Points
+    whose neighbours face in all directions are outliers and dropped.
     """
     points = cloud.points_world.detach().cpu()
     if len(points) < 3:
         return cloud
     tree, count = cKDTree(points.numpy()), min(_COMMON, len(points))
-    normals, places = cloud.normals_world.double().cpu(), cloud.points_world.double().cpu()
+    normals, positions = cloud.normals_world.double().cpu(), cloud.points_world.double().cpu()
     weight = 1 / cloud.noise.double().cpu().clamp_min(1e-12).square()
 
     def common(some: Float[Tensor, "some 3"]) -> tuple[Tensor, Tensor]:
         around = torch.from_numpy(tree.query(some.numpy(), count)[1])
         fraction = weight[around] / weight[around].sum(dim=1, keepdim=True)
         mean = (fraction[..., None] * normals[around]).sum(dim=1)
-        alike = (normals[around] * mean[:, None]).sum(dim=-1) > 0
-        fraction = torch.where(alike, fraction, 0) / (fraction * alike).sum(dim=1, keepdim=True)
-        centre = (fraction[..., None] * places[around]).sum(dim=1, keepdim=True)
-        steps = places[around] - centre
+        facing = (normals[around] * mean[:, None]).sum(dim=-1) > 0
+        fraction = torch.where(facing, fraction, 0) / (fraction * facing).sum(dim=1, keepdim=True)
+        centre = (fraction[..., None] * positions[around]).sum(dim=1, keepdim=True)
+        steps = positions[around] - centre
         width, axes = torch.linalg.eigh((fraction[..., None] * steps).mT @ steps)
         across = axes[:, :, 0]
         across = across * (across * mean).sum(dim=-1, keepdim=True).sign()
@@ -332,8 +320,8 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
 
     parts = torch.split(points, _AT_ONCE)
     found, agreement = zip(*side_by_side(common, parts, tracked=False), strict=True)
-    alike = torch.cat(agreement).to(cloud.normals_world) > _MIN_AGREEMENT
-    return cloud.replace(normals_world=torch.cat(found).to(cloud.normals_world)).take(alike)
+    reliable = torch.cat(agreement).to(cloud.normals_world) > _MIN_AGREEMENT
+    return cloud.replace(normals_world=torch.cat(found).to(cloud.normals_world)).take(reliable)
 
 
 def sparse_oriented(
@@ -342,16 +330,16 @@ def sparse_oriented(
     dense: OrientedPoints,
     reach: float,
 ) -> OrientedPoints:
-    """Give points of the sparse cloud normals, where there are no dense ones.
+    """Give the points of the sparse cloud that are far from all dense ones, with normals.
 
-    A normal is that of the plane through the nearest points, sparse and dense; a point whose
+    A normal is that of the plane fitted to the nearest points, sparse and dense; a point whose
     neighbours lie on none is left out.
 
     Args:
         scene: Cameras, cloud and tracks.
-        index: Trusted points.
+        index: Reliable points.
         dense: Points with normals.
-        reach: A dense point nearer than this makes a sparse one needless.
+        reach: Distance to a dense point within which a sparse one is left out.
     """
     points = scene.points_world[index]
     around = torch.cat([points, dense.points_world.to(points)]).detach().cpu().numpy()

@@ -3,7 +3,7 @@ from torch.testing import assert_close
 
 from pimper_torch.coarse.densify import agreeing, median3, push_pull, sweep
 from pimper_torch.coarse.fine_surface import near_points
-from pimper_torch.coarse.matching import Matcher, Windows, level_of, mean_of_largest, pair
+from pimper_torch.coarse.matching import Matcher, Windows, level_of, pair
 from pimper_torch.coarse.oriented import OrientedPoints, fitted_planes, thinned
 from pimper_torch.coarse.trim import (
     ViewCounts,
@@ -70,13 +70,6 @@ def test_a_sweep_finds_the_offset_between_its_steps():
     found, score = sweep(matcher, true + 1.3 * step, [step * rank for rank in range(-3, 4)])
     assert ((found - true)[inner].abs().median() / step) < 0.15
     assert score[inner].median() > 0.9
-
-
-def test_the_mean_of_the_largest_is_that_of_a_sort():
-    generator = torch.Generator().manual_seed(0)
-    values = torch.randn(5, 4, 3, generator=generator)
-    assert_close(mean_of_largest(values, 3), values.topk(3, dim=0).values.mean(dim=0))
-    assert_close(mean_of_largest(values, 9), values.mean(dim=0))
 
 
 def test_holes_are_filled_from_around_and_the_rest_stays():

@@ -132,8 +132,8 @@ def test_a_cloud_without_reliable_points_is_refused(round_about):
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(ConfigError, match="best_sources"):
-        DensifyConfig(sources=2, best_sources=3)
+    with pytest.raises(ConfigError, match="coarsest_px"):
+        DensifyConfig(coarsest_px=31)
     with pytest.raises(ConfigError, match="num_facets"):
         CoarseSurfaceConfig(num_facets=3)
 

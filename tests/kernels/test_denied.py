@@ -17,7 +17,6 @@ def test_points_are_denied_by_as_many_views_as_torch_says():
         factor=1,
         level=Level(tone=tone, usable=tone > 0, cameras=cameras),
         inverse_depth=0.25 + 0.02 * torch.randn(5, 30, 40, generator=generator),
-        score=tone,
         agreed=tone.long(),
         valid=torch.rand(5, 30, 40, generator=generator) > 0.2,
         step=torch.linspace(0.001, 0.01, 5),
