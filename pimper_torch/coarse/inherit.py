@@ -1,4 +1,4 @@
-"""What goes with the coarse mesh when its facets are split: normals, and the cloud's points."""
+"""Normals, points of the cloud and support of a coarse mesh whose facets were split."""
 
 import torch
 from jaxtyping import Float, Int
@@ -10,49 +10,50 @@ from pimper_torch.geometry.surfaces import barycentric_2d, vertex_normals
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Surface
 
-# The surface's normals count this much where no photograph told them.
-UNSURE = 0.05
+# Weight of the surface's normals, added to their confidence: a twentieth of the best where they
+# follow from their neighbours alone. A choice.
+MIN_WEIGHT = 0.05
 
-# How strongly the facets' own normals hold those fitted to the surface, in fractions of a typical
-# vertex's data: next to nothing, except where there are none.
+# Weight of the facets' own normals in the fit, in fractions of a typical vertex's data: negligible
+# except where there is none. A choice.
 _DAMPING = 0.01
 
 
 def fitted_normals(
-    mesh: Mesh, surface: Surface, split: Split, number: Int[Tensor, " child"]
+    mesh: Mesh, surface: Surface, split: Split, index: Int[Tensor, " child"]
 ) -> Float[Tensor, "vertex 3"]:
-    """Fit normals at the vertices so that, blended over facets, they are the surface's.
+    """Fit vertex normals whose blend over the facets is nearest to the surface's normals.
 
-    Least squares over the subdivided mesh, weighted by confidence; where there is no subdivided
-    mesh the facets' own.
+    Least squares over the subdivided mesh, weighted by confidence; where that has no vertex, the
+    facets' own normals.
 
     Args:
         mesh: After splitting and dropping.
         surface: On the mesh before.
         split: From the one to the other.
-        number: Of each part among the mesh's faces; -1 for a dropped one.
+        index: Of each child among the mesh's faces; -1 for a dropped one.
     """
     vertices, faces = mesh.vertices_world.double(), mesh.faces
-    child, place = split.relocate(surface.facet, surface.barycentric)
-    face = number[child]
-    (on,) = torch.nonzero(face >= 0, as_tuple=True)
-    face, place = face[on], place[on].double()
-    weight = (surface.confidence[on].double() + UNSURE)[:, None] * place
-    normals = surface.normals_world[on].double()
+    child, barycentric = split.relocate(surface.facet, surface.barycentric)
+    face = index[child]
+    (kept,) = torch.nonzero(face >= 0, as_tuple=True)
+    face, barycentric = face[kept], barycentric[kept].double()
+    weight = (surface.confidence[kept].double() + MIN_WEIGHT)[:, None] * barycentric
+    normals = surface.normals_world[kept].double()
     # Facet by facet first: a million subdivided mesh vertices are a few thousand blocks.
-    blocks = place.new_zeros(len(faces), 3, 3)
-    blocks.index_add_(0, face, weight[:, :, None] * place[:, None])
-    fractions = place.new_zeros(len(faces), 3, 3)
-    fractions.index_add_(0, face, weight[:, :, None] * normals[:, None])
-    like = place.new_zeros(len(vertices))
-    diagonal = like.index_add(0, faces.flatten(), blocks.diagonal(dim1=1, dim2=2).flatten())
-    rhs = torch.zeros_like(vertices).index_add(0, faces.flatten(), fractions.flatten(0, 1))
+    zeros = barycentric.new_zeros(len(faces), 3, 3)
+    blocks = zeros.index_add(0, face, weight[:, :, None] * barycentric[:, None])
+    sums = zeros.index_add(0, face, weight[:, :, None] * normals[:, None])
+    diagonal = zeros.new_zeros(len(vertices)).index_add(
+        0, faces.flatten(), blocks.diagonal(dim1=1, dim2=2).flatten()
+    )
+    rhs = torch.zeros_like(vertices).index_add(0, faces.flatten(), sums.flatten(0, 1))
     damping = (_DAMPING * diagonal.mean()).clamp_min(1e-12).expand(len(vertices))
     own = vertex_normals(vertices, faces)
-    everyone = torch.arange(len(vertices), device=faces.device)
+    every = torch.arange(len(vertices), device=faces.device)
     fitted = SparseCholesky(
-        torch.cat([faces[:, :, None].expand(-1, -1, 3).flatten(), everyone]),
-        torch.cat([faces[:, None].expand(-1, 3, -1).flatten(), everyone]),
+        torch.cat([faces[:, :, None].expand(-1, -1, 3).flatten(), every]),
+        torch.cat([faces[:, None].expand(-1, 3, -1).flatten(), every]),
         torch.cat([blocks.flatten(), damping]),
         size=len(vertices),
         what="the coarse mesh's normals",
@@ -65,76 +66,66 @@ def with_points(
     coarse: CoarseMesh,
     mesh: Mesh,
     split: Split,
-    number: Int[Tensor, " child"],
+    index: Int[Tensor, " child"],
     source: Int[Tensor, " vertex"],
 ) -> CoarseMesh:
-    """Put the mesh beside the cloud's points: those on facets, and those that vertices left.
+    """Give the new mesh the points of the cloud on its facets, and the support of its facets.
+
+    A vertex that was a point of the cloud and has moved is none any more: the point lies on a
+    facet, at its own position with its own covariance.
 
     Args:
         coarse: Before.
         mesh: After.
         split: From the one to the other.
-        number: Of each part among the mesh's faces; -1 for a dropped one.
-        source: The vertex each one is or is a copy of; new ones follow the old.
+        index: Of each child among the mesh's faces; -1 for a dropped one.
+        source: The old vertex that each vertex is or is a copy of; new ones follow the old.
     """
-    old, points = coarse.mesh.vertices_world, coarse.points
+    old, points, covariance = coarse.mesh.vertices_world, coarse.points, coarse.covariance_world
     origin = source.clamp_max(len(old) - 1)
     was_point = (source < len(old)) & coarse.is_point[origin]
-    stayed = (mesh.vertices_world == old[origin]).all(dim=1)
+    is_point = was_point & (mesh.vertices_world == old[origin]).all(dim=1)
     if points is not None:
-        points = _transferred(coarse, points, split, number)
-    covariance = coarse.covariance_world
+        points = _relocated(coarse, points, split, index)
     if covariance is not None:
-        (left,) = torch.nonzero(was_point & ~stayed, as_tuple=True)
+        (left,) = torch.nonzero(was_point & ~is_point, as_tuple=True)
         once = torch.ones_like(left, dtype=torch.bool)  # a vertex parted in two leaves one point
         once[1:] = origin[left][1:] != origin[left][:-1]
         left = left[once]
-        points = _joined(
-            points,
-            FacetPoints(
-                points_world=old[origin[left]],
-                covariance_world=covariance[origin[left]],
-                facet=_first_face(mesh.faces, len(source))[left],
-            ),
+        first_face = mesh.faces.new_full((len(source),), len(mesh.faces)).scatter_reduce(
+            0,
+            mesh.faces.flatten(),
+            torch.arange(len(mesh.faces), device=source.device).repeat_interleave(3),
+            "amin",
         )
-        covariance = torch.where((was_point & stayed)[:, None, None], covariance[origin], 0)
+        moved = FacetPoints(
+            points_world=old[origin[left]],
+            covariance_world=covariance[origin[left]],
+            facet=first_face[left],
+        )
+        points = moved if points is None else FacetPoints.cat([points, moved])
+        covariance = torch.where(is_point[:, None, None], covariance[origin], 0)
     return CoarseMesh(
         mesh=mesh,
         reference=coarse.reference,
-        is_point=was_point & stayed,
+        is_point=is_point,
         covariance_world=covariance,
         points=points,
-        support=None if coarse.support is None else coarse.support[split.parent[number >= 0]],
+        support=None if coarse.support is None else coarse.support[split.parent[index >= 0]],
     )
 
 
-def _transferred(
-    coarse: CoarseMesh, points: FacetPoints, split: Split, number: Int[Tensor, " child"]
+def _relocated(
+    coarse: CoarseMesh, points: FacetPoints, split: Split, index: Int[Tensor, " child"]
 ) -> FacetPoints:
-    """Give the points on facets to the parts they lie over, straight down on the old plane."""
+    """Give the points on facets to the children that they project into, along the old normal."""
     corners = coarse.mesh.vertices_world[coarse.mesh.faces[points.facet]]
     origin, along = corners[:, 0], corners[:, 1] - corners[:, 0]
     normal = torch.linalg.cross(along, corners[:, 2] - origin)
     x, normal = normalize(along, dim=1), normalize(normal, dim=1)
     axes = torch.stack([x, torch.linalg.cross(normal, x)], dim=2)
     flat = (corners - origin[:, None]) @ axes
-    place = ((points.points_world - origin)[:, None] @ axes)[:, 0]
-    child, _ = split.relocate(points.facet, barycentric_2d(place, flat))
-    facet = number[child]
-    (on,) = torch.nonzero(facet >= 0, as_tuple=True)
-    return FacetPoints(
-        points_world=points.points_world[on],
-        covariance_world=points.covariance_world[on],
-        facet=facet[on],
-    )
-
-
-def _joined(one: FacetPoints | None, other: FacetPoints) -> FacetPoints:
-    return other if one is None else FacetPoints.cat([one, other])
-
-
-def _first_face(faces: Int[Tensor, "face 3"], count: int) -> Int[Tensor, " {count}"]:
-    """Give the first face round each vertex."""
-    face = torch.arange(len(faces), device=faces.device).repeat_interleave(3)
-    unset = torch.full((count,), len(faces), device=faces.device)
-    return unset.scatter_reduce(0, faces.flatten(), face, "amin")
+    projected = ((points.points_world - origin)[:, None] @ axes)[:, 0]
+    child, _ = split.relocate(points.facet, barycentric_2d(projected, flat))
+    facet = index[child]
+    return points.replace(facet=facet).take(facet >= 0)

@@ -1,4 +1,4 @@
-"""The mesh adapts: facets that the surface has outgrown are split, unseen ones dropped."""
+"""Remeshing: facets that the surface departs from are split, unseen ones dropped."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.contradicted import contradicted, misfit_of
-from pimper_torch.coarse.inherit import UNSURE, fitted_normals, with_points
+from pimper_torch.coarse.inherit import MIN_WEIGHT, fitted_normals, with_points
 from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import require
@@ -26,24 +26,22 @@ from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.silhouettes.hull import Hull
 from pimper_torch.stage import Stage
 
-# A subdivided mesh vertex lies on an edge when its coordinate opposite to it is below this:
-# subdivided meshes have far fewer than a million pieces.
+# Barycentric coordinate below which a subdivided mesh vertex lies on an edge: subdivided meshes
+# have far fewer than a million parts.
 _ON_EDGE = 1e-6
 
-# Fraction of a facet's subdivided mesh vertices that must lie within the distance it is said to
-# depart by.
-_DEPARTURE_FRACTION = 0.9
+# Fraction of a facet's subdivided mesh vertices within its departure.
+_DEPARTURE_QUANTILE = 0.9
 
-# Views that a facet has to show in to stay, without silhouettes, whatever light tells of it.
-_SEEING = 2
+# Views that have to see a facet without data, where silhouettes constrain nothing. A choice: one
+# may be wrong.
+_MIN_VIEWS = 2
 
-# A facet smaller than this fraction of what it was before its corners moved has collapsed.
-_MIN_AREA = 0.05
+# A facet whose corners would move stays where its area falls below this fraction, or its longest
+# side grows so many times: it collapses, or has an outlier for a corner. Choices.
+_MIN_AREA, _MAX_STRETCH = 0.05, 4.0
 
-# A facet that gets so many times longer has a corner that ran away.
-_MAX_STRETCH = 4.0
-
-# Photometric residual over the median facet's, above which a facet is split.
+# Photometric residual over the median facet's, above which a facet is split. A choice.
 _MAX_RESIDUAL = 3.0
 
 
@@ -90,42 +88,35 @@ class Remesh(Stage):
         surface: Surface,
         contours: Contours,
     ) -> CoarseMesh:
-        """Remesh the mesh that the patches stand on to the surface that was found.
+        """Remesh the patches' coarse mesh to the surface that was reconstructed on it.
 
         Lengths count in samples of these patches; the residual is their photometry's. A facet
-        that shows in two views has data, whether or not it is lit there. Inside the silhouettes'
-        visual hull one view is enough, as at the ends of an arc, or none beside a facet that
-        shows: contours run through both. Facets outside the hull are dropped, and so are those
-        that the photographs contradict (:mod:`~pimper_torch.coarse.contradicted`).
+        that two views see has data, illuminated or not. Inside the silhouettes' visual hull one
+        view is enough, as at the ends of an arc, or none beside a facet that is seen: contours
+        run through both. Facets outside the hull are dropped, and so are those that the
+        photographs contradict (:mod:`~pimper_torch.coarse.contradicted`).
         """
-        patches = swept.patches
+        patches, mesh = swept.patches, swept.patches.coarse.mesh
         residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
-        seen = torch.zeros_like(residual, dtype=torch.bool)
+        misfit, seen = residual.clone(), torch.zeros_like(residual, dtype=torch.bool)
         for templates, found, heights in zip(
             patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
         ):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
-            residual = residual.index_copy(0, templates.facet, known.detach().to(residual))
-            enough = heights.num_views >= (1 if contours.confine else _SEEING)
-            seen = seen.index_copy(0, templates.facet, enough)
-        spacing = float(patches.buckets[0].spacing[0].detach())
+            residual[templates.facet] = known.detach().to(residual)
+            misfit[templates.facet] = misfit_of(found).to(misfit)
+            seen[templates.facet] = heights.num_views >= (1 if contours.confine else _MIN_VIEWS)
         inside = None
         if contours.confine:
-            mesh = patches.coarse.mesh
             seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
             inside = within(contours.hull, surface, patches.num_patches)
             if patches.coarse.support is not None:
-                misfit = torch.full_like(residual, torch.nan)
-                for templates, found in zip(
-                    patches.buckets, swept.photometric.buckets, strict=True
-                ):
-                    misfit[templates.facet] = misfit_of(found).to(misfit)
                 occlusion = ambient_occlusion(mesh.vertices_world, mesh.faces).to(misfit)
                 inside &= ~contradicted(mesh.faces, patches.coarse.support, misfit, occlusion)
         return remesh(
             patches.coarse,
             surface,
-            spacing,
+            float(patches.buckets[0].spacing[0].detach()),
             self.config,
             residual=residual,
             seen=seen,
@@ -143,12 +134,12 @@ def remesh(
     seen: Bool[Tensor, " facet"] | None = None,
     inside: Bool[Tensor, " facet"] | None = None,
 ) -> CoarseMesh:
-    """Fit the coarse mesh to the surface that was found on it.
+    """Fit the coarse mesh to the surface that was reconstructed on it.
 
     Every facet is split in four at most, neighbours are cut so that the mesh stays conforming
     (see :mod:`~pimper_torch.coarse.splitting`), and all vertices, old and new, move onto the
-    surface. Where that would turn or flatten a facet, or draw it out to a needle, its vertices
-    stay on the old mesh.
+    surface. Where that would fold, flatten or stretch a facet, its vertices stay on the old
+    mesh.
 
     Args:
         coarse: The facets that ``surface`` is the subdivided mesh of.
@@ -157,15 +148,13 @@ def remesh(
             settings.
         config: Settings.
         residual: Of the photometry, one a facet, in any unit; NaN for none.
-        seen: True for facets that have data whatever the surface's confidence says.
-        inside: False for facets that are not of the object, whatever data they have.
+        seen: True for facets that have data even without confidence of the surface.
+        inside: False for facets outside the object, which are dropped even with data.
 
     Returns:
-        The adapted mesh. Its normals are the piecewise linear fit to the surface's. A vertex
-        that was a point of the cloud and has moved is none any more: the point joins those on
-        the facets, in its own place with its own covariance. Points on facets that are dropped
-        are dropped. Unused vertices are gone, and so are vertices that touched two parts of the
-        mesh without joining them: each part has its own.
+        The new mesh. Its normals are the piecewise linear fit to the surface's; points of the
+        cloud follow :func:`~pimper_torch.coarse.inherit.with_points`. Unused vertices are
+        dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
 
     Raises:
         InputError: The surface is not this mesh's subdivided mesh.
@@ -190,14 +179,14 @@ def remesh(
         split = split_edges(old, faces, marked)
     flat = torch.cat([old, old[edges[split.halved]].mean(dim=1)])
     onto = torch.cat([corners, centres[split.halved]])
-    split_kept = kept[split.parent]
-    places = _without_folds(flat, onto, split.faces[split_kept])
-    source, new_faces = vertex_fans(split.faces[split_kept])
-    number = torch.full_like(split.parent, -1)
-    number[split_kept] = torch.arange(int(split_kept.sum()), device=faces.device)
-    mesh = Mesh(vertices_world=places[source], faces=new_faces)
-    mesh = mesh.replace(normals_world=fitted_normals(mesh, surface, split, number))
-    return with_points(coarse, mesh, split, number, source)
+    child_kept = kept[split.parent]
+    positions = _without_folds(flat, onto, split.faces[child_kept])
+    source, new_faces = vertex_fans(split.faces[child_kept])
+    index = torch.full_like(split.parent, -1)
+    index[child_kept] = torch.arange(int(child_kept.sum()), device=faces.device)
+    mesh = Mesh(vertices_world=positions[source], faces=new_faces)
+    mesh = mesh.replace(normals_world=fitted_normals(mesh, surface, split, index))
+    return with_points(coarse, mesh, split, index, source)
 
 
 def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
@@ -211,7 +200,7 @@ def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
 
 
 def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]:
-    """Mark facets with a vertex of the surface that the hull holds, or with none of their own."""
+    """Mark facets with a vertex of the surface inside the hull, or without own vertices."""
     inside = hull.holds(surface.vertices_world.detach())
     outside = torch.bincount(surface.facet[~inside], minlength=count)
     return torch.bincount(surface.facet[inside], minlength=count) >= outside.clamp_max(1)
@@ -224,14 +213,14 @@ def _on_surface(
     face_edge: Int[Tensor, "face 3"],
     surface: Surface,
 ) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "edge 3"]]:
-    """Find where vertices and centres of edges came to lie, the latter between two cuts."""
+    """Find vertices and midpoints of edges on the surface; these interpolate along the edge."""
     zeros = surface.barycentric < _ON_EDGE
     count = zeros.sum(dim=1)
     (at,) = torch.nonzero(count == 2, as_tuple=True)
     corner = surface.barycentric[at].argmax(dim=1, keepdim=True)
     name = faces[surface.facet[at]].gather(1, corner)[:, 0]
-    places = vertices.clone()
-    places[name] = surface.vertices_world[at].to(places)
+    moved = vertices.clone()
+    moved[name] = surface.vertices_world[at].to(moved)
 
     (on,) = torch.nonzero(count == 1, as_tuple=True)
     facet, opposite = surface.facet[on], zeros[on].long().argmax(dim=1, keepdim=True)
@@ -241,13 +230,13 @@ def _on_surface(
     below, above = along <= 0.5, along >= 0.5
     low = along.new_zeros(len(edges)).scatter_reduce(0, edge[below], along[below], "amax")
     high = along.new_ones(len(edges)).scatter_reduce(0, edge[above], along[above], "amin")
-    start, end = places[edges[:, 0]], places[edges[:, 1]]
-    cut = surface.vertices_world[on].to(places)
+    start, end = moved[edges[:, 0]], moved[edges[:, 1]]
+    cut = surface.vertices_world[on].to(moved)
     first, last = below & (along == low[edge]), above & (along == high[edge])
     start[edge[first]], end[edge[last]] = cut[first], cut[last]
     gap = high - low
     fraction = torch.where(gap > 0, (0.5 - low) / torch.where(gap > 0, gap, 1), 0)[:, None]
-    return places, (1 - fraction) * start + fraction * end
+    return moved, (1 - fraction) * start + fraction * end
 
 
 def _with_data(
@@ -257,20 +246,20 @@ def _with_data(
     seen: Bool[Tensor, " face"] | None,
     max_hole: float,
 ) -> Bool[Tensor, " face"]:
-    """Tell which facets stay: those with data, and small holes that those enclose."""
+    """Mark facets with data, and small holes that those enclose."""
     everything = torch.ones_like(faces[:, 0], dtype=torch.bool)
-    sure = surface.confidence > 0
+    confident = surface.confidence > 0
     inner = (surface.barycentric >= _ON_EDGE).all(dim=1)
-    if not bool(sure.any()):
+    if not bool(confident.any()):
         return everything
     inside = torch.bincount(surface.facet[inner], minlength=len(faces))
-    known = torch.bincount(surface.facet[inner & sure], minlength=len(faces)) > 0
+    known = torch.bincount(surface.facet[inner & confident], minlength=len(faces)) > 0
     # A facet too small to have vertices inside has data when all its corners have.
-    at_corner = (surface.barycentric > 1 - _ON_EDGE).any(dim=1) & sure
+    at_corner = (surface.barycentric > 1 - _ON_EDGE).any(dim=1) & confident
     slot = surface.barycentric[at_corner].argmax(dim=1, keepdim=True)
-    told = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
-    told[faces[surface.facet[at_corner]].gather(1, slot)[:, 0]] = True
-    known = torch.where(inside > 0, known, told[faces].all(dim=1))
+    at_vertex = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
+    at_vertex[faces[surface.facet[at_corner]].gather(1, slot)[:, 0]] = True
+    known = torch.where(inside > 0, known, at_vertex[faces].all(dim=1))
     if seen is not None:
         known = known | seen
     if not bool(known.any()):
@@ -287,7 +276,7 @@ def _severity(
     residual: Float[Tensor, " face"] | None,
     config: RemeshConfig,
 ) -> Float[Tensor, " face"]:
-    """Give how much each facet exceeds what it may, the worst of its measures over its limit."""
+    """Give the largest ratio of each facet's measures to their limits."""
     limit = config.max_departure * spacing
     worst = departures(corners, faces, surface) / limit
     spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
@@ -302,28 +291,28 @@ def _severity(
 def departures(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], surface: Surface
 ) -> Float[Tensor, " face"]:
-    """Give the 90th percentile of the vertices' distances from each facet's plane.
+    """Give the 90th percentile of the surface's distances from each facet's plane.
 
     Args:
-        vertices: The facets' corners, where their planes are to pass.
+        vertices: The facets' corners.
         faces: The facets.
         surface: Their subdivided mesh.
     """
     normals = normalize(face_normals(vertices, faces), dim=1)
     centre = vertices[faces].mean(dim=1)
     offset = surface.vertices_world.to(vertices) - centre[surface.facet]
-    away = (offset * normals[surface.facet]).sum(dim=1).abs()
-    order = away.argsort()
+    distance = (offset * normals[surface.facet]).sum(dim=1).abs()
+    order = distance.argsort()
     order = order[surface.facet[order].argsort(stable=True)]
     count = torch.bincount(surface.facet, minlength=len(faces))
-    last = (_DEPARTURE_FRACTION * (count - 1).clamp_min(0)).ceil().long()
-    place = (count.cumsum(dim=0) - count + last).clamp_max(len(order) - 1)
-    return torch.where(count > 0, away[order[place]], 0)
+    rank = (_DEPARTURE_QUANTILE * (count - 1).clamp_min(0)).ceil().long()
+    last = (count.cumsum(dim=0) - count + rank).clamp_max(len(order) - 1)
+    return torch.where(count > 0, distance[order[last]], 0)
 
 
 def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
     """Give the root mean square angle between the surface's normals and their facet's mean."""
-    weight = surface.confidence + UNSURE
+    weight = surface.confidence + MIN_WEIGHT
     total = weight.new_zeros(count, 3)
     total = total.index_add(0, surface.facet, weight[:, None] * surface.normals_world)
     mass = weight.new_zeros(count).index_add(0, surface.facet, weight)
@@ -347,7 +336,7 @@ def _worst_first(
     kept: Bool[Tensor, " face"],
     max_facets: int,
 ) -> Bool[Tensor, " edge"]:
-    """Mark the edges of as many of the worst facets as the limit allows; more mean more."""
+    """Mark the edges of as many of the worst facets as the limit allows, by bisection."""
     _, face_edge = face_edges(faces)
     wanted = torch.where(small, 0, severity)
     order = wanted.argsort(descending=True, stable=True)
@@ -373,16 +362,16 @@ def _worst_first(
 def _without_folds(
     flat: Float[Tensor, "vertex 3"], onto: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
 ) -> Float[Tensor, "vertex 3"]:
-    """Move vertices onto the surface, except where that folds, flattens or draws out facets."""
+    """Move vertices onto the surface, except where that folds, flattens or stretches facets."""
     before = face_normals(flat, faces)
     size = before.square().sum(dim=1)
     longest = _MAX_STRETCH * side_lengths(flat[faces]).amax(dim=1)
     moving = onto.isfinite().all(dim=1)
     while True:
-        places = torch.where(moving[:, None], onto, flat)
-        along = (face_normals(places, faces) * before).sum(dim=1)
-        bad = (along <= _MIN_AREA * size) | (side_lengths(places[faces]).amax(dim=1) > longest)
+        moved = torch.where(moving[:, None], onto, flat)
+        along = (face_normals(moved, faces) * before).sum(dim=1)
+        bad = (along <= _MIN_AREA * size) | (side_lengths(moved[faces]).amax(dim=1) > longest)
         bad &= moving[faces].any(dim=1)
         if not bool(bad.any()):
-            return places
+            return moved
         moving[faces[bad].flatten()] = False

@@ -17,7 +17,7 @@ from torch import Tensor
 from pimper_torch.geometry.surfaces import face_edges
 from pimper_torch.records import Record
 
-# Barycentric coordinates of a face's corners, and of the centres of the opposite edges.
+# Barycentric coordinates of a face's corners, and of the midpoints of the opposite edges.
 _NODES = ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0))
 
 _RED = ((0, 5, 4), (5, 1, 3), (4, 3, 2), (3, 4, 5))
@@ -28,8 +28,8 @@ class Split(Record):
     """A mesh, some of whose edges have been halved.
 
     Attributes:
-        faces: Old vertices keep their numbers; the new ones follow, one for each of ``halved``.
-        halved: The edges in the centre of which they lie.
+        faces: Old vertices keep their indices; the new ones follow, one for each of ``halved``.
+        halved: The edges whose midpoints they are.
         parent: The face that each face is a part of, ascending.
         corners: Barycentric coordinates of each face's corners in its parent, row by row.
     """
@@ -42,7 +42,7 @@ class Split(Record):
     def relocate(
         self, parent: Int[Tensor, " point"], barycentric: Float[Tensor, "point 3"]
     ) -> tuple[Int[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """Give the part that each point of a face lies in, or nearest to, and where in it.
+        """Give the child that each point of a face lies in or nearest to, and its coordinates.
 
         Args:
             parent: The face before it was split.
@@ -51,15 +51,15 @@ class Split(Record):
         inverse = torch.linalg.inv(self.corners).to(barycentric)
         first = torch.searchsorted(self.parent, parent)
         last = torch.searchsorted(self.parent, parent, right=True) - 1
-        child, place = first, (barycentric[:, None] @ inverse[first])[:, 0]
+        child, inner = first, (barycentric[:, None] @ inverse[first])[:, 0]
         for slot in range(1, len(_RED)):
             (more,) = torch.nonzero(first + slot <= last, as_tuple=True)
             other = first[more] + slot
             there = (barycentric[more, None] @ inverse[other])[:, 0]
-            better = there.amin(dim=1) > place[more].amin(dim=1)
+            better = there.amin(dim=1) > inner[more].amin(dim=1)
             child = child.index_copy(0, more[better], other[better])
-            place = place.index_copy(0, more[better], there[better])
-        return child, place
+            inner = inner.index_copy(0, more[better], there[better])
+        return child, inner
 
 
 def mark_edges(
@@ -77,7 +77,7 @@ def mark_edges(
         vertices: Of the mesh.
         faces: Of the mesh.
         wanted: To be split in four.
-        forbidden: Faces that keep all their edges, whatever it costs the angles of others.
+        forbidden: Faces that keep all their edges, even if angles of others shrink.
     """
     edges, face_edge = face_edges(faces)
     ends = vertices[edges]
@@ -103,15 +103,15 @@ def split_edges(
     """Halve the marked edges, in the order of :func:`face_edges`; faces keep their orientation."""
     _, face_edge = face_edges(faces)
     halved = marked.nonzero()[:, 0]
-    number = torch.full_like(marked, -1, dtype=torch.long)
-    number[halved] = len(vertices) + torch.arange(len(halved), device=faces.device)
-    names = torch.cat([faces, number[face_edge]], dim=1)
+    midpoint = torch.full_like(marked, -1, dtype=torch.long)
+    midpoint[halved] = len(vertices) + torch.arange(len(halved), device=faces.device)
+    names = torch.cat([faces, midpoint[face_edge]], dim=1)
     corners = vertices[faces]
     nodes = torch.tensor(_NODES, dtype=vertices.dtype, device=vertices.device)
-    places = nodes @ corners
+    positions = nodes @ corners
     here = marked[face_edge]
     children, parents, inside = [], [], []
-    for some, table in _cases(here, places):
+    for some, table in _cases(here, positions):
         if not len(some):
             continue
         local = torch.tensor(table, device=faces.device)
@@ -129,9 +129,9 @@ def split_edges(
 
 
 def _cases(
-    marked: Bool[Tensor, "face 3"], places: Float[Tensor, "face 6 3"]
+    marked: Bool[Tensor, "face 3"], positions: Float[Tensor, "face 6 3"]
 ) -> list[tuple[Int[Tensor, " some"], tuple[tuple[int, int, int], ...]]]:
-    """List the faces that are cut alike, and how."""
+    """List the faces that are cut in the same way, and their children's corners."""
     count = marked.sum(dim=1)
     cases: list[tuple[Int[Tensor, " some"], tuple[tuple[int, int, int], ...]]] = [
         ((count == 0).nonzero()[:, 0], ((0, 1, 2),)),
@@ -142,11 +142,11 @@ def _cases(
         centre = 3 + a
         one = (count == 1) & marked[:, a]
         cases.append((one.nonzero()[:, 0], ((a, b, centre), (a, centre, c))))
-        p, q = 3 + c, 3 + b  # the centres of ab and ac, where bc is whole
+        p, q = 3 + c, 3 + b  # the midpoints of ab and ac, where bc is whole
         two = (count == 2) & ~marked[:, a]
-        # The shorter diagonal of the rest is the median to the longer edge: larger angles.
-        from_b = (places[:, b] - places[:, q]).norm(dim=1)
-        from_c = (places[:, c] - places[:, p]).norm(dim=1)
+        # The shorter diagonal of the quadrangle is the median to the longer edge: larger angles.
+        from_b = (positions[:, b] - positions[:, q]).norm(dim=1)
+        from_c = (positions[:, c] - positions[:, p]).norm(dim=1)
         near = from_b <= from_c
         cases.append(((two & near).nonzero()[:, 0], ((a, p, q), (p, b, q), (b, c, q))))
         cases.append(((two & ~near).nonzero()[:, 0], ((a, p, q), (p, b, c), (p, c, q))))

@@ -14,7 +14,7 @@ def strips(count=11):
     return faces.reshape(-1, 3), strip.reshape(-1)
 
 
-def test_a_lid_goes_and_plain_surface_stays():
+def test_a_surface_that_no_light_explains_is_contradicted_and_plain_surface_is_not():
     faces, strip = strips()
     support = torch.full_like(strip, Support.POINTS)
     support[(strip == 1) | (strip == 3)] = Support.LIGHT
@@ -22,12 +22,12 @@ def test_a_lid_goes_and_plain_surface_stays():
     misfit[strip == 1] = 0.04
     misfit[strip == 3] = 0.2
     misfit[(strip == 3).nonzero()[::5, 0]] = 0.03  # some of it fits by chance
-    misfit[(strip == 2).nonzero()[::3, 0]] = 0.5  # points bear it out, whatever light says
+    misfit[(strip == 2).nonzero()[::3, 0]] = 0.5  # points support it, whatever the misfit
     misfit[strip == 4] = torch.nan
     assert (contradicted(faces, support, misfit, 0 * misfit) == (strip == 3)).all()
 
 
-def test_with_little_to_compare_with_nothing_goes():
+def test_with_few_facets_to_compare_with_nothing_is_contradicted():
     faces, strip = strips()
     misfit = torch.full(strip.shape, 0.5, dtype=torch.float64)
     light = torch.full_like(strip, Support.LIGHT)
@@ -37,18 +37,18 @@ def test_with_little_to_compare_with_nothing_goes():
     assert not contradicted(faces, some, misfit, 0 * misfit).any()
 
 
-def test_a_few_facets_are_no_lid():
+def test_a_few_facets_are_not_contradicted():
     faces, strip = strips()
     support = torch.full_like(strip, Support.POINTS)
     misfit = torch.full(strip.shape, 0.03, dtype=torch.float64)
-    (lid,) = (strip == 3).nonzero(as_tuple=True)
-    support[lid], misfit[lid] = Support.LIGHT, 0.2
+    (cover,) = (strip == 3).nonzero(as_tuple=True)
+    support[cover], misfit[cover] = Support.LIGHT, 0.2
     assert contradicted(faces, support, misfit, 0 * misfit).any()
-    misfit[lid[6:]] = torch.nan  # light determines six
+    misfit[cover[6:]] = torch.nan  # light determines six
     assert not contradicted(faces, support, misfit, 0 * misfit).any()
 
 
-def test_what_is_dark_in_all_alike_is_not_called_a_lid():
+def test_a_small_misfit_is_no_contradiction_however_many_times_the_usual_one():
     faces, strip = strips()
     support = torch.full_like(strip, Support.POINTS)
     support[strip == 3] = Support.LIGHT
@@ -57,11 +57,11 @@ def test_what_is_dark_in_all_alike_is_not_called_a_lid():
     assert not contradicted(faces, support, misfit, 0 * misfit).any()
 
 
-def test_a_concavity_is_compared_with_textured_ones_and_a_lid_with_open_surface():
+def test_a_component_is_compared_with_facets_of_the_same_occlusion():
     faces, strip = strips(21)
     support = torch.full_like(strip, Support.POINTS)
     support[(strip == 1) | (strip == 3)] = Support.LIGHT
-    # Half of what points support is a concavity too. So is strip 1; strip 3 is a lid.
+    # Half of what points support is a concavity too. So is strip 1; strip 3 closes an opening.
     occlusion = torch.where((strip == 0) | (strip == 1), 0.4, 0.02).double()
     misfit = 0.03 + 0.3 * occlusion
     misfit[strip == 1] = 0.2  # 5.6 times the open surface's, 1.3 times a concavity's

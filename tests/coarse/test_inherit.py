@@ -1,0 +1,132 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.coarse.inherit import MIN_WEIGHT, fitted_normals, with_points
+from pimper_torch.coarse.splitting import split_edges
+from pimper_torch.geometry.surfaces import barycentric_2d, face_edges, vertex_normals
+from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(29)
+
+
+def square():
+    """Two facets, and the same with all edges halved."""
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    edges, _ = face_edges(faces)
+    split = split_edges(vertices, faces, torch.ones(len(edges), dtype=torch.bool))
+    fine = torch.cat([vertices, vertices[edges[split.halved]].mean(dim=1)])
+    return vertices, faces, split, fine
+
+
+def on_facets(vertices, faces, count, generator, normal):
+    """A surface of loose points on facets, whose normals are a function of the position."""
+    facet = torch.randint(len(faces), (count,), generator=generator)
+    barycentric = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    barycentric = barycentric / barycentric.sum(dim=1, keepdim=True)
+    points = (barycentric[:, None] @ vertices[faces[facet]])[:, 0]
+    return Surface(
+        vertices_world=points,
+        faces=torch.zeros(0, 3, dtype=torch.long),
+        facet=facet,
+        barycentric=barycentric,
+        normals_world=normal(points),
+        albedo=torch.ones_like(points),
+        confidence=torch.rand(count, generator=generator, dtype=torch.float64),
+        convergence=Convergence(
+            iterations=torch.ones(1).long(), residual=torch.zeros(1), cause=torch.zeros(1).long()
+        ),
+    )
+
+
+def test_normals_are_the_weighted_least_squares_fit_of_their_blend(generator):
+    vertices, faces, split, fine = square()
+
+    def bent(points):
+        noise = 0.2 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
+        return normalize(points.new_tensor([0, 0, 1]) + 0.5 * points.sin() + noise, dim=1)
+
+    surface = on_facets(vertices, faces, 500, generator, bent)
+    index = torch.arange(len(split.faces))
+    mesh = Mesh(vertices_world=fine, faces=split.faces)
+    found = fitted_normals(mesh, surface, split, index)
+    # A dense solve; where each point lies among the children, in the plane of the square.
+    flat = fine[split.faces][..., :2]
+    inside = barycentric_2d(surface.vertices_world[:, None, :2], flat[None])
+    child = inside.amin(dim=-1).argmax(dim=1)
+    blend = torch.zeros(len(child), len(fine), dtype=torch.float64)
+    weights = inside[torch.arange(len(child)), child]
+    blend.scatter_(1, split.faces[child], weights)
+    own = vertex_normals(fine, split.faces)
+    weight = (surface.confidence + MIN_WEIGHT)[:, None]
+    matrix = blend.mT @ (weight * blend)
+    damping = 0.01 * matrix.diagonal().mean()  # the facets' own normals, a hundredth of the data
+    damped = matrix + damping * torch.eye(len(fine)).double()
+    right = blend.mT @ (weight * surface.normals_world) + damping * own
+    assert_close(found, normalize(torch.linalg.solve(damped, right), dim=1))
+    assert float(torch.rad2deg((found * own).sum(dim=1).clamp(-1, 1).acos()).max()) > 10
+
+
+def test_where_the_surface_has_no_vertex_normals_are_the_facets_own(generator):
+    vertices, faces, split, fine = square()
+    surface = on_facets(
+        vertices,
+        faces,
+        500,
+        generator,
+        lambda points: points.new_tensor([0.6, 0, 0.8]) + 0 * points,
+    )
+    kept = split.parent == 0
+    index = torch.where(kept, kept.cumsum(dim=0) - 1, -1)
+    surface = surface.take(surface.facet == 1)  # on the dropped facet alone
+    mesh = Mesh(vertices_world=fine, faces=split.faces[kept])
+    found = fitted_normals(mesh, surface, split, index)
+    used = torch.unique(mesh.faces)
+    assert_close(found[used], torch.tensor([0.0, 0, 1]).double().expand(len(used), 3))
+
+
+def test_points_follow_their_facets_and_a_moved_vertex_leaves_its_point(generator):
+    vertices, faces, split, fine = square()
+    uv = torch.rand(60, 2, generator=generator, dtype=torch.float64)
+    points_world = torch.cat([uv, 0.05 * uv[:, :1]], dim=1)  # off the plane
+    covariance = torch.eye(3).double() * torch.arange(1, 65)[:, None, None]
+    coarse = CoarseMesh(
+        mesh=Mesh(vertices_world=vertices, faces=faces),
+        reference=0,
+        is_point=torch.tensor([True, True, True, False]),
+        covariance_world=covariance[60:] * torch.tensor([1, 1, 1, 0])[:, None, None],
+        points=FacetPoints(
+            points_world=points_world,
+            covariance_world=covariance[:60],
+            facet=(uv[:, 1] > uv[:, 0]).long(),
+        ),
+        support=torch.tensor([2, 3]),
+    )
+    moved = fine.clone()
+    moved[2, 2] += 0.1
+    dropped = 5
+    kept = torch.arange(len(split.faces)) != dropped
+    index = torch.where(kept, kept.cumsum(dim=0) - 1, -1)
+    mesh = Mesh(vertices_world=moved, faces=split.faces[kept])
+    found = with_points(coarse, mesh, split, index, torch.arange(len(moved)))
+    assert found.is_point.tolist() == [True, True] + [False] * (len(moved) - 2)
+    assert_close(found.covariance_world[:2], coarse.covariance_world[:2])
+    assert not found.covariance_world[2:].any()
+    assert found.support.tolist() == coarse.support[split.parent[kept]].tolist()
+    # Brute force: the child whose triangle holds the point, seen from above.
+    child = barycentric_2d(uv[:, None], fine[split.faces][None, ..., :2]).amin(dim=-1).argmax(dim=1)
+    stays = child != dropped
+    assert 0 < int((~stays).sum()) < 30
+    points = found.points
+    assert_close(points.points_world[:-1], points_world[stays])
+    assert_close(points.covariance_world[:-1], covariance[:60][stays])
+    assert points.facet[:-1].tolist() == index[child][stays].tolist()
+    # The vertex that moved: its former position, with its covariance, on a face round it.
+    assert_close(points.points_world[-1], vertices[2])
+    assert_close(points.covariance_world[-1], coarse.covariance_world[2])
+    assert 2 in mesh.faces[points.facet[-1]].tolist()
