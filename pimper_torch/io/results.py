@@ -93,7 +93,7 @@ def write_result(
         summary = summary_report(whole, about or {})
         if not full_mesh:
             with part(0, _PARTS):
-                found = simplify(whole.mesh, told=written_channels(whole.mesh))
+                found = simplify(whole.mesh, values=written_channels(whole.mesh))
             whole = whole.replace(mesh=found.mesh)
             summary["simplified"] = {
                 "vertices": len(found.mesh.vertices_world),

@@ -32,8 +32,8 @@ class ExtractConfig:
         overturned: Which of the faces turned more than 90 degrees from the mean of their facet
             are left out: those that a fold bounds, as the others are on facets that bend far;
             all; or none.
-        min_piece: Fraction of the largest connected piece's area that another one needs to be
-            kept; 1 keeps the largest only.
+        min_piece: Fraction of the largest connected component's area that another one needs to
+            be kept; 1 keeps the largest only.
     """
 
     min_confidence: float = 0.0
@@ -54,14 +54,14 @@ class ExtractConfig:
 
 
 class Extract(Stage):
-    """Keep what the photographs support, as one connected manifold mesh.
+    """Extract the mesh that the photographs support, a manifold.
 
-    Faces without support go, and so do spikes and faces turned over. Of the rest the large
-    pieces stay, and where two fans of faces touched in one vertex only, each gets its own copy.
-    Orientation is the coarse mesh's: counter-clockwise from outside.
+    Faces without support are dropped, and so are spikes and overturned faces. Of the remaining
+    ones the large components stay, and where two fans of faces met in a vertex only, each gets
+    its own copy. Orientation is the coarse mesh's: counter-clockwise from outside.
 
-    Differentiable: what is kept is decided without gradient, and the kept vertices, normals,
-    albedo and confidence carry theirs.
+    Differentiable: faces are chosen without gradient, and vertices, normals, albedo and
+    confidence of those keep theirs.
     """
 
     def __init__(self, config: ExtractConfig | None = None) -> None:
@@ -99,7 +99,7 @@ class Extract(Stage):
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the fraction "
                 "of missing data that the report gives."
             )
-        faces = faces[large_pieces(vertices, faces, self.config.min_piece)]
+        faces = faces[large_components(vertices, faces, self.config.min_piece)]
         source, faces = vertex_fans(faces)
         return Mesh(
             vertices_world=surface.vertices_world[source],
@@ -119,12 +119,12 @@ class Extract(Stage):
         return spikes | overturned(vertices, faces, facet) if config.overturned == "all" else spikes
 
 
-def large_pieces(
+def large_components(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], fraction: float
 ) -> Bool[Tensor, " face"]:
-    """Mark the faces of pieces with at least a fraction of the largest one's area.
+    """Mark the components, connected by edges, with a fraction of the largest one's area.
 
-    Pieces hang together by edges. With share 1 one piece is marked, the first of the largest.
+    With a fraction of 1 only the first of the largest is marked.
     """
     label = face_components(faces)
     areas = component_areas(vertices, faces, label)

@@ -1,4 +1,4 @@
-"""Groups of vertices that hang together, and how far they extend."""
+"""Connected components of vertices, and how far they extend."""
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -12,13 +12,13 @@ def small_groups(
     among: Bool[Tensor, " vertex"],
     max_extent: Float[Tensor, ""],
 ) -> Bool[Tensor, " vertex"]:
-    """Mark those of some vertices that lie in a small connected group of their kind.
+    """Mark the vertices ``among`` whose connected component is small.
 
     Args:
         vertices: World.
         faces: Of the surface.
-        among: Grouped along edges.
-        max_extent: Diagonal of a group's bounding box.
+        among: Vertices to connect along edges.
+        max_extent: Diagonal of a component's bounding box.
     """
     label = vertex_components(faces, among)
     count = int(label.max()) + 1 if len(label) else 0
@@ -31,5 +31,5 @@ def small_groups(
 
 
 def diagonal(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
-    """Measure the bounding box of some points."""
+    """Give the diagonal of the points' bounding box."""
     return (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()

@@ -1,4 +1,4 @@
-"""Parts of a surface placed anew, as a thin plate that the rest of it clamps."""
+"""Parts of a surface replaced by a thin plate, clamped by what surrounds them."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,18 +14,18 @@ def least_bent(
     faces: Int[Tensor, "face 3"],
     free: Bool[Tensor, " vertex"],
 ) -> Float[Tensor, "vertex 3"]:
-    r"""Place some vertices where the surface bends least, as a thin plate clamped all round.
+    r"""Move some vertices to where the surface bends least, as a thin plate clamped all round.
 
-    The sum of :math:`\lVert x_i - \tfrac{1}{d_i} \sum_{j \sim i} x_j \rVert^2` over free
-    vertices and their neighbours is made as small as can be. Neighbours count alike, whatever
-    their distances: those of folded faces mean nothing.
+    Minimizes the sum of :math:`\lVert x_i - \tfrac{1}{d_i} \sum_{j \sim i} x_j \rVert^2` over
+    free vertices and their neighbours. Weights are uniform: lengths of folded faces mean
+    nothing.
 
     Args:
         vertices: World.
         faces: Of the surface.
-        free: Everything that hangs together of these must have a neighbour that is not free.
+        free: Vertices to move; every connected component needs a neighbour that is not free.
 
-    Differentiable in the vertices that are held; one solve.
+    Differentiable in the fixed vertices; one solve.
 
     Source: Kobbelt, Campagna, Vorsatz, Seidel: Interactive multi-resolution modeling on
     arbitrary meshes, SIGGRAPH 1998, for the energy.

@@ -1,4 +1,4 @@
-"""Simplification: a mesh of fewer vertices that all former vertices stay near."""
+"""Mesh decimation with a bound on the distance of every former vertex."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,23 @@ from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Mesh, Record
 
-# Slices of the mesh that threads work on side by side; a fixed number, so that the result does
-# not depend on the number of threads. Vertices between slices come last.
+# Slices of the mesh that threads work on side by side; a constant, so that the result does not
+# depend on the number of threads. Vertices between slices come last.
 _SLICES = 4
+
+# Bounds are doubled so often at most: from one median edge to 16. A choice.
 _DOUBLINGS = 5
-_EDGES = 100_000  # tell their median to a few thousandths
-_ITERATIONS = 30  # few vertices go after the first ten
+
+# Edges of which the median is taken: it is certain to a few thousandths.
+_EDGES = 100_000
+
+# Passes over the vertices: few vertices go after the first ten.
+_ITERATIONS = 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bounds:
-    """What a former vertex may be off from the mesh that is left.
+    """Limits on the deviation of a former vertex from the decimated mesh.
 
     Attributes:
         spacings: Distance to the surface, in multiples of the former mesh's median edge.
@@ -32,7 +38,7 @@ class Bounds:
     angle_deg: float
 
 
-# A twentieth of a sample's spacing and 1.5 degrees. With a tenth, the finest height field of the
+# A twentieth of a sample's spacing and 1.5 degrees: with a tenth, the finest height field of the
 # demo's skull is lost where its shape is shaded without the vertices' normals.
 FAITHFUL = Bounds(spacings=0.05, angle_deg=1.5)
 
@@ -42,10 +48,10 @@ class Simplified(Record):
     """A mesh with fewer vertices, and how far the others are from it.
 
     Attributes:
-        mesh: Its vertices are former ones, with all that they carried.
-        kept: Which ones.
-        face: The face of ``mesh`` that every former vertex is nearest to among those that took
-            the place of its own; -1 for vertices that are kept.
+        mesh: Its vertices are former ones, with all their values.
+        kept: Their former indices.
+        face: The face of ``mesh`` that every former vertex is nearest to among those that
+            replaced its own; -1 for vertices that are kept.
         spacing: Median edge of the former mesh, scene units.
         max_spacings: Largest distance of a former vertex from its face, in multiples of that.
         max_angle_deg: Largest angle between its normal and that of its face.
@@ -60,19 +66,19 @@ class Simplified(Record):
 
 
 def simplify(
-    mesh: Mesh, bounds: Bounds = FAITHFUL, told: Float[Tensor, "vertex channel"] | None = None
+    mesh: Mesh, bounds: Bounds = FAITHFUL, values: Float[Tensor, "vertex channel"] | None = None
 ) -> Simplified:
-    """Merge vertices with their neighbours as long as every former vertex stays near.
+    """Collapse edges as long as every former vertex stays within bounds of the mesh.
 
     Vertices of a border, and where more than one fan of faces meets, stay. Nothing moves: the
-    vertices that are left keep place, normal and whatever else they carry to the last digit.
-    Topology stays, too. A constant to autograd but for the values of what is kept.
+    remaining vertices keep position, normal and all other values to the last digit. Topology
+    stays, too. A constant to autograd but for the values of what is kept.
 
     Args:
         mesh: Any; without normals, those of its shape are taken.
-        bounds: How near.
-        told: More that is blended over the faces, in units of what it may be off; what it is of
-            a removed vertex, and what its face says, differ by 1 at most.
+        bounds: On distances and normals.
+        values: More that is interpolated over the faces, in units of its bound: the value of a
+            removed vertex and that interpolated on its face differ by 1 at most.
     """
     from pimper_torch.kernels import decimation  # compiled when it is imported
 
@@ -93,7 +99,7 @@ def simplify(
     spacing = _median_edge(vertices, mesh.faces.cpu())
     points = (vertices - vertices.mean(dim=0)).float().contiguous().numpy()
     faces = mesh.faces.to("cpu", torch.int32, copy=True).contiguous().numpy()
-    channels = np.zeros((len(points), 0), np.float32) if told is None else _rows(told)
+    channels = np.zeros((len(points), 0), np.float32) if values is None else _rows(values)
     head = np.empty(len(points), np.int32)
     following = np.empty(faces.size, np.int32)
     first, after = np.full(len(faces), -1, np.int32), np.full(len(points), -1, np.int32)
@@ -142,16 +148,16 @@ def simplify(
     )
 
 
-def with_few_faces(mesh: Mesh, most: int) -> Mesh:
-    """Simplify a mesh for pictures, its shape only, until it has few faces.
+def with_few_faces(mesh: Mesh, max_faces: int) -> Mesh:
+    """Simplify the shape of a mesh for pictures until it has few faces.
 
     Args:
         mesh: Any; one that is small enough comes back as it is.
-        most: Faces. Borders stay, however many faces they have.
+        max_faces: Of the result, about: borders stay, however many faces they have.
     """
     bounds = Bounds(spacings=1.0, angle_deg=180.0)
     for _ in range(_DOUBLINGS):
-        if len(mesh.faces) <= most:
+        if len(mesh.faces) <= max_faces:
             break
         mesh = simplify(mesh, bounds).mesh
         bounds = Bounds(spacings=2 * bounds.spacings, angle_deg=bounds.angle_deg)
@@ -183,7 +189,7 @@ def _median_edge(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3
 
 
 def _slices(points: np.ndarray) -> np.ndarray:
-    """Number slices across the mesh's longest side, of as many vertices each."""
+    """Give each vertex its slice across the mesh's longest side; all have as many vertices."""
     along = points[:, np.ptp(points, axis=0).argmax()]
     cuts = np.quantile(along, np.arange(1, _SLICES) / _SLICES)
     return np.searchsorted(cuts, along).astype(np.int8)

@@ -60,14 +60,14 @@ class Decompose(Stage):
     ) -> PatchSet:
         """Decompose a coarse mesh.
 
-        The samples of all templates are equally far apart: one over ``samples_per_pixel``
+        The spacing of the samples of all templates is the same: one over ``samples_per_pixel``
         times ``scale`` pixels of the reference view at the median depth of the mesh, or further
         where ``max_samples`` asks for it.
 
         Args:
             coarse: The facets.
             cameras: Of all views.
-            surface: What the templates are to carry; without, they are flat.
+            surface: What is transferred to the templates; without, they are flat.
             scale: Of the photographs, 1 for their own size.
 
         Raises:
@@ -199,9 +199,9 @@ def _templates(
 ) -> Templates:
     height, width = raster
     grid = spacing * (pixel_centers(width, height, like=low) - 0.5)
-    places = low[facets, None, None] + grid
-    barycentric = barycentric_2d(places, corners[facets, None, None])
-    within = barycentric_2d(places, enlarged[facets, None, None])
+    positions = low[facets, None, None] + grid
+    barycentric = barycentric_2d(positions, corners[facets, None, None])
+    within = barycentric_2d(positions, enlarged[facets, None, None])
     return Templates(
         facet=facets,
         patch_from_world=patch_from_world[facets],

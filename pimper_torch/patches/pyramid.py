@@ -13,7 +13,7 @@ def halve(images: Float[Tensor, "view channels _ _"]) -> Float[Tensor, "view cha
     """Blur and halve images as kornia's ``pyrdown`` does, in a sixth of the time.
 
     Burt's binomial of five, then the mean of two: together six taps along rows and along
-    columns, at every other place. Sides that are odd go by ``pyrdown`` itself.
+    columns, at every other pixel. Sides that are odd go by ``pyrdown`` itself.
     """
     height, width = images.shape[-2:]
     if height % 2 or width % 2:

@@ -1,4 +1,4 @@
-"""What hands a bucket of templates to the compiled kernels, and takes J and D from them."""
+"""The compiled registration of a bucket of templates: the matrices J and D."""
 
 import torch
 from jaxtyping import Int
@@ -19,9 +19,9 @@ def resampled(
     min_facing: float,
     dark_level: float,
 ) -> Observations:
-    """Resample all views on a bucket of templates; nothing hides anything.
+    """Resample all views on a bucket of templates, without occlusion.
 
-    Places are found in float64; images are looked up in float32.
+    Pixels are computed in float64; images are looked up in float32.
 
     Args:
         cameras: Of all views.
@@ -64,7 +64,7 @@ def resampled(
 def hide(
     registered: Observations, cameras: Cameras, sources: Sources, templates: Templates, stride: int
 ) -> None:
-    """Take away, in place, what the surface of the sources hides.
+    """Invalidate, in place, the samples that the sources' surface occludes.
 
     One ray for every ``stride`` samples either way, from the camera to just before the surface;
     all of a bucket at once.
@@ -76,15 +76,15 @@ def hide(
     world_from_patch = invert_rigid(templates.patch_from_world.double())
     height, width = sparse.shape[1:3]
     points = transform(world_from_patch, sparse.flatten(1, 2)).reshape(sparse.shape)
-    asked = torch.zeros(*registered.valid.shape[:2], height, width, dtype=torch.bool)
-    rows = as_array(_answering(height, templates.depth.shape[1]))
-    columns = as_array(_answering(width, templates.depth.shape[2]))
-    rays = resample.sites(as_array(registered.valid), rows, columns, as_array(asked))
+    wanted = torch.zeros(*registered.valid.shape[:2], height, width, dtype=torch.bool)
+    rows = as_array(_nearest_site(height, templates.depth.shape[1]))
+    columns = as_array(_nearest_site(width, templates.depth.shape[2]))
+    rays = resample.sites(as_array(registered.valid), rows, columns, as_array(wanted))
     starts, directions, reach = torch.empty(rays, 3), torch.empty(rays, 3), torch.empty(rays)
     # An enlarged triangle dips under its neighbours by the overlap's fraction of their slope.
     tolerance = 4 * stride * templates.spacing
     resample.sight_lines(
-        as_array(asked),
+        as_array(wanted),
         as_array(points),
         as_array(cameras.to(torch.float64).centers_world),
         as_array(tolerance, torch.float64),
@@ -94,7 +94,7 @@ def hide(
     )
     blocked = sources.caster.blocked(starts, directions, reach)
     resample.hide(
-        as_array(asked),
+        as_array(wanted),
         as_array(blocked),
         rows,
         columns,
@@ -103,7 +103,7 @@ def hide(
     )
 
 
-def _answering(sites: int, samples: int) -> Int[Tensor, " sample"]:
+def _nearest_site(sites: int, samples: int) -> Int[Tensor, " sample"]:
     """Give the site nearest to each of a row of samples."""
     index = torch.arange(sites, dtype=torch.float32)[None, None]
     return interpolate(index, size=samples, mode="nearest-exact")[0, 0].long()

@@ -1,4 +1,4 @@
-"""What resampling needs of photographs and surface, prepared once for all patches."""
+"""Image pyramids and the occluding surface, prepared once for all patches."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -17,21 +17,22 @@ from pimper_torch.patches.pyramid import halve
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Mesh, Record, Views
 
-# An eighth of the photographs' size, the least at which a template of theirs is looked up.
+# Levels of a pyramid, down to an eighth of the photographs' size: templates of the coarsest scale
+# have a sample for every four pixels. A choice.
 LEVELS = 4
 
-# Halves need a few pixels for their blur.
+# Smallest side of a level that is halved: its blur takes five pixels.
 _SMALLEST = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Pyramid(Record):
-    """Images halved again and again.
+    """Image pyramids, each level half the size of the one before.
 
     The finest level is by itself, so that it can be the photographs, without a copy.
 
     Attributes:
-        finest: Of floating point, or shares in 255ths.
+        finest: Floating point, or fractions in 255ths.
         coarser: All further levels one after another, each of ``channel height width``.
         sizes: Height and width of every level, the finest first.
     """
@@ -46,8 +47,8 @@ class Pyramid(Record):
         """Give a view's levels, the finest first."""
         channels = self.finest.shape[1]
         areas = [channels * height * width for height, width in self.sizes[1:]]
-        rest = zip(torch.split(self.coarser[view], areas), self.sizes[1:], strict=True)
-        return [self.finest[view], *(level.reshape(channels, *size) for level, size in rest)]
+        coarser = zip(torch.split(self.coarser[view], areas), self.sizes[1:], strict=True)
+        return [self.finest[view], *(level.reshape(channels, *size) for level, size in coarser)]
 
     @property
     def arrays(self) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -64,14 +65,14 @@ class Pyramid(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Sources(Record):
-    """Photographs at several sizes, and what hides them.
+    """Photographs at several sizes, and the surface that occludes.
 
     Attributes:
-        images: Linear radiance; zero where it is no number.
+        images: Linear radiance; zero where it is not finite.
         unusable: Fraction of every pixel that is unusable, in 255ths: outside the undistorted frame
             or the mask, not finite, or saturated in any channel.
         gray: Mean over the channels.
-        caster: The surface that hides what is behind it; ``None`` while there is none.
+        caster: Of the surface that occludes; ``None`` where none is given yet.
     """
 
     images: Pyramid
@@ -80,23 +81,23 @@ class Sources(Record):
     caster: RayCaster | None = None
 
     def hidden_by(self, mesh: Mesh) -> "Sources":
-        """Let a surface hide what is behind it."""
+        """Set the surface that occludes."""
         return self.replace(caster=RayCaster(mesh.vertices_world, mesh.faces))
 
 
 def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEVELS) -> Sources:
-    """Halve all photographs, once for all rounds of a run.
+    """Build the pyramids of all photographs, once for all scales of a run.
 
     Differentiable in the photographs.
 
     Args:
         views: Photographs.
         saturation_level: Radiance at or above which a pixel is unusable.
-        levels: At most so many; fewer of small photographs.
+        levels: Maximum number; small photographs have fewer.
     """
     images = views.images
     if not all(bool(image.isfinite().all()) for image in images):
-        # NaN times a weight of 0 is NaN: zeros, which are marked, spread nothing.
+        # NaN times a weight of 0 is NaN; zeros are marked as unusable.
         images = torch.where(images.isfinite(), images, 0)
     count, _, height, width = images.shape
     sizes = _sizes(height, width, levels)

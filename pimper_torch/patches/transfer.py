@@ -1,4 +1,4 @@
-"""Templates that carry a surface: registration on what is known, not on the facet's plane."""
+"""A surface transferred to templates: views are registered on it, not on the facets' planes."""
 
 from functools import partial
 
@@ -13,19 +13,20 @@ from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
 
-# Normals are kept this far from the rim, so that all of them face the viewer.
+# Cosine to the viewer that every normal keeps at least. A choice: 87 degrees.
 MIN_FACING = 0.05
 
-# A template finds its surface within this fraction of its own extent of the facet's plane.
+# Largest distance of the surface from the facet's plane, in extents of the template. A choice:
+# further off it is another part of the object.
 _REACH = 0.5
 
 
 def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
-    """Let every template carry the surface: its depth, and its normals.
+    """Transfer the depth and the normals of a surface to every template.
 
-    A sample's place is where the surface, facing as the facet does, meets the sample's line
-    along the facet's normal, nearest to the facet's plane. Samples without one, or whose place
-    is further off than half the template's extent, are no longer ``inside``.
+    A sample's point is where its line along the facet's normal meets the surface, facing as
+    the facet does, nearest to the facet's plane. Samples without one, or with one further off
+    than half the template's extent, are no longer ``inside``.
 
     Differentiable in the surface's vertices and normals and in the templates' frames; which face
     a line meets is constant.
@@ -34,7 +35,7 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     if normals is None:
         normals = vertex_normals(surface.vertices_world, surface.faces)
     caster = RayCaster(surface.vertices_world, surface.faces)
-    one = partial(_carrying, surface, normals, caster)
+    one = partial(_transferred, surface, normals, caster)
     buckets = tuple(side_by_side(one, patches.buckets, tracked=False))
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
 
@@ -42,7 +43,7 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
 def transferred_normals(
     coarse: CoarseMesh, templates: Templates
 ) -> Float[Tensor, "patch height width 3"]:
-    """Give the normals of what a template carries, patch frame: a surface's, or the mesh's."""
+    """Give the normals of a template, patch frame: of its surface, or else of the mesh."""
     if templates.normals_patch is None:
         return coarse_normals(coarse, templates)
     return facing_viewer(templates.normals_patch)
@@ -67,14 +68,14 @@ def coarse_normals(
 
 
 def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Make unit, and bring what faces away to just before the rim."""
+    """Make normals unit, and rotate those that face away until they just face the viewer."""
     unit = normalize(normals, dim=-1)
     aside = (1 - MIN_FACING**2) ** 0.5 * normalize(unit[..., :2], dim=-1)
     rotated = torch.cat([aside, torch.full_like(unit[..., 2:], -MIN_FACING)], dim=-1)
     return torch.where(unit[..., 2:] > -MIN_FACING, rotated, unit)
 
 
-def _carrying(
+def _transferred(
     surface: Mesh,
     normals: Float[Tensor, "vertex 3"],
     caster: RayCaster,
@@ -83,12 +84,12 @@ def _carrying(
     num, height, width = templates.depth.shape
     world_from_patch = invert_rigid(templates.patch_from_world)
     flat = templates.replace(depth=torch.zeros_like(templates.depth)).points_patch
-    places = transform(world_from_patch, flat.reshape(num, -1, 3))
-    inward = world_from_patch[:, None, :3, 2].expand_as(places)
+    positions = transform(world_from_patch, flat.reshape(num, -1, 3))
+    inward = world_from_patch[:, None, :3, 2].expand_as(positions)
     reach = _REACH * templates.spacing * max(height, width)
     # A little further, so that rounding does not decide.
-    hits, met = _nearest(caster, places, inward, surface, 1.01 * reach[:, None])
-    hits = hits.refined(surface.vertices_world, surface.faces, places, inward)
+    hits, met = _nearest(caster, positions, inward, surface, 1.01 * reach[:, None])
+    hits = hits.refined(surface.vertices_world, surface.faces, positions, inward)
     found = hits.interpolate(surface.vertices_world, surface.faces)
     depth = transform(templates.patch_from_world, found)[..., 2]
     rotated = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
@@ -105,13 +106,13 @@ def _carrying(
 
 def _nearest(
     caster: RayCaster,
-    places: Float[Tensor, "patch sample 3"],
+    positions: Float[Tensor, "patch sample 3"],
     inward: Float[Tensor, "patch sample 3"],
     surface: Mesh,
     reach: Float[Tensor, "patch 1"],
 ) -> tuple[Hits, Bool[Tensor, "patch sample"]]:
     """Cast to both sides, and take the nearer hit of a face that looks outward."""
-    below, above = caster.cast(places, inward, reach), caster.cast(places, -inward, reach)
+    below, above = caster.cast(positions, inward, reach), caster.cast(positions, -inward, reach)
 
     def looking_out(hits: Hits) -> Bool[Tensor, "patch sample"]:
         met = surface.faces[hits.face.clamp_min(0).flatten()]

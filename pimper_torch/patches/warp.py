@@ -86,8 +86,8 @@ class Warp(Stage):
             views: Photographs.
             cameras: Of all views.
             patches: All, or some buckets of them.
-            sources: The photographs as :meth:`prepare` gives them, and what hides what; made
-                here where not given.
+            sources: Pyramids as :meth:`prepare` builds them, and the surface that occludes;
+                made here where not given.
         """
         sources = sources or self.prepare(views)
         if sources.caster is None:
@@ -96,7 +96,7 @@ class Warp(Stage):
         return PatchViews(patches=patches, buckets=tuple(side_by_side(one, patches.buckets)))
 
     def prepare(self, views: Views) -> Sources:
-        """Prepare photographs for any number of calls, here and in the sweep."""
+        """Build pyramids of photographs for any number of calls, here and in the sweep."""
         return prepare(views, self.config.saturation_level, LEVELS)
 
     def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
@@ -177,17 +177,17 @@ class Warp(Stage):
         points_world: Float[Tensor, "patch height width 3"],
         center: Float[Tensor, " 3"],
         caster: RayCaster | None,
-        asked: Bool[Tensor, "patch height width"],
+        wanted: Bool[Tensor, "patch height width"],
     ) -> Bool[Tensor, "patch height width"]:
         assert caster is not None  # forward sees to it
         stride = self.config.occlusion_stride
         sparse = points_world[:, stride // 2 :: stride, stride // 2 :: stride]
-        if not asked.any() or sparse.numel() == 0:
-            return torch.zeros_like(asked)
+        if not wanted.any() or sparse.numel() == 0:
+            return torch.zeros_like(wanted)
         # An enlarged triangle dips under its neighbours by the overlap's fraction of their slope.
         own = 4 * stride * templates.spacing[:, None, None]
         hidden = caster.occluded(sparse, center, own)
-        dense = interpolate(hidden[:, None].float(), size=asked.shape[-2:], mode="nearest-exact")
+        dense = interpolate(hidden[:, None].float(), size=wanted.shape[-2:], mode="nearest-exact")
         return dense[:, 0] > 0
 
 

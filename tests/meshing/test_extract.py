@@ -159,7 +159,7 @@ def test_a_surface_without_enough_support_is_refused():
         )
 
 
-def test_what_is_expected_to_be_too_far_off_is_cut_out():
+def test_faces_with_a_large_expected_error_are_cut_out():
     surface = sheet()
     fraction = columns(surface) / (SIDE - 1) / 10
     told = surface.replace(expected_error=fraction * diagonal(surface.vertices_world))

@@ -84,7 +84,7 @@ def test_a_folded_sphere_was_slit_and_comes_out_closed():
     assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 2e-3
 
 
-def test_only_what_is_mended_changes_and_it_says_so():
+def test_only_repaired_vertices_change_and_their_confidence_is_zero():
     _, surface = folded_sphere()
     mesh = Extract()(Repair()(surface))
     moved = (mesh.vertices_world != surface.vertices_world).any(dim=1)
@@ -98,7 +98,7 @@ def test_only_what_is_mended_changes_and_it_says_so():
     assert_close(mesh.normals_world[beside], own[beside])
 
 
-def test_without_mending_exactly_the_overturned_faces_go():
+def test_without_repair_exactly_the_overturned_faces_go():
     _, surface = folded_sphere()
     gone = overturned(surface.vertices_world, surface.faces, surface.facet)
     mesh = Extract(OLD)(surface)
@@ -197,7 +197,7 @@ def test_a_facet_that_bends_far_has_no_fold():
     assert (mesh.confidence == 1).all()
 
 
-def test_gradients_reach_what_is_held_and_none_what_is_mended():
+def test_gradients_reach_fixed_vertices_and_no_repaired_ones():
     _, surface = folded_sphere(3)
     leaf = surface.vertices_world.clone().requires_grad_()
     mesh = Extract()(Repair()(surface.replace(vertices_world=leaf)))
@@ -213,7 +213,7 @@ def test_gradients_reach_what_is_held_and_none_what_is_mended():
     assert torch.autograd.gradcheck(lambda places: least_bent(places, coarse, free), clone)
 
 
-def test_the_least_bent_places_are_those_of_a_dense_solve(generator):
+def test_the_least_bent_positions_are_those_of_a_dense_solve(generator):
     vertices, faces = icosphere(2)
     vertices = vertices + 0.1 * torch.randn(vertices.shape, generator=generator).double()
     free = torch.rand(len(vertices), generator=generator) < 0.3
@@ -245,7 +245,7 @@ def test_a_regular_subdivided_mesh_in_a_plane_is_found_again(generator):
     assert_close(least_bent(stirred, faces, free), flat)
 
 
-def test_what_no_placing_heals_is_left_where_it_was():
+def test_defects_that_no_position_repairs_are_left_where_they_were():
     vertices, faces = icosphere(3)
 
     def never(places):
@@ -256,7 +256,7 @@ def test_what_no_placing_heals_is_left_where_it_was():
     assert not moved.any()
 
 
-def test_a_piece_that_is_broken_all_over_is_left_where_it_was():
+def test_a_component_of_defects_alone_is_left_where_it_was():
     vertices, faces = icosphere(1)
     both = torch.cat([vertices, vertices + 5])
     faces = torch.cat([faces, faces + len(vertices)])

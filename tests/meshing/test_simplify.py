@@ -34,7 +34,7 @@ def waves(x, y):
 
 
 def deviations(mesh, found, told):
-    """Distance, angle and worst channel of removed vertices against the faces they are told."""
+    """Distance, angle and worst channel of removed vertices against the faces they are given."""
     gone = (found.face >= 0).nonzero()[:, 0]
     corners = found.mesh.faces[found.face[gone]]
     place = closest_on_triangles(mesh.vertices_world[gone], found.mesh.vertices_world[corners])

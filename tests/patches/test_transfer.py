@@ -43,7 +43,7 @@ def places(templates):
     return transform(invert_rigid(templates.patch_from_world), flat).view_as(templates.points_patch)
 
 
-def test_samples_come_to_lie_on_the_surface_above_their_places_on_the_facet(flat):
+def test_samples_lie_on_the_surface_above_their_positions_on_the_facet(flat):
     transferred = transfer(flat, surface())
     for before, after in zip(flat.buckets, transferred.buckets, strict=True):
         assert torch.equal(before.inside, after.inside)

@@ -21,7 +21,7 @@ def _points_world(templates):
     return transform(invert_rigid(templates.patch_from_world), flat).view_as(templates.points_patch)
 
 
-def test_every_view_gives_the_albedo_at_each_samples_own_place(registered):
+def test_every_view_gives_the_albedo_at_each_samples_own_point(registered):
     for templates, seen in zip(registered.patches.buckets, registered.buckets, strict=True):
         points = _points_world(templates)
         x, y = points[..., 0], points[..., 1]
@@ -33,7 +33,7 @@ def test_every_view_gives_the_albedo_at_each_samples_own_place(registered):
         assert (seen.valid & templates.inside[:, None]).float().mean() > 0.2
 
 
-def test_nothing_is_said_about_missing_samples(registered):
+def test_missing_samples_are_zero(registered):
     for seen in registered.buckets:
         assert (seen.radiance * ~seen.valid[:, :, None]).abs().max() == 0
     assert 0 <= missing_fraction(registered) < 0.2

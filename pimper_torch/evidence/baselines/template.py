@@ -22,7 +22,7 @@ from pimper_torch.geometry.frames import invert_rigid, rigid, rotate, transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.meshing.extract import large_pieces
+from pimper_torch.meshing.extract import large_components
 from pimper_torch.patches.decompose import sample_spacing
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.progress import track
@@ -274,7 +274,7 @@ def surface_of(
             "at least one triangle is needed. Look at the coarse mesh, or sample more finely."
         )
     rows = template.points(depth)[template.inside]
-    faces = faces[large_pieces(rows, faces, 1.0)]
+    faces = faces[large_components(rows, faces, 1.0)]
     used, faces = torch.unique(faces, return_inverse=True)
     return Mesh(
         vertices_world=template.to_world(rows[used]),
