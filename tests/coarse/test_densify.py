@@ -1,10 +1,19 @@
 import torch
+from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.coarse.densify import agreeing, median3, push_pull, sweep
 from pimper_torch.coarse.fine_surface import near_points
 from pimper_torch.coarse.matching import Matcher, Windows, level_of, pair
-from pimper_torch.coarse.oriented import OrientedPoints, fitted_planes, thinned
+from pimper_torch.coarse.neighbours import choose_sources, step_for_one_pixel
+from pimper_torch.coarse.oriented import (
+    OrientedPoints,
+    fitted_planes,
+    no_points,
+    sparse_oriented,
+    thinned,
+    with_common_normals,
+)
 from pimper_torch.coarse.trim import (
     ViewCounts,
     connected_to,
@@ -17,6 +26,7 @@ from pimper_torch.evidence.scenes.meshes import icosphere, table
 from pimper_torch.evidence.scenes.render import render_shape
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.geometry.projection import project
 from pimper_torch.records import Support
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
@@ -228,3 +238,88 @@ def test_a_poisson_surface_is_the_same_whatever_was_made_before_it():
     made(3)
     for one, other in zip(before, made(5), strict=True):
         assert torch.equal(one, other)
+
+
+def test_sources_are_the_views_at_angles_that_match_well():
+    _, scene = ball(9)  # 50 degrees in all: 6 between neighbours
+    everyone = torch.arange(len(scene.points_world))
+    found = choose_sources(scene, everyone, 4, 4)
+    rays = normalize(scene.cameras.centers_world, dim=1)
+    angle = torch.rad2deg((rays @ rays[4]).clamp(-1, 1).acos())
+    assert set(found[:2].tolist()) == {2, 6}  # 12 degrees, the best there is
+    assert bool((angle[found] < 20).all())
+    assert 4 not in found.tolist()
+    # Without shared points no view is a source.
+    seen_by_4 = scene.observed[:, 4]
+    alone = (scene.observation_view == 4) | ~seen_by_4[scene.observation_point]
+    lonely = scene.replace(
+        observation_point=scene.observation_point[alone],
+        observation_view=scene.observation_view[alone],
+        observation_pixels=scene.observation_pixels[alone],
+    )
+    assert len(choose_sources(lonely, everyone, 4, 4)) == 0
+
+
+def test_a_step_of_inverse_depth_moves_points_by_a_pixel():
+    _, scene = ball()
+    level = level_of(scene, 1)
+    pairing = pair(level, 2, torch.tensor([1, 3]))
+    here = scene.points_world[scene.observed[:, 2]]
+    cameras = scene.cameras
+    pixels, depth = project(here, cameras.cam_from_world[2], cameras.intrinsics[2])
+    step = step_for_one_pixel(pairing, pixels, 1 / depth)
+    center = cameras.centers_world[2]
+    farther = center + (here - center) * (depth * (1 / depth - step)).reciprocal()[:, None]
+    moved = []
+    for view in (1, 3):
+        camera = cameras.cam_from_world[view], cameras.intrinsics[view]
+        moved.append((project(farther, *camera)[0] - project(here, *camera)[0]).norm(dim=1))
+    assert abs(float(torch.cat(moved).median()) - 1) < 0.05  # looked up at whole pixels
+
+
+def sheets(generator, gap=0.055):
+    """Two sheets that face away from each other, with noisy normals.
+
+    Of 24 neighbours some 21 lie on the same sheet, fewer at its border.
+    """
+    points = torch.rand(4000, 3, generator=generator, dtype=torch.float64)
+    up = torch.arange(4000)[:, None] % 2 == 0
+    points[:, 2] = torch.where(up[:, 0], gap, 0.0)
+    true = torch.where(up, 1.0, -1.0) * torch.tensor([0.0, 0, 1]).double()
+    normals = normalize(true + 0.25 * torch.randn(4000, 3, generator=generator).double(), dim=1)
+    noise = torch.full((4000,), 0.01, dtype=torch.float64)
+    return true, OrientedPoints(points_world=points, normals_world=normals, noise=noise)
+
+
+def test_normals_follow_the_neighbours_positions_on_either_side_of_a_thin_wall():
+    true, cloud = sheets(torch.Generator().manual_seed(4))
+    found = with_common_normals(cloud)
+    # Where more neighbours than usual are on the other sheet, normals disagree: points are dropped.
+    assert len(found.points_world) > 0.8 * len(cloud.points_world)
+    truth = torch.where(found.points_world[:, 2:] > 0.02, 1.0, -1.0) * true[:1]
+    cosine = (found.normals_world * truth).sum(dim=1)
+    given = (cloud.normals_world * true).sum(dim=1)
+    assert float((cosine > 0.999).double().mean()) > 0.95
+    assert float((given > 0.999).double().mean()) < 0.05
+
+
+def test_points_whose_neighbours_face_anywhere_are_dropped():
+    generator = torch.Generator().manual_seed(5)
+    _, cloud = sheets(generator)
+    random = normalize(torch.randn(4000, 3, generator=generator, dtype=torch.float64), dim=1)
+    assert len(with_common_normals(cloud.replace(normals_world=random)).noise) < 0.2 * 4000
+
+
+def test_sparse_points_far_from_dense_ones_get_normals_to_the_cameras():
+    _, scene = ball()
+    everyone = torch.arange(len(scene.points_world))
+    found = sparse_oriented(scene, everyone, no_points(scene.points_world), 0.05)
+    assert len(found.points_world) > 0.6 * len(everyone)
+    cosine = (found.normals_world * normalize(found.points_world, dim=1)).sum(dim=1)
+    assert float(cosine.min()) > 0.7
+    assert float(cosine.median()) > 0.98
+    # Half of the ball has dense points.
+    half = found.points_world[:, 0] > 0
+    left = sparse_oriented(scene, everyone, found.take(half), 0.05)
+    assert float(left.points_world[:, 0].max()) < 0.05
+    assert len(left.points_world) > 0.7 * int((~half).sum())
