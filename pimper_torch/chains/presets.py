@@ -72,6 +72,7 @@ _FORMER = {
             *("sweep.step_samples", "sweep.window_samples", "sweep.loss_scale", "sweep.max_slope"),
             *("reconstruct.min_matches", "reconstruct.min_registration_points"),
             *("reconstruct.min_share", "warp.pyramid_levels", "refine.samples_per_vertex"),
+            "extract.min_confidence",
             *("fuse.outlier_samples", "integrate.max_tilt_deg"),
         ],
         "a constant",

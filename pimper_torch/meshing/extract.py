@@ -21,7 +21,6 @@ class ExtractConfig:
     """What of the surface is worth keeping.
 
     Attributes:
-        min_confidence: Vertices with no more than this have no support of their own.
         max_expected_error: Faces with a vertex that is expected to be further off are cut out;
             a fraction of the surface's extent (diagonal of its bounding box). Infinite keeps all.
         max_hole: Connected vertices without support stay, as a filled hole, when they
@@ -36,7 +35,6 @@ class ExtractConfig:
             be kept; 1 keeps the largest only.
     """
 
-    min_confidence: float = 0.0
     max_expected_error: float = 0.02
     max_hole: float = 1.0
     max_stretch: float = 10.0
@@ -44,7 +42,6 @@ class ExtractConfig:
     min_piece: float = 0.01
 
     def __post_init__(self) -> None:
-        require(0 <= self.min_confidence < 1, "min_confidence", self.min_confidence, "in [0, 1)")
         require(
             self.max_expected_error > 0, "max_expected_error", self.max_expected_error, "above 0"
         )
@@ -78,10 +75,9 @@ class Extract(Stage):
             ReconstructionError: Nothing is left.
         """
         vertices = surface.vertices_world.detach()
-        confidence = surface.confidence.detach()
-        supported = confidence > self.config.min_confidence
-        if not bool((confidence > 0).any()):  # nowhere better than elsewhere
-            supported = supported.new_ones(supported.shape)
+        supported = surface.confidence > 0
+        if not bool(supported.any()):  # nowhere better than elsewhere
+            supported = ~supported
         max_hole = self.config.max_hole * diagonal(vertices)
         filled = small_groups(vertices, surface.faces, ~supported, max_hole)
         keep = (supported | filled)[surface.faces].all(dim=1)
@@ -93,8 +89,7 @@ class Extract(Stage):
         if len(faces) == 0:
             raise ReconstructionError(
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
-                f"{len(faces)} of those are no spikes; at least one is needed. Lower "
-                f"`extract.min_confidence` (now {self.config.min_confidence}), raise "
+                f"{len(faces)} of those are no spikes; at least one is needed. Raise "
                 f"`extract.max_expected_error` (now {bound}) or "
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the fraction "
                 "of missing data that the report gives."
