@@ -33,7 +33,7 @@ from pimper_torch.sfm.surfaces import poisson_surface
 from pimper_torch.silhouettes.contours import Contours
 
 # Lengths in pixels are those of the finest depth maps, at the cloud's median depth. Choices,
-# those of the surface through points and rims that benchmarks/README.md measures:
+# those of the surface through points and contours (rims) that benchmarks/README.md measures:
 # the finest grid of the cloud; the octree's cell; how far points and surface may lie outside the
 # visual hull; how near a face is to the points or contour points that support it.
 POINT_PX, CELL_PX, TOLERANCE_PX, REACH_PX = 1.0, 4.0, 4.0, 4.0
@@ -62,7 +62,7 @@ _MIN_BEHIND, _MIN_LIT = 2, 2
 
 # Without silhouettes a face without points is dropped where it is further than the first from all
 # points, with all connected to it that are further than the second. Spans over gaps in potatoes
-# stay, and what hangs in the air beside the object is dropped (benchmarks/README.md, ablations).
+# stay, and surface in the air beside the object is dropped (benchmarks/README.md, ablations).
 _GAP_PX, _MARGIN_PX = 40.0, 10.0
 
 

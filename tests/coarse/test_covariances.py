@@ -29,7 +29,7 @@ def test_covariances_are_as_large_as_the_errors_of_triangulated_points():
     error = cloud.points_world.norm(dim=1) - 1
     ratio = float((error.square() / predicted).mean())
     assert 0.6 < ratio < 1.6  # the triangulation is not weighted by depth, nor noise by track
-    # Those said to be uncertain are.
+    # Points with a larger predicted error have a larger one.
     order = predicted.argsort()
     half = len(order) // 2
     spread = [float(error[part].square().mean()) for part in (order[:half], order[half:])]

@@ -100,7 +100,7 @@ def test_a_surface_that_views_see_through_is_dropped_and_small_dents_stay():
     everywhere = torch.ones_like(cover)
     kept = seen_surface(vertices, faces, support, counts, everywhere, 1.0, SMALL_HOLES)
     assert bool((kept == ~cover).all())  # the cover's area is 1.2, the speck's 0.2
-    # Nothing goes where points are.
+    # Nothing is dropped where points are.
     support[cover] = Support.POINTS
     assert bool(seen_surface(vertices, faces, support, counts, everywhere, 1.0, SMALL_HOLES).all())
 

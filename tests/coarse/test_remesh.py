@@ -214,27 +214,27 @@ def test_small_facets_are_never_split_and_the_limit_holds(generator):
     free = len(remesh(coarse, surface, SPACING, RemeshConfig(min_samples=5.0)).mesh.faces)
     limit = (len(coarse.mesh.faces) + free) // 2
     config = RemeshConfig(min_samples=5.0, max_facets=limit)
-    held = len(remesh(coarse, surface, SPACING, config).mesh.faces)
-    assert limit - 12 <= held <= limit
+    limited = len(remesh(coarse, surface, SPACING, config).mesh.faces)
+    assert limit - 12 <= limited <= limit
 
 
 def test_facets_without_data_go_except_holes_inside(generator):
     coarse = sheet(generator, side=9)
     centres = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
     hole = centres[:, :2].norm(dim=1).argsort()[:2]
-    rim = centres[:, 0] > 0.7
+    border = centres[:, 0] > 0.7
 
     def confidence(subdivision):
         inner = (subdivision.barycentric > 0).all(dim=1)
-        lost = torch.isin(subdivision.facet, torch.cat([hole, rim.nonzero()[:, 0]])) & inner
+        lost = torch.isin(subdivision.facet, torch.cat([hole, border.nonzero()[:, 0]])) & inner
         return (~lost).double()
 
     surface = surface_on(coarse, lambda points: points, confidence=confidence)
     found = remesh(coarse, surface, SPACING)
-    assert len(found.mesh.faces) == len(coarse.mesh.faces) - int(rim.sum())
+    assert len(found.mesh.faces) == len(coarse.mesh.faces) - int(border.sum())
     strict = remesh(coarse, surface, SPACING, RemeshConfig(max_hole=0.0))
     assert len(strict.mesh.faces) == len(found.mesh.faces) - 2
-    seen = rim.clone()
+    seen = border.clone()
     assert len(remesh(coarse, surface, SPACING, seen=seen).mesh.faces) == len(coarse.mesh.faces)
     dark = surface.replace(confidence=torch.zeros_like(surface.confidence))
     assert len(remesh(coarse, dark, SPACING).mesh.faces) == len(coarse.mesh.faces)

@@ -111,7 +111,7 @@ def test_a_small_given_mesh_stays_as_it_is(round_about):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda v, f: (v, f[:0]), "no faces"),
         (lambda v, f: (v, f + len(v)), "faces reach from 42 to 83"),
@@ -119,9 +119,9 @@ def test_a_small_given_mesh_stays_as_it_is(round_about):
         (lambda v, f: (v + 1e4, f), "no photograph shows"),
     ],
 )
-def test_a_mesh_that_cannot_be_used_is_refused(round_about, change, told):
+def test_a_mesh_that_cannot_be_used_is_refused(round_about, change, message):
     vertices, faces = change(*icosphere(1))
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         built(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
 
 

@@ -162,13 +162,13 @@ def test_a_surface_without_enough_support_is_refused():
 def test_faces_with_a_large_expected_error_are_cut_out():
     surface = sheet()
     fraction = columns(surface) / (SIDE - 1) / 10
-    told = surface.replace(expected_error=fraction * diagonal(surface.vertices_world))
-    mesh = Extract(ExtractConfig(max_expected_error=0.05))(told)
+    inexact = surface.replace(expected_error=fraction * diagonal(surface.vertices_world))
+    mesh = Extract(ExtractConfig(max_expected_error=0.05))(inexact)
     assert columns(mesh).max() == (SIDE - 1) / 2
     assert len(mesh.faces) == len(surface.faces) // 2
     kept = mesh.vertices_world[:, 0] / (SIDE - 1) / 10 * diagonal(surface.vertices_world)
     assert_close(mesh.expected_error, kept)  # each with its own vertex
-    assert len(Extract(ExtractConfig(max_expected_error=0.11))(told).faces) == len(surface.faces)
+    assert len(Extract(ExtractConfig(max_expected_error=0.11))(inexact).faces) == len(surface.faces)
     with pytest.raises(ReconstructionError, match="max_expected_error"):
         Extract(ExtractConfig(max_expected_error=1e-9))(
             surface.replace(expected_error=1 + 0 * fraction)

@@ -202,10 +202,10 @@ def test_gradients_reach_fixed_vertices_and_no_repaired_ones():
     leaf = surface.vertices_world.clone().requires_grad_()
     mesh = Extract()(Repair()(surface.replace(vertices_world=leaf)))
     moved = (mesh.vertices_world != surface.vertices_world).any(dim=1)
-    (pulled,) = torch.autograd.grad(mesh.vertices_world[moved].sum(), leaf)
-    assert (pulled[moved] == 0).all()
-    # A shift of all that is held shifts what is repaired.
-    assert_close(pulled.sum(dim=0), moved.sum().double().expand(3))
+    (gradient,) = torch.autograd.grad(mesh.vertices_world[moved].sum(), leaf)
+    assert (gradient[moved] == 0).all()
+    # A shift of all fixed vertices shifts the repaired ones.
+    assert_close(gradient.sum(dim=0), moved.sum().double().expand(3))
     clone = surface.vertices_world[:42].clone().requires_grad_()
     _, coarse = icosphere(1)
     free = torch.zeros(42, dtype=torch.bool)

@@ -33,8 +33,8 @@ def waves(x, y):
     return 0.1 * torch.sin(7 * x) * torch.cos(5 * y) + 2e-4 * noise
 
 
-def deviations(mesh, found, told):
-    """Distance, angle and worst channel of removed vertices against the faces they are given."""
+def deviations(mesh, found, values):
+    """Distance, angle and worst channel of removed vertices against their faces."""
     gone = (found.face >= 0).nonzero()[:, 0]
     corners = found.mesh.faces[found.face[gone]]
     place = closest_on_triangles(mesh.vertices_world[gone], found.mesh.vertices_world[corners])
@@ -42,7 +42,7 @@ def deviations(mesh, found, told):
     blend = torch.linalg.lstsq(triangles.mT, place[..., None]).solution
     normals = normalize((blend * found.mesh.normals_world[corners]).sum(dim=1), dim=1)
     cosine = (normals * mesh.normals_world[gone]).sum(dim=1)
-    off = (blend * told[found.kept][corners]).sum(dim=1) - told[gone]
+    off = (blend * values[found.kept][corners]).sum(dim=1) - values[gone]
     return (
         (place - mesh.vertices_world[gone]).norm(dim=1),
         cosine.clamp(-1, 1).acos().rad2deg(),
@@ -53,12 +53,12 @@ def deviations(mesh, found, told):
 def test_every_former_vertex_stays_within_the_bounds():
     mesh = square(60, waves)
     mesh = mesh.replace(vertices_world=mesh.vertices_world + torch.tensor([3.0, -4.0, 5.0]))
-    told = 10 * mesh.albedo
+    values = 10 * mesh.albedo
     bounds = Bounds(spacings=0.1, angle_deg=3.0)
-    found = simplify(mesh, bounds, told)
+    found = simplify(mesh, bounds, values)
     assert len(found.kept) < 0.5 * len(mesh.vertices_world)
     assert len(found.kept) + int((found.face >= 0).sum()) == len(mesh.vertices_world)
-    distance, angle, off = deviations(mesh, found, told)
+    distance, angle, off = deviations(mesh, found, values)
     # The kernel's places are float32.
     assert distance.max() <= 0.1 * found.spacing * (1 + 1e-3)
     assert angle.max() <= 3.0 + 1e-2
@@ -79,9 +79,9 @@ def test_every_former_vertex_stays_within_the_bounds():
 )
 def test_each_bound_alone_keeps_vertices(bounds, channel):
     mesh = square(40, waves)
-    told = None if channel is None else channel * mesh.albedo
+    values = None if channel is None else channel * mesh.albedo
     loose = simplify(mesh, Bounds(spacings=100.0, angle_deg=180.0))
-    found = simplify(mesh, bounds, told)
+    found = simplify(mesh, bounds, values)
     assert len(found.kept) > 0.9 * len(mesh.vertices_world) > 5 * len(loose.kept)
 
 

@@ -14,7 +14,7 @@ from pimper_torch.paper.triangulate import (
 )
 
 
-def test_the_mesh_of_a_ball_faces_out_hangs_together_and_lies_on_the_ball(dome_cloud):
+def test_the_mesh_of_a_ball_faces_out_is_connected_and_lies_on_the_ball(dome_cloud):
     coarse = Triangulate(TriangulateConfig(num_points=120))(dome_cloud)
     vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
     assert 80 <= len(vertices) <= 260
@@ -54,7 +54,7 @@ def test_regions_without_points_are_filled_smoothly(dome_cloud):
     assert filled.is_point.logical_not().sum() > 10
     assert flat.is_point.all()
     new = filled.mesh.vertices_world[~filled.is_point]
-    # A flat lid over the bald cap would lie 1 - sqrt(1 - 0.45^2) = 0.107 under its top.
+    # A flat surface over the bald cap would lie 1 - sqrt(1 - 0.45^2) = 0.107 under its top.
     assert (new.norm(dim=-1) - 1).abs().max() < 0.03
     centre = flat.mesh.vertices_world[flat.mesh.faces].mean(dim=1).norm(dim=-1)
     assert centre.min() < 0.92
@@ -144,7 +144,7 @@ def test_filled_pixels_keep_away_from_points_and_inside_the_faces():
     assert 0.4 < len(half) / len(all_filled) < 0.6
 
 
-def test_components_hang_together_by_edges_only():
+def test_components_are_connected_by_edges_only():
     faces = torch.tensor([[0, 1, 2], [1, 3, 2], [2, 4, 5]])  # the last touches in a vertex
     assert largest_component(faces).tolist() == [[0, 1, 2], [1, 3, 2]]
     pairs, edges = face_pairs(faces)

@@ -65,9 +65,9 @@ def test_a_facet_turned_away_is_not_seen(plane_scene, plane_mesh):
 
 def test_a_facet_in_front_hides_the_one_behind(plane_scene, plane_mesh):
     vertices, faces = plane_mesh.mesh.vertices_world, plane_mesh.mesh.faces
-    lid = 0.5 * vertices + torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64)
+    cover = 0.5 * vertices + torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64)
     both = CoarseMesh(
-        mesh=Mesh(vertices_world=torch.cat([vertices, lid]), faces=torch.cat([faces, faces + 4])),
+        mesh=Mesh(vertices_world=torch.cat([vertices, cover]), faces=torch.cat([faces, faces + 4])),
         reference=2,
         is_point=torch.ones(8, dtype=torch.bool),
     )
@@ -76,15 +76,15 @@ def test_a_facet_in_front_hides_the_one_behind(plane_scene, plane_mesh):
     center = plane_scene.cameras.centers_world[2]
     for templates, bucket in zip(patches.buckets, seen.buckets, strict=True):
         points = _points_world(templates)
-        # Where the ray to the centre of view 2 passes the lid's plane, in the lid's corners.
-        normal = torch.linalg.cross(lid[1] - lid[0], lid[2] - lid[0])
+        # Where the ray to the centre of view 2 passes the cover's plane, in the cover's corners.
+        normal = torch.linalg.cross(cover[1] - cover[0], cover[2] - cover[0])
         ray = center - points
-        reach = ((lid[0] - points) @ normal) / (ray @ normal)
+        reach = ((cover[0] - points) @ normal) / (ray @ normal)
         at = points + reach[..., None] * ray
         covered = torch.zeros_like(templates.inside)
         deep = torch.zeros_like(templates.inside)
         for face in faces:
-            a, b, c = lid[face]
+            a, b, c = cover[face]
             inverse = torch.linalg.inv(torch.stack([a, b, c], dim=1))
             weights = at @ inverse.mT
             covered |= (weights > -0.08).all(dim=-1)
