@@ -1,4 +1,4 @@
-"""How far silhouettes can be trusted: what every view cut against what all have in common."""
+"""How reliable silhouettes are: every view's cut against the projection of the visual hull."""
 
 from dataclasses import dataclass
 
@@ -56,7 +56,7 @@ def agreement_of(cuts: Cuts) -> Agreement:
     )
 
 
-def settled(cuts: Cuts) -> Cuts:
+def repaired(cuts: Cuts) -> Cuts:
     """Repair single cuts that the hull denies: shadows taken in, highlights left out.
 
     A supporting plane shows shadows, and what is seen through a hole is known there

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, Record, SparseScene
-from pimper_torch.silhouettes.ground import Fixation, Plane, well_tracked
+from pimper_torch.silhouettes.supporting_plane import Fixation, Plane, well_tracked
 
 _CLEAR = 1.5  # tolerances above the plane: nearer points may lie on it
 _NEAR = 0.6  # of the cameras' distance: an object that fills photographs of 60 degrees
@@ -19,15 +19,15 @@ _CENTRE, _WITHIN, _OUTSIDE = 0.7, 1.3, 2.6
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SplitCloud(Record):
-    """The cloud's points, told apart.
+    """The cloud's points, divided into object and background.
 
     Attributes:
-        own: The object's.
-        other: Certainly not; the rest may be either.
+        on_object: The object's.
+        background: Certainly not the object's; the remainder may be either.
     """
 
-    own: Bool[Tensor, " point"]
-    other: Bool[Tensor, " point"]
+    on_object: Bool[Tensor, " point"]
+    background: Bool[Tensor, " point"]
 
 
 def split_cloud(
@@ -37,7 +37,7 @@ def split_cloud(
     tolerance: float,
     box_world: Float[Tensor, "2 3"] | None,
 ) -> SplitCloud:
-    """Tell the object's points from others.
+    """Divide the cloud into points of the object and of the background.
 
     With a plane they are what stands above it near the fixation point, without one what is near
     that point.
@@ -49,19 +49,22 @@ def split_cloud(
         tolerance: Of the plane, scene units.
         box_world: What is outside is not the object.
     """
-    points, good = scene.points_world, well_tracked(scene)
+    points, tracked = scene.points_world, well_tracked(scene)
     away = (points - fixation.fixation_world).norm(dim=1)
     if plane is None:
-        centre = torch.quantile(away[good], _CENTRE) if bool(good.any()) else away.sum()
-        own, other = away < _WITHIN * centre, away > _OUTSIDE * centre
+        centre = torch.quantile(away[tracked], _CENTRE) if bool(tracked.any()) else away.sum()
+        on_object = away < _WITHIN * centre
+        background = away > _OUTSIDE * centre
     else:
-        own = (plane.height_of(points) > _CLEAR * tolerance) & (away < _NEAR * fixation.distance)
-        other = ~own
+        on_object = (plane.height_of(points) > _CLEAR * tolerance) & (
+            away < _NEAR * fixation.distance
+        )
+        background = ~on_object
     if box_world is not None:
         low, high = box_world.to(points)
         inside = ((points >= low) & (points <= high)).all(dim=1)
-        own, other = own & inside, other | ~inside
-    return SplitCloud(own=good & own, other=good & other)
+        on_object, background = on_object & inside, background | ~inside
+    return SplitCloud(on_object=tracked & on_object, background=tracked & background)
 
 
 def pixels_seen(

@@ -26,7 +26,7 @@ class Contours(Record):
 
     Attributes:
         silhouettes: Of all views.
-        rays: Through the silhouettes of all trusted views.
+        rays: Through the silhouettes of all reliable views.
         cameras: Of all views.
         hull: The visual hull of the same silhouettes.
     """
@@ -122,10 +122,10 @@ def box_round(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"
 
     Its centre is nearest to the rays through the centres of the silhouettes' bounding boxes; from
     there it reaches as far as the largest of them, seen from its camera, and half as far again:
-    an silhouette may be cut by the photograph's border.
+    a silhouette may be cut by the photograph's border.
 
     Returns:
-        ``None`` where fewer than two trusted views show anything.
+        ``None`` where fewer than two reliable views show anything.
     """
     masks = silhouettes.masks
     views = (silhouettes.reliable & masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()

@@ -1,4 +1,4 @@
-"""Rounds of cutting every view and of voting on what the cuts have in common."""
+"""Alternate cuts of every view with a vote of all views on their visual hull."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pimper_torch.records import Record, Silhouettes
-from pimper_torch.silhouettes.ground import Fixation, Plane
 from pimper_torch.silhouettes.hull import margins, visual_hull
 from pimper_torch.silhouettes.opencv import (
     OBJECT,
@@ -29,6 +28,7 @@ from pimper_torch.silhouettes.seeds import (
     off_level,
     off_plane,
 )
+from pimper_torch.silhouettes.supporting_plane import Fixation, Plane
 
 # Points of the object that a view must observe, in the median, to be seeded by them.
 _MIN_OBSERVED = 12
@@ -41,12 +41,12 @@ Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Cues(Record):
-    """What tells the object before anything is cut.
+    """What is known of the object before any view is cut.
 
     Attributes:
         pictures: At the working size.
-        own_px: Pixels of the object's points, one tensor a view.
-        other_px: Of points that are not the object's.
+        object_px: Pixels of the object's points, one tensor a view.
+        background_px: Of points that are not the object's.
         plane: That the object stands on.
         agreement: With the plane's texture.
         fixation: Where the cameras look.
@@ -54,8 +54,8 @@ class Cues(Record):
     """
 
     pictures: Pictures
-    own_px: tuple[Float[Tensor, "_ 2"], ...]
-    other_px: tuple[Float[Tensor, "_ 2"], ...]
+    object_px: tuple[Float[Tensor, "_ 2"], ...]
+    background_px: tuple[Float[Tensor, "_ 2"], ...]
     plane: Plane | None
     agreement: Float[Tensor, "view height width"] | None
     fixation: Fixation
@@ -64,12 +64,12 @@ class Cues(Record):
     @property
     def num_views(self) -> int:
         """How many views there are."""
-        return len(self.own_px)
+        return len(self.object_px)
 
     @property
     def has_points(self) -> bool:
         """Whether views observe enough points of the object to be seeded by them."""
-        counts = torch.tensor([len(pixels) for pixels in self.own_px])
+        counts = torch.tensor([len(pixels) for pixels in self.object_px])
         return int(counts.median()) >= _MIN_OBSERVED
 
 
@@ -101,20 +101,20 @@ def cut_in_iterations(
     """
     masks = _first(cues)
     for _ in range(iterations):
-        cues = _looked_behind(cues, masks)
+        cues = _with_plane_texture(cues, masks)
         masks = _filled(cues, masks)
         seen = _voted(cues, masks | _likely(cues), disagreeing, num_voxels)
         if seen is None:
             return None
         masks = _again(cues, masks, seen)
-    masks = _filled(_looked_behind(cues, masks), masks)
+    masks = _filled(_with_plane_texture(cues, masks), masks)
     seen = _voted(cues, masks, disagreeing, num_voxels)
     if seen is None:
         return None
     return Cuts(masks=masks, margins_px=seen, on_plane=cues.plane is not None)
 
 
-def _looked_behind(cues: Cues, masks: Bool[Tensor, "view height width"]) -> Cues:
+def _with_plane_texture(cues: Cues, masks: Bool[Tensor, "view height width"]) -> Cues:
     """Learn the plane's texture where the cuts do not hide it; elsewhere keep what was known."""
     if cues.plane is None or cues.agreement is None:
         return cues
@@ -140,12 +140,12 @@ def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
     height, width = cues.pictures.grey.shape[1:]
 
     def first(view: int) -> Bool[Tensor, "height width"]:
-        own_px = cues.own_px[view]
+        object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
         if agreement is not None and not cues.has_points:
             return off_plane(agreement)
-        labels = labels_from_points(own_px, cues.other_px[view], agreement, (width, height))
-        margin = signed_distance(convex_hull_of(own_px, (width, height)))
+        labels = labels_from_points(object_px, cues.background_px[view], agreement, (width, height))
+        margin = signed_distance(convex_hull_of(object_px, (width, height)))
         return _cut(grab_cut_halved, cues, view, labels, margin)
 
     return of_views(first, cues.num_views)
@@ -159,9 +159,9 @@ def _again(
     """Cut from the last cut and the hull; drop what does not meet the hull."""
 
     def again(view: int) -> Bool[Tensor, "height width"]:
-        own_px = cues.own_px[view]
+        object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
-        labels = labels_from_hull(seen[view], masks[view], own_px, agreement)
+        labels = labels_from_hull(seen[view], masks[view], object_px, agreement)
         cut = _cut(grab_cut, cues, view, labels, seen[view])
         return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
 
@@ -183,26 +183,21 @@ def _cut(
     if cues.agreement is None:
         return how(cues.pictures.opponent[view], labels, _CUTS)
     agreement = cues.agreement[view]
-    surrounded = not_seen_through(cues.own_px[view], agreement)
+    surrounded = not_seen_through(cues.object_px[view], agreement)
     surrounded &= ~(agreement >= DISPUTED)
     labels = torch.where(is_deep(margin / _WELL) & surrounded, OBJECT, labels)
     return how(cues.pictures.opponent[view], labels, _CUTS)
 
 
 def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
-    """Mark what takes part in the vote though cuts may lack it, as the inside of a vessel.
+    """Mark what takes part in the vote though cuts may lack it: what no light makes of the plane.
 
-    That is what the object's points surround and the plane is not seen through, and what is
-    brighter or darker than the plane can be.
+    That is what is brighter or darker than the plane can be, as the inside of a vessel.
     """
-    own_px, agreement = cues.own_px, cues.agreement
+    agreement = cues.agreement
     if agreement is None or not cues.has_points:
         return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
-
-    def likely(view: int) -> Bool[Tensor, "height width"]:
-        return not_seen_through(own_px[view], agreement[view]) | off_level(agreement[view])
-
-    return of_views(likely, cues.num_views)
+    return of_views(lambda view: off_level(agreement[view]), cues.num_views)
 
 
 def _voted(

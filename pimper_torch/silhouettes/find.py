@@ -13,13 +13,13 @@ from pimper_torch.config import require
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Silhouettes, SparseScene, Views
-from pimper_torch.silhouettes.agreement import Agreement, agreement_of, settled
+from pimper_torch.silhouettes.agreement import Agreement, agreement_of, repaired
 from pimper_torch.silhouettes.cloud import pixels_seen, split_cloud
 from pimper_torch.silhouettes.cuts import Cues, Cuts, cut_in_iterations
-from pimper_torch.silhouettes.ground import fixation, supporting_plane, well_tracked
 from pimper_torch.silhouettes.opencv import signed_distance
 from pimper_torch.silhouettes.parallax import plane_agreement
 from pimper_torch.silhouettes.pictures import working_pictures
+from pimper_torch.silhouettes.supporting_plane import fixation, supporting_plane, well_tracked
 from pimper_torch.stage import Stage
 
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
@@ -69,9 +69,9 @@ class SilhouetteDetails:
         min_on_plane: Fraction of the points that lie on it.
         max_below_plane: Fraction of the points that may lie below it.
         min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
-            view is not trusted.
+            view is not reliable.
         min_overlap: Intersection over union of silhouettes and projections, in the median, below
-            which silhouettes are not trusted.
+            which silhouettes are not reliable.
         seed: Of the plane's trials.
     """
 
@@ -106,7 +106,7 @@ class FindSilhouettes(Stage):
         Returns:
             Everything where that is asked for, and, with a
             :class:`~pimper_torch.errors.PimperWarning` that says why, where silhouettes cannot be
-            trusted.
+            reliable.
 
         Raises:
             InputError: Masks are asked for, and none are given.
@@ -131,7 +131,7 @@ class FindSilhouettes(Stage):
         if doubt:
             _warn(doubt)
             return everything
-        cuts = settled(cuts)
+        cuts = repaired(cuts)
         found = _at_full_size(cuts, scene.views)
         reliable = agreement_of(cuts).reliable(self.details.min_covered).to(found.device)
         return Silhouettes(inside=found, reliable=reliable, source="found")
@@ -141,13 +141,13 @@ class FindSilhouettes(Stage):
         scene = scene.to("cpu", torch.float32)
         pictures = working_pictures(scene.views, scene.cameras, config.size_px)
         cameras, points = pictures.cameras, scene.points_world
-        looked_at = fixation(cameras)
-        tolerance = details.plane_tolerance * float(looked_at.distance)
+        focus = fixation(cameras)
+        tolerance = details.plane_tolerance * float(focus.distance)
         plane = supporting_plane(
             points[well_tracked(scene)],
             cameras,
             tolerance=tolerance,
-            least_on=details.min_on_plane,
+            min_on=details.min_on_plane,
             max_below=details.max_below_plane,
             generator=torch.Generator().manual_seed(details.seed),
         )
@@ -156,17 +156,17 @@ class FindSilhouettes(Stage):
             if config.region
             else None
         )
-        cloud = split_cloud(scene, looked_at, plane, tolerance, region)
-        half = _BOX * looked_at.distance
-        centre = looked_at.fixation_world
-        agreement = None if plane is None else plane_agreement(pictures, plane, looked_at)
+        cloud = split_cloud(scene, focus, plane, tolerance, region)
+        half = _BOX * focus.distance
+        centre = focus.fixation_world
+        agreement = None if plane is None else plane_agreement(pictures, plane, focus)
         cues = Cues(
             pictures=pictures,
-            own_px=tuple(pixels_seen(scene, cameras, cloud.own)),
-            other_px=tuple(pixels_seen(scene, cameras, cloud.other)),
+            object_px=tuple(pixels_seen(scene, cameras, cloud.on_object)),
+            background_px=tuple(pixels_seen(scene, cameras, cloud.background)),
             plane=plane,
             agreement=agreement,
-            fixation=looked_at,
+            fixation=focus,
             box_world=torch.stack([centre - half, centre + half]) if region is None else region,
         )
         if plane is None and not cues.has_points:
@@ -179,7 +179,7 @@ class FindSilhouettes(Stage):
         )
 
     def _doubt(self, agreement: Agreement) -> str:
-        """Say why silhouettes cannot be trusted, or nothing."""
+        """Say why silhouettes are unreliable, or nothing."""
         reliable = agreement.reliable(self.details.min_covered)
         overlap = float(agreement.overlap.median())
         if overlap < self.details.min_overlap:

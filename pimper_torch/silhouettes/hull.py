@@ -128,7 +128,7 @@ def visual_hull(
     disagreeing: float = 0.03,
     min_seen: float = 0.5,
 ) -> Hull | None:
-    """Build the hull by the vote of the trusted views.
+    """Build the hull by the vote of the reliable views.
 
     A view votes about what is inside its photograph, and abstains elsewhere. Time and memory
     grow with the voxels.
@@ -141,7 +141,7 @@ def visual_hull(
         num_voxels: Of the whole grid; an arc of views gives a hull that is long along their rays.
         disagreeing: Fraction of the views in sight of a voxel that may see it outside. What only
             a few views cut, such as the ends of an arc, needs a small one.
-        min_seen: Fraction of the trusted views that a voxel must be in sight of.
+        min_seen: Fraction of the reliable views that a voxel must be in sight of.
 
     Returns:
         ``None`` where the silhouettes have nothing in common inside the box.
@@ -279,7 +279,7 @@ def _vote(
     reach: tuple[Float[Tensor, " x"], Float[Tensor, " y"], Float[Tensor, " z"]],
     fractions: tuple[float, float],
 ) -> Float[Tensor, "x y z"]:
-    """Give the smallest distance to an silhouette after those that may disagree.
+    """Give the smallest distance to a silhouette after those that may disagree.
 
     Args:
         maps: Distances to the silhouettes in pixels, one a view.

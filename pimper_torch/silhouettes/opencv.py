@@ -89,9 +89,9 @@ def grab_cut(
             ``PERHAPS_OBJECT``; some of each side.
         iterations: Of estimating the mixtures and cutting.
     """
-    told = labels & 1 > 0
-    if not told.any() or told.all():
-        return told
+    seeded = labels & 1 > 0
+    if not seeded.any() or seeded.all():
+        return seeded
     cv2.setRNGSeed(0)
     top, left = (int(side.nonzero()[0, 0]) for side in _open_sides(labels))
     bottom, right = (int(side.nonzero()[-1, 0]) + 1 for side in _open_sides(labels))
@@ -100,7 +100,7 @@ def grab_cut(
     models = np.zeros((1, 65)), np.zeros((1, 65))
     pixels = colours[window].contiguous().numpy()
     cv2.grabCut(pixels, drawn, None, *models, iterations, cv2.GC_INIT_WITH_MASK)
-    found = torch.zeros_like(told)
+    found = torch.zeros_like(seeded)
     found[window] = torch.from_numpy((drawn & 1) > 0)
     return found
 
@@ -156,10 +156,10 @@ def _morphed(
 
 
 def without_specks(
-    mask: Bool[Tensor, "height width"], kept: Bool[Tensor, "height width"], least_px: int
+    mask: Bool[Tensor, "height width"], kept: Bool[Tensor, "height width"], min_px: int
 ) -> Bool[Tensor, "height width"]:
     """Drop components that are small or do not reach ``kept``, and fill small holes."""
-    return ~_large(~_large(mask, kept, least_px), torch.ones_like(mask), least_px)
+    return ~_large(~_large(mask, kept, min_px), torch.ones_like(mask), min_px)
 
 
 def components_of(
@@ -170,12 +170,12 @@ def components_of(
 
 
 def _large(
-    mask: Bool[Tensor, "height width"], meeting: Bool[Tensor, "height width"], least_px: int
+    mask: Bool[Tensor, "height width"], meeting: Bool[Tensor, "height width"], min_px: int
 ) -> Bool[Tensor, "height width"]:
     drawn = mask.numpy().astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(drawn, connectivity=4)
     met = np.bincount(labels[meeting.numpy()], minlength=count) > 0
-    taken = met & (stats[:, cv2.CC_STAT_AREA] >= least_px) & (np.arange(count) > 0)
+    taken = met & (stats[:, cv2.CC_STAT_AREA] >= min_px) & (np.arange(count) > 0)
     return torch.from_numpy(taken[labels])
 
 

@@ -16,9 +16,9 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record
-from pimper_torch.silhouettes.ground import Fixation, Plane
 from pimper_torch.silhouettes.opencv import warped, window_means
 from pimper_torch.silhouettes.pictures import Pictures, of_views
+from pimper_torch.silhouettes.supporting_plane import Fixation, Plane
 
 # Fractions of the pictures' longer side.
 _WINDOW = 1 / 80  # windows that are compared: 9 px of 640
@@ -36,15 +36,15 @@ _SAMPLES = 2**20  # of the plane, over all views, at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Sheet(Record):
+class PlaneRaster(Record):
     """A raster on the plane.
 
     Attributes:
-        world_from_sheet: Homogeneous pixels of the raster to world points, 3 x 3.
+        world_from_raster: Homogeneous pixels of the raster to world points, 3 x 3.
         size_px: Samples each way.
     """
 
-    world_from_sheet: Float[Tensor, "3 3"]
+    world_from_raster: Float[Tensor, "3 3"]
     size_px: int
 
 
@@ -79,8 +79,8 @@ def plane_agreement(
 
     texture = of_views(textured, cameras.num_views)
     seen, radiance = (layer.masked_fill(hidden, torch.nan) for layer in (texture, pictures.grey))
-    common, spread = _common(seen, cameras, _sheet(cameras, plane, fixation, _REACH, _STEP))
-    far = _sheet(cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
+    common, spread = _common(seen, cameras, _raster(cameras, plane, fixation, _REACH, _STEP))
+    far = _raster(cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
     level, level_spread = _common(radiance, cameras, far)
 
     def agreement_of(view: int) -> Float[Tensor, "height width"]:
@@ -93,19 +93,21 @@ def plane_agreement(
 
 
 def _common(
-    values: Float[Tensor, "view height width"], cameras: Cameras, sheet: Sheet
+    values: Float[Tensor, "view height width"], cameras: Cameras, raster: PlaneRaster
 ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
-    """Give the views' median of each place on the plane, and its spread, as each view sees it."""
-    maps = [cameras.intrinsics[v] @ _on_sheet(cameras, sheet, v) for v in range(len(values))]
-    square = (sheet.size_px, sheet.size_px)
+    """Give the views' median at each point of the plane, and its spread, as each view sees it."""
+    maps = [
+        cameras.intrinsics[v] @ _cam_from_raster(cameras, raster, v) for v in range(len(values))
+    ]
+    square = (raster.size_px, raster.size_px)
     seen = of_views(lambda view: warped(values[view], maps[view], square), len(values))
-    rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * sheet.size_px)), dim=1)
+    rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * raster.size_px)), dim=1)
     common, spread = torch.cat(list(side_by_side(_centre, rows, tracked=False)), dim=1)
     size = (values.shape[2], values.shape[1])
 
     def back(view: int) -> Float[Tensor, "layer height width"]:
         to = torch.linalg.inv(maps[view])
-        return torch.stack([_before(warped(one, to, size), to) for one in (common, spread)])
+        return torch.stack([_in_front(warped(one, to, size), to) for one in (common, spread)])
 
     common, spread = of_views(back, len(values)).unbind(dim=1)
     return common, spread
@@ -119,19 +121,19 @@ def _centre(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row colu
     return torch.stack([common, spread]).masked_fill(few, torch.nan)
 
 
-def _before(
-    layer: Float[Tensor, "height width"], sheet_from_pixels: Float[Tensor, "3 3"]
+def _in_front(
+    layer: Float[Tensor, "height width"], raster_from_pixels: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "height width"]:
-    """Forget what a homography puts before the camera though it lies behind, above the horizon."""
+    """Mask what a homography maps in front of the camera though it lies behind it."""
     height, width = layer.shape
     pixels = pixel_centers(width, height, like=layer)
-    scale = pixels @ sheet_from_pixels[2, :2] + sheet_from_pixels[2, 2]
+    scale = pixels @ raster_from_pixels[2, :2] + raster_from_pixels[2, 2]
     return torch.where(scale > 0, layer, torch.nan)
 
 
-def _sheet(
+def _raster(
     cameras: Cameras, plane: Plane, fixation: Fixation, reach: float, step_px: float
-) -> Sheet:
+) -> PlaneRaster:
     """Lay a raster on the plane about the foot of the fixation point."""
     normal = plane.normal_world
     axis = torch.eye(3)[normal.abs().argmin()].to(normal)
@@ -141,15 +143,15 @@ def _sheet(
     step = step_px * fixation.distance / cameras.intrinsics[:, 0, 0].median()
     size = int(2 * reach * fixation.distance / step)
     corner = foot - step * size / 2 * (first + second)
-    return Sheet(
-        world_from_sheet=torch.stack([step * first, step * second, corner], dim=1), size_px=size
+    return PlaneRaster(
+        world_from_raster=torch.stack([step * first, step * second, corner], dim=1), size_px=size
     )
 
 
-def _on_sheet(cameras: Cameras, sheet: Sheet, view: int) -> Float[Tensor, "3 3"]:
+def _cam_from_raster(cameras: Cameras, raster: PlaneRaster, view: int) -> Float[Tensor, "3 3"]:
     """Give the map from homogeneous pixels of the raster to a camera's frame."""
     pose = cameras.cam_from_world[view]
-    moved = pose[:3, :3] @ sheet.world_from_sheet
+    moved = pose[:3, :3] @ raster.world_from_raster
     moved[:, 2] += pose[:3, 3]
     return moved
 
@@ -180,8 +182,8 @@ def _agreement(
     variance_common = (means[3] - means[1] ** 2).clamp_min(0)
     agreement = 2 * (means[4] - means[0] * means[1]) / (variance + variance_common)
     disputed = means[5] > variance_common.sqrt().clamp_min(_FLAT)
-    told = (torch.maximum(variance, variance_common) > _FLAT**2) & (means[6] > 0.999)
-    return torch.where(told, torch.where(disputed, DISPUTED, agreement), torch.nan)
+    known_here = (torch.maximum(variance, variance_common) > _FLAT**2) & (means[6] > 0.999)
+    return torch.where(known_here, torch.where(disputed, DISPUTED, agreement), torch.nan)
 
 
 def _odd(size: float) -> int:

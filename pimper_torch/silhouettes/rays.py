@@ -1,4 +1,4 @@
-"""TraceContours rays: the silhouettes' pixels as rays that the surface is tangent to."""
+"""Contour rays: pixels of the silhouettes as rays that the surface is tangent to."""
 
 import math
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ _READING = 1 / 12 + 1 / 6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RayConfig:
-    """Which places of the silhouettes become rays.
+    """Which points of the silhouettes become rays.
 
     Lengths are in pixels of the probability maps.
 
@@ -40,7 +40,7 @@ class RayConfig:
         tangent_px: The same along the silhouette, for its tangents.
         corner_px: A corner is where the tangent turns too far from so far before to so far
             after it.
-        max_convex_deg: Turn of an silhouette that bends round the object, at most.
+        max_convex_deg: Turn of a silhouette that bends round the object, at most.
         max_concave_deg: The same of one that bends into it: where one part of the surface
             hides another, the silhouette has a concave corner, and no normal.
         border_px: Rays keep so far from the photograph's border.
@@ -80,13 +80,13 @@ def contour_rays(
     place, it has there a slope of :math:`1 / (\sigma \sqrt{2 \pi})`.
 
     Args:
-        silhouettes: Probabilities that pixels show the object; views that are not trusted get
+        silhouettes: Probabilities that pixels show the object; views that are not reliable get
             no rays.
         cameras: Of all views.
         config: Settings.
 
     Returns:
-        Rays of all trusted views. Corners, where the surface has no single normal, specks,
+        Rays of all reliable views. Corners, where the surface has no single normal, specks,
         and what lies at the photograph's border have none. A constant to autograd.
     """
     config = config or RayConfig()
@@ -125,12 +125,12 @@ def _of_view(
         inside[:height, :width].detach().cpu().double().numpy(), config.blur_px, mode="nearest"
     )
     lines = [_resampled(line) for line in find_contours(smooth, 0.5)]
-    lines = [line for line in lines if len(line.places) >= config.min_length_px]
-    stride = max(1.0, sum(len(line.places) for line in lines) / config.per_view)
+    lines = [line for line in lines if len(line.points) >= config.min_length_px]
+    stride = max(1.0, sum(len(line.points) for line in lines) / config.per_view)
     rows = [_samples(line, smooth, stride, config) for line in lines]
     table = torch.from_numpy(np.concatenate([np.zeros((0, 7)), *rows])).to(like)
-    place, along, outward, slope = torch.split(table, [2, 2, 2, 1], dim=1)
-    pixels = pixels_from_indices(place)
+    point, along, outward, slope = torch.split(table, [2, 2, 2, 1], dim=1)
+    pixels = pixels_from_indices(point)
     frame, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
     rays = rays_through(pixels, frame, intrinsics)
     # Rays are affine in the pixel.
@@ -150,13 +150,13 @@ def _of_view(
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """An silhouette's places ``(u, v)``, about a pixel apart, that count from 0."""
+    """A silhouette's points ``(u, v)``, about a pixel apart, that count from 0."""
 
-    places: Array
+    points: Array
     closed: bool
 
     def shifted(self, values: Array, by: int) -> Array:
-        """Give what stands so many places further along; the end's beyond an open one's end."""
+        """Give what stands so many points further along; the end's beyond an open one's end."""
         at = np.arange(len(values)) + by
         at = at % len(values) if self.closed else at.clip(0, len(values) - 1)
         shifted: Array = values[at]
@@ -168,18 +168,18 @@ def _resampled(corners: Array) -> _Line:
     length = np.concatenate([[0.0], np.cumsum(steps)])
     closed = bool((corners[0] == corners[-1]).all())
     wanted = np.linspace(0, length[-1], round(length[-1]), endpoint=not closed)
-    places = [np.interp(wanted, length, corners[:, axis]) for axis in (1, 0)]
-    return _Line(np.stack(places, axis=1), closed)
+    points = [np.interp(wanted, length, corners[:, axis]) for axis in (1, 0)]
+    return _Line(np.stack(points, axis=1), closed)
 
 
 def _samples(line: _Line, smooth: Array, stride: float, config: RayConfig) -> Array:
     """Give rows of place, tangent and outward direction, two numbers each, and slope."""
-    places = line.places
+    points = line.points
     how: Literal["wrap", "nearest"] = "wrap" if line.closed else "nearest"
-    tangent = _unit(gaussian_filter1d(places, config.tangent_px, axis=0, order=1, mode=how))
+    tangent = _unit(gaussian_filter1d(points, config.tangent_px, axis=0, order=1, mode=how))
     # The probability falls outward; half a pixel to either side tells how fast.
     across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    rise = _read(smooth, places + 0.5 * across) - _read(smooth, places - 0.5 * across)
+    rise = _read(smooth, points + 0.5 * across) - _read(smooth, points - 0.5 * across)
     outward = -np.sign(rise)[:, None] * across
     reach = round(config.corner_px)
     behind, ahead = line.shifted(tangent, -reach), line.shifted(tangent, reach)
@@ -187,11 +187,11 @@ def _samples(line: _Line, smooth: Array, stride: float, config: RayConfig) -> Ar
     convex = ((ahead - behind) * outward).sum(axis=1) < 0
     most = np.where(convex, config.max_convex_deg, config.max_concave_deg)
     size = np.array([smooth.shape[1], smooth.shape[0]]) - 1.0
-    margin = np.minimum(places, size - places).min(axis=1) + 0.5
+    margin = np.minimum(points, size - points).min(axis=1) + 0.5
     good = (rotation <= most) & (margin >= config.border_px) & (rise != 0)
-    chosen = np.arange(0, len(places), stride).astype(int)
+    chosen = np.arange(0, len(points), stride).astype(int)
     chosen = chosen[good[chosen]]
-    rows = np.concatenate([places, tangent, outward, np.abs(rise)[:, None]], axis=1)
+    rows = np.concatenate([points, tangent, outward, np.abs(rise)[:, None]], axis=1)
     return np.asarray(rows[chosen])
 
 
@@ -199,5 +199,5 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
-def _read(values: Array, places: Array) -> Array:
-    return np.asarray(map_coordinates(values, places.T[::-1], order=1, mode="nearest"))
+def _read(values: Array, points: Array) -> Array:
+    return np.asarray(map_coordinates(values, points.T[::-1], order=1, mode="nearest"))

@@ -24,13 +24,13 @@ _NEIGHBOURS = 7
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TangencyConfig:
-    """How places on contour rays are chosen.
+    """How positions on contour rays are chosen.
 
     Attributes:
         steps: Places that are looked at on each ray, over the object's depth.
         refined_steps: Between those beside the best one.
         tolerance_px: How far outside the visual hull the place may lie.
-        ambiguous_px: Two places on a ray, one behind the other, both so near to the surface
+        ambiguous_px: Two positions on a ray, one behind the other, both so near to the surface
             that they differ by less than this: nothing tells which of them it touches.
     """
 
@@ -57,7 +57,7 @@ def contour_points(
 ) -> ContourPoints:
     """Find where each contour ray touches a surface, of which points with normals are given.
 
-    It touches where, of all places inside the visual hull, the ray runs deepest below the
+    It touches where, of all positions inside the visual hull, the ray runs deepest below the
     surface or, if it passes the surface by, nearest to it. The place may be off along the ray:
     the surface is tangent there, so that this matters little across it.
 
@@ -66,7 +66,7 @@ def contour_points(
         cameras: Of all views.
         hull: Of the same silhouettes.
         points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
-            any, places are in the centre of what is in the hull.
+            any, positions are in the centre of what is in the hull.
         normals_world: Theirs, unit, outward.
         config: Settings.
 
@@ -108,17 +108,19 @@ class _SignedDistance:
     """
 
     def __init__(self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]) -> None:
-        places = points.detach().cpu().double().numpy()
-        self._points, self._normals, self._tree = points, normals, cKDTree(places)
+        positions = points.detach().cpu().double().numpy()
+        self._points, self._normals, self._tree = points, normals, cKDTree(positions)
 
-    def __call__(self, places: Float[Tensor, "place 3"]) -> Float[Tensor, " place"]:
-        _, nearest = self._tree.query(places.detach().cpu().double().numpy(), workers=num_workers())
+    def __call__(self, positions: Float[Tensor, "place 3"]) -> Float[Tensor, " place"]:
+        _, nearest = self._tree.query(
+            positions.detach().cpu().double().numpy(), workers=num_workers()
+        )
         index = torch.from_numpy(nearest).to(self._points.device)
-        offset, normals = places - self._points[index], self._normals[index]
+        offset, normals = positions - self._points[index], self._normals[index]
         height = (offset * normals).sum(dim=1)
         beside = (offset - height[:, None] * normals).norm(dim=1) - self._radii(index)
-        away = torch.hypot(height, beside.clamp_min(0))
-        return torch.where(height < -_ALONG_NORMAL * away, -away, away)
+        distance = torch.hypot(height, beside.clamp_min(0))
+        return torch.where(height < -_ALONG_NORMAL * distance, -distance, distance)
 
     def _radii(self, index: Int[Tensor, " place"]) -> Float[Tensor, " place"]:
         some, place = torch.unique(index, return_inverse=True)
@@ -152,34 +154,34 @@ def _costs(
 
     Without a surface it is the distance to the centre of what is in the hull.
     """
-    places = centers[:, None] + depth[..., None] * rays.rays_world[:, None]
-    inside = hull.depth_of(places.to(hull.distance)) >= -tolerance[:, None].to(hull.distance)
+    positions = centers[:, None] + depth[..., None] * rays.rays_world[:, None]
+    inside = hull.depth_of(positions.to(hull.distance)) >= -tolerance[:, None].to(hull.distance)
     inside &= depth > 0
     if surface is None:
         centre = (inside * depth).sum(dim=1) / inside.sum(dim=1).clamp_min(1)
         return torch.where(inside, (depth - centre[:, None]).abs(), torch.inf)
     cost = torch.full_like(depth, torch.inf)
-    cost[inside] = surface(places[inside])
+    cost[inside] = surface(positions[inside])
     return cost
 
 
 def ambiguous(
-    cost: Float[Tensor, "ray step"], alike: Float[Tensor, " ray"]
+    cost: Float[Tensor, "ray step"], tolerance: Float[Tensor, " ray"]
 ) -> Bool[Tensor, " ray"]:
     """Tell rays that come equally near to two surfaces, one behind the other.
 
     Args:
         cost: Signed distance to the surface along the rays; infinite where they cannot
             touch it.
-        alike: Difference of distances that does not count. Places are on two surfaces if the
+        tolerance: Difference of distances that does not count. Places are on two surfaces if the
             distance between them rises by more.
     """
-    margin = alike[:, None]
+    margin = tolerance[:, None]
     # Below the surface, or on it, is all the same: thick and thin parts are alike near.
     lowest = cost.amin(dim=1, keepdim=True).clamp_min(0)
-    near, apart = cost <= lowest + margin, cost > lowest + 2 * margin
-    # A new stretch begins where places are near again after some that are apart.
-    stretch = apart.cumsum(dim=1)
+    near, far = cost <= lowest + margin, cost > lowest + 2 * margin
+    # A new stretch begins where positions are near again after some that are far.
+    stretch = far.cumsum(dim=1)
     first = torch.where(near, stretch, cost.shape[1] + 1).amin(dim=1)
     last = torch.where(near, stretch, -1).amax(dim=1)
     return last > first

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.silhouettes.agreement import agreement_of, settled
+from pimper_torch.silhouettes.agreement import agreement_of, repaired
 from pimper_torch.silhouettes.cuts import Cuts
 
 VIEWS = 8
@@ -30,7 +30,7 @@ def shadowed():
 
 def test_what_one_view_cuts_and_the_hull_denies_is_taken_from_it():
     cuts = cuts_of([shadowed()])
-    found = settled(cuts).masks
+    found = repaired(cuts).masks
     # Half of _FAR times 100 pixels stays along the border of what is taken.
     assert torch.equal(found[0] & (disc() < -0.25), torch.zeros(80, 100, dtype=torch.bool))
     assert torch.equal(found[0] & (disc() > 0), disc() > 0)
@@ -40,7 +40,7 @@ def test_what_one_view_cuts_and_the_hull_denies_is_taken_from_it():
 def test_what_lies_apart_from_the_excess_keeps_its_border():
     """A pixel too wide on the far side is no shadow."""
     wide = (disc() > -0.4) | shadowed()
-    found = settled(cuts_of([wide])).masks[0]
+    found = repaired(cuts_of([wide])).masks[0]
     far_side = torch.zeros(80, 100, dtype=torch.bool)
     far_side[:, :40] = True
     far_side &= disc() > -0.25
@@ -58,7 +58,7 @@ def test_what_lies_apart_from_the_excess_keeps_its_border():
 )
 def test_nothing_is_taken_where_another_cause_is_likelier(changed, on_plane):
     cuts = cuts_of(changed, on_plane)
-    assert torch.equal(settled(cuts).masks, cuts.masks)
+    assert torch.equal(repaired(cuts).masks, cuts.masks)
 
 
 def test_a_highlight_is_filled_where_the_hull_is_deep_and_no_plane_tells_of_it():
@@ -66,8 +66,8 @@ def test_a_highlight_is_filled_where_the_hull_is_deep_and_no_plane_tells_of_it()
     holes = disc() > 0
     holes &= (disc((50.0, 40.0), 4.0) < 0) & (disc((50.0, 60.5), 2.0) < 0)
     open_side = holes | (disc((50.0, 40.0), 4.0) >= 0)
-    assert torch.equal(settled(cuts_of([holes], on_plane=False)).masks[0], open_side)
-    assert torch.equal(settled(cuts_of([holes], on_plane=True)).masks[0], holes)
+    assert torch.equal(repaired(cuts_of([holes], on_plane=False)).masks[0], open_side)
+    assert torch.equal(repaired(cuts_of([holes], on_plane=True)).masks[0], holes)
 
 
 def test_the_agreement_counts_pixels():

@@ -14,9 +14,9 @@ from pimper_torch.silhouettes.find import (
     SilhouetteDetails,
     masked,
 )
-from pimper_torch.silhouettes.ground import Plane, fixation, supporting_plane
 from pimper_torch.silhouettes.parallax import plane_agreement
 from pimper_torch.silhouettes.pictures import working_pictures
+from pimper_torch.silhouettes.supporting_plane import Plane, fixation, supporting_plane
 
 SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
 
@@ -153,7 +153,7 @@ def test_a_region_is_two_corners():
 def test_the_table_is_the_supporting_plane(staged, generator):
     scene = staged.scene
     plane = supporting_plane(
-        scene.points_world, scene.cameras, tolerance=0.01, least_on=0.1, max_below=0.05,
+        scene.points_world, scene.cameras, tolerance=0.01, min_on=0.1, max_below=0.05,
         generator=generator,
     )  # fmt: skip
     assert plane is not None
@@ -169,7 +169,7 @@ def test_points_without_a_plane_have_none(generator):
     cameras = arc_cameras(5, width=80, height=60, focal_px=90.0, distance=4.0).to(torch.float32)
     points = torch.randn(500, 3, generator=generator)
     found = supporting_plane(
-        points, cameras, tolerance=0.01, least_on=0.1, max_below=0.05, generator=generator
+        points, cameras, tolerance=0.01, min_on=0.1, max_below=0.05, generator=generator
     )
     assert found is None
 

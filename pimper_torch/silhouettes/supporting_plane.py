@@ -1,4 +1,4 @@
-"""What the cloud tells of the object: where the cameras look, what it stands on, its points."""
+"""Where the cameras look, and the plane that the object stands on, from the sparse cloud."""
 
 from dataclasses import dataclass
 
@@ -75,7 +75,7 @@ def supporting_plane(
     cameras: Cameras,
     *,
     tolerance: float,
-    least_on: float,
+    min_on: float,
     max_below: float,
     generator: torch.Generator,
 ) -> Plane | None:
@@ -85,7 +85,7 @@ def supporting_plane(
         points_world: Well tracked.
         cameras: All on its upper side.
         tolerance: Distance from the plane up to which a point lies on it, scene units.
-        least_on: Fraction of the points that must lie on it.
+        min_on: Fraction of the points that must lie on it.
         max_below: Fraction of the points that may lie below it.
         generator: Draws the trials.
 
@@ -106,7 +106,7 @@ def supporting_plane(
     height = points_world @ normals.mT - offsets
     on = (height.abs() < tolerance).double().mean(dim=0)
     below = (height < -tolerance).double().mean(dim=0)
-    fits = eyes_above & (on >= least_on) & (below < max_below)
+    fits = eyes_above & (on >= min_on) & (below < max_below)
     if not bool(fits.any()):
         return None
     best = torch.where(fits, on, -1).argmax()

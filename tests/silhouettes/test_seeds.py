@@ -1,0 +1,103 @@
+"""What is labelled before a view is cut, on pictures that are drawn."""
+
+import pytest
+import torch
+
+from pimper_torch.silhouettes.opencv import BACKGROUND, OBJECT, PERHAPS_BACKGROUND, PERHAPS_OBJECT
+from pimper_torch.silhouettes.seeds import (
+    filled,
+    labels_from_hull,
+    labels_from_points,
+    not_seen_through,
+    off_level,
+    off_plane,
+)
+
+WIDTH, HEIGHT = 320, 240
+NOTHING = torch.zeros(0, 2)
+
+
+def square(left: int, top: int, right: int, bottom: int) -> torch.Tensor:
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+def agreeing(hidden: torch.Tensor) -> torch.Tensor:
+    """The plane is seen but where something stands before it."""
+    return torch.where(hidden, -0.2, 0.95)
+
+
+@pytest.fixture
+def thing() -> torch.Tensor:
+    return square(100, 80, 200, 180)
+
+
+def test_points_label_discs_about_them_and_background_wins_nothing_from_the_object(thing):
+    points, others = torch.tensor([[150.5, 130.5]]), torch.tensor([[20.5, 20.5]])
+    labels = labels_from_points(points, others, None, (WIDTH, HEIGHT))
+    assert labels[130, 150] == OBJECT
+    assert labels[20, 20] == BACKGROUND
+    assert labels[20, 40] == PERHAPS_BACKGROUND
+    assert (labels[0] == BACKGROUND).all()  # the strip along the border
+    assert (labels[:, -1] == BACKGROUND).all()
+
+
+def test_the_plane_beside_the_object_is_background_but_for_a_seam(thing):
+    labels = labels_from_points(NOTHING, NOTHING, agreeing(thing), (WIDTH, HEIGHT))
+    assert labels[130, 20] == BACKGROUND
+    assert labels[130, 99] == PERHAPS_BACKGROUND  # an object's foot agrees with the plane, too
+    assert labels[130, 150] != BACKGROUND
+
+
+def test_what_a_window_holds_that_agrees_is_not_the_object_for_certain(thing):
+    """Windows that reach over the border of the object agree less: the plane goes on there."""
+    corners = torch.tensor([[60.5, 60.5], [240.5, 60.5], [240.5, 200.5], [60.5, 200.5]])
+    labels = labels_from_points(corners, NOTHING, agreeing(thing), (WIDTH, HEIGHT))
+    assert labels[130, 101] == PERHAPS_BACKGROUND  # half a window of 320 / 80 pixels
+    assert labels[130, 103] == PERHAPS_OBJECT
+    assert not not_seen_through(corners, agreeing(thing))[130, 101]
+    assert not_seen_through(corners, agreeing(thing))[130, 103]
+
+
+def test_gaps_between_legs_are_background_where_the_plane_is_seen_in_them():
+    legs = square(100, 80, 130, 180) | square(145, 80, 175, 180)
+    hull = square(100, 80, 175, 180)
+    margin = torch.where(hull, 1.0, -1.0)
+    labels = labels_from_hull(margin, hull, NOTHING, agreeing(legs))
+    assert labels[130, 137] == BACKGROUND
+    assert labels[130, 115] == PERHAPS_OBJECT
+
+
+def test_deep_inside_the_hull_parallax_is_enough_and_far_beyond_it_nothing_is(thing):
+    margin = torch.where(thing, 20.0, -20.0)
+    labels = labels_from_hull(margin, thing, NOTHING, agreeing(thing))
+    assert labels[130, 150] == OBJECT
+    unknown = torch.full((HEIGHT, WIDTH), torch.nan)
+    labels = labels_from_hull(margin, thing, NOTHING, unknown)
+    assert labels[130, 150] == PERHAPS_OBJECT
+    assert labels[10, 10] == BACKGROUND
+
+
+def test_what_does_not_show_the_plane_is_off_it_and_grains_are_not(thing):
+    grain = square(20, 20, 22, 22)
+    found = off_plane(agreeing(thing | grain))
+    assert found[130, 150]
+    assert not found[20:22, 20:22].any()
+    assert not off_plane(torch.full((HEIGHT, WIDTH), torch.nan)).any()
+
+
+def test_only_what_no_light_makes_of_the_plane_is_off_its_level(thing):
+    agreement = agreeing(thing)
+    assert not off_level(agreement).any()
+    agreement[100:160, 120:180] = -1
+    assert off_level(agreement)[130, 150]
+    assert not off_level(agreement)[90, 110]
+
+
+@pytest.mark.parametrize("seen_through", [False, True])
+def test_holes_are_filled_unless_the_plane_is_seen_through_them(thing, seen_through):
+    hole = square(140, 120, 160, 140)
+    cut = thing & ~hole
+    agreement = agreeing(thing & ~hole) if seen_through else agreeing(thing)
+    assert bool(filled(cut, agreement)[130, 150]) != seen_through
