@@ -21,7 +21,8 @@ from pimper_torch.io.photographs import load_views
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.silhouettes.find import FindSilhouettes, SilhouetteConfig
+from pimper_torch.silhouettes.find import FindSilhouettes
+from pimper_torch.silhouettes.settings import SilhouetteConfig
 
 
 def main() -> None:

@@ -41,7 +41,8 @@ from pimper_torch.records import (
 from pimper_torch.reporting import Observer
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours, TraceContours
-from pimper_torch.silhouettes.find import FindSilhouettes, SilhouetteConfig, masked
+from pimper_torch.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.silhouettes.settings import SilhouetteConfig
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
 

@@ -34,7 +34,8 @@ from pimper_torch.records import (
 from pimper_torch.reporting import Observer
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours
-from pimper_torch.silhouettes.find import FindSilhouettes, SilhouetteConfig, masked
+from pimper_torch.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.silhouettes.settings import SilhouetteConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

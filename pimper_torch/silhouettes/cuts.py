@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pimper_torch.records import Record, Silhouettes
+from pimper_torch.silhouettes.cues import Cues
 from pimper_torch.silhouettes.hull import margins, visual_hull
 from pimper_torch.silhouettes.opencv import (
     OBJECT,
@@ -17,8 +18,8 @@ from pimper_torch.silhouettes.opencv import (
     signed_distance,
     without_specks,
 )
-from pimper_torch.silhouettes.parallax import DISPUTED, plane_agreement
-from pimper_torch.silhouettes.pictures import Pictures, of_views
+from pimper_torch.silhouettes.parallax import DISPUTED
+from pimper_torch.silhouettes.pictures import of_views
 from pimper_torch.silhouettes.seeds import (
     filled,
     is_deep,
@@ -28,49 +29,13 @@ from pimper_torch.silhouettes.seeds import (
     off_level,
     off_plane,
 )
-from pimper_torch.silhouettes.supporting_plane import Fixation, Plane
+from pimper_torch.silhouettes.settings import SilhouetteDetails
 
-# Points of the object that a view must observe, in the median, to be seeded by them.
-_MIN_OBSERVED = 12
 _WELL = 2.0  # times as deep as is_deep asks for
 _CUTS = 2  # rounds of mixtures and cut inside GrabCut
 _SPECK = 2e-4  # fraction of the picture
 
 Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Cues(Record):
-    """What is known of the object before any view is cut.
-
-    Attributes:
-        pictures: At the working size.
-        object_px: Pixels of the object's points, one tensor a view.
-        background_px: Of points that are not the object's.
-        plane: That the object stands on.
-        agreement: With the plane's texture.
-        fixation: Where the cameras look.
-        box_world: The object is inside.
-    """
-
-    pictures: Pictures
-    object_px: tuple[Float[Tensor, "_ 2"], ...]
-    background_px: tuple[Float[Tensor, "_ 2"], ...]
-    plane: Plane | None
-    agreement: Float[Tensor, "view height width"] | None
-    fixation: Fixation
-    box_world: Float[Tensor, "2 3"]
-
-    @property
-    def num_views(self) -> int:
-        """How many views there are."""
-        return len(self.object_px)
-
-    @property
-    def has_points(self) -> bool:
-        """Whether views observe enough points of the object to be seeded by them."""
-        counts = torch.tensor([len(pixels) for pixels in self.object_px])
-        return int(counts.median()) >= _MIN_OBSERVED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -88,9 +53,7 @@ class Cuts(Record):
     on_plane: bool = False
 
 
-def cut_in_iterations(
-    cues: Cues, *, iterations: int, disagreeing: float, num_voxels: int
-) -> Cuts | None:
+def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
     """Cut every view, vote, and cut again from what the vote says.
 
     Before every vote the plane's texture is learned anew where the cuts do not hide it: holes
@@ -100,26 +63,18 @@ def cut_in_iterations(
         ``None`` where the cuts have nothing in common.
     """
     masks = _first(cues)
-    for _ in range(iterations):
-        cues = _with_plane_texture(cues, masks)
+    for _ in range(details.iterations):
+        cues = cues.relearned(masks)
         masks = _filled(cues, masks)
-        seen = _voted(cues, masks | _likely(cues), disagreeing, num_voxels)
+        seen = _voted(cues, masks | _likely(cues), details)
         if seen is None:
             return None
         masks = _again(cues, masks, seen)
-    masks = _filled(_with_plane_texture(cues, masks), masks)
-    seen = _voted(cues, masks, disagreeing, num_voxels)
+    masks = _filled(cues.relearned(masks), masks)
+    seen = _voted(cues, masks, details)
     if seen is None:
         return None
     return Cuts(masks=masks, margins_px=seen, on_plane=cues.plane is not None)
-
-
-def _with_plane_texture(cues: Cues, masks: Bool[Tensor, "view height width"]) -> Cues:
-    """Learn the plane's texture where the cuts do not hide it; elsewhere keep what was known."""
-    if cues.plane is None or cues.agreement is None:
-        return cues
-    found = plane_agreement(cues.pictures, cues.plane, cues.fixation, masks)
-    return cues.replace(agreement=torch.where(found.isnan(), cues.agreement, found))
 
 
 def _filled(
@@ -168,6 +123,16 @@ def _again(
     return of_views(again, cues.num_views)
 
 
+def cut_from(
+    colours: UInt8[Tensor, "height width 3"],
+    labels: UInt8[Tensor, "height width"],
+    meeting: Bool[Tensor, "height width"],
+) -> Bool[Tensor, "height width"]:
+    """Cut a picture by its labels; drop what is small or does not meet the object."""
+    cut = grab_cut(colours, labels, _CUTS)
+    return without_specks(cut, meeting, round(_SPECK * cut.numel()))
+
+
 def _cut(
     how: Cutter,
     cues: Cues,
@@ -201,7 +166,7 @@ def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
 
 
 def _voted(
-    cues: Cues, masks: Bool[Tensor, "view height width"], disagreeing: float, num_voxels: int
+    cues: Cues, masks: Bool[Tensor, "view height width"], details: SilhouetteDetails
 ) -> Float[Tensor, "view height width"] | None:
     """Build the hull above the plane, and see it in every view."""
     cameras = cues.pictures.cameras
@@ -209,7 +174,11 @@ def _voted(
         inside=masks.float(), reliable=torch.ones(len(masks), dtype=torch.bool), source="found"
     )
     hull = visual_hull(
-        silhouettes, cameras, cues.box_world, num_voxels=num_voxels, disagreeing=disagreeing
+        silhouettes,
+        cameras,
+        cues.box_world,
+        num_voxels=details.num_voxels,
+        disagreeing=details.disagreeing,
     )
     if hull is None:
         return None

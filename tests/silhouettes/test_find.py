@@ -8,14 +8,10 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.records import Silhouettes
 from pimper_torch.silhouettes import find
 from pimper_torch.silhouettes.cuts import Cuts
-from pimper_torch.silhouettes.find import (
-    FindSilhouettes,
-    SilhouetteConfig,
-    SilhouetteDetails,
-    masked,
-)
+from pimper_torch.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.silhouettes.parallax import plane_agreement
 from pimper_torch.silhouettes.pictures import working_pictures
+from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.silhouettes.supporting_plane import Plane, fixation, supporting_plane
 
 SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)

@@ -1,0 +1,102 @@
+"""What is known of the object before any view is cut."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.records import Record, SparseScene
+from pimper_torch.silhouettes.cloud import pixels_seen, split_cloud
+from pimper_torch.silhouettes.parallax import plane_agreement
+from pimper_torch.silhouettes.pictures import Pictures, working_pictures
+from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.silhouettes.supporting_plane import (
+    Fixation,
+    Plane,
+    fixation,
+    supporting_plane,
+    well_tracked,
+)
+
+_BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
+# Points of the object that a view must observe, in the median, to be seeded by them.
+_MIN_OBSERVED = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Cues(Record):
+    """What is known of the object before any view is cut.
+
+    Attributes:
+        pictures: At the working size.
+        object_px: Pixels of the object's points, one tensor a view.
+        background_px: Of points that are not the object's.
+        plane: That the object stands on.
+        agreement: With the plane's texture.
+        fixation: Where the cameras look.
+        box_world: The object is inside.
+    """
+
+    pictures: Pictures
+    object_px: tuple[Float[Tensor, "_ 2"], ...]
+    background_px: tuple[Float[Tensor, "_ 2"], ...]
+    plane: Plane | None
+    agreement: Float[Tensor, "view height width"] | None
+    fixation: Fixation
+    box_world: Float[Tensor, "2 3"]
+
+    @property
+    def num_views(self) -> int:
+        """How many views there are."""
+        return len(self.object_px)
+
+    @property
+    def has_points(self) -> bool:
+        """Whether views observe enough points of the object to be seeded by them."""
+        counts = torch.tensor([len(pixels) for pixels in self.object_px])
+        return int(counts.median()) >= _MIN_OBSERVED
+
+    def relearned(self, masks: Bool[Tensor, "view height width"]) -> "Cues":
+        """Learn the plane's texture anew where cuts do not hide it, and keep it elsewhere."""
+        if self.plane is None or self.agreement is None:
+            return self
+        found = plane_agreement(self.pictures, self.plane, self.fixation, masks)
+        return self.replace(agreement=torch.where(found.isnan(), self.agreement, found))
+
+
+def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDetails) -> Cues:
+    """Gather what is known of the object from photographs, cameras and cloud.
+
+    Args:
+        scene: Of the photographs' size.
+        config: Settings.
+        details: Settings that are the same for all photographs.
+    """
+    scene = scene.to("cpu", torch.float32)
+    pictures = working_pictures(scene.views, scene.cameras, config.size_px)
+    cameras, points = pictures.cameras, scene.points_world
+    focus = fixation(cameras)
+    tolerance = details.plane_tolerance * float(focus.distance)
+    plane = supporting_plane(
+        points[well_tracked(scene)],
+        cameras,
+        tolerance=tolerance,
+        min_on=details.min_on_plane,
+        max_below=details.max_below_plane,
+        generator=torch.Generator().manual_seed(details.seed),
+    )
+    region = (
+        torch.tensor(config.region, dtype=torch.float32).reshape(2, 3) if config.region else None
+    )
+    cloud = split_cloud(scene, focus, plane, tolerance, region)
+    half, centre = _BOX * focus.distance, focus.fixation_world
+    return Cues(
+        pictures=pictures,
+        object_px=tuple(pixels_seen(scene, cameras, cloud.on_object)),
+        background_px=tuple(pixels_seen(scene, cameras, cloud.background)),
+        plane=plane,
+        agreement=None if plane is None else plane_agreement(pictures, plane, focus),
+        fixation=focus,
+        box_world=torch.stack([centre - half, centre + half]) if region is None else region,
+    )

@@ -1,0 +1,63 @@
+"""Settings of finding and correcting silhouettes."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pimper_torch.config import require
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SilhouetteConfig:
+    """Settings of :class:`FindSilhouettes`.
+
+    Attributes:
+        object: Find silhouettes and fall back to everything (``auto``), take the masks that come
+            with the photographs (``masks``), or take all that the photographs show for the object
+            (``everything``), as for walls, height fields and scenes. Masks that are given are
+            believed by ``auto``, too.
+        region: Box that the object is inside: smallest x, y, z, then largest, scene units; none
+            unless given.
+        size_px: Longer side of the pictures that are cut.
+    """
+
+    object: Literal["auto", "masks", "everything"] = "auto"
+    region: tuple[float, ...] = ()
+    size_px: int = 640
+
+    def __post_init__(self) -> None:
+        require(self.size_px >= 64, "size_px", self.size_px, "64 or more")
+        low, high = self.region[:3], self.region[3:]
+        fits = len(self.region) in (0, 6) and all(a < b for a, b in zip(low, high, strict=True))
+        require(fits, "region", self.region, "nothing, or smallest x, y, z, then largest")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SilhouetteDetails:
+    """What of :class:`FindSilhouettes` is the same for all photographs.
+
+    Chosen on the four rendered scenes and the skull (``benchmarks/silhouettes.py``).
+
+    Attributes:
+        iterations: Of cutting and voting after the first cut.
+        num_voxels: Of the visual hull.
+        disagreeing: Fraction of the views that may see a voxel of the hull outside.
+        plane_tolerance: Distance up to which a point lies on the supporting plane, as a fraction of
+            the cameras' distance.
+        min_on_plane: Fraction of the points that lie on it.
+        max_below_plane: Fraction of the points that may lie below it.
+        min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
+            view is not reliable.
+        min_overlap: Intersection over union of silhouettes and projections, in the median, below
+            which silhouettes are not reliable.
+        seed: Of the plane's trials.
+    """
+
+    iterations: int = 2
+    num_voxels: int = 500_000
+    disagreeing: float = 0.05
+    plane_tolerance: float = 0.004
+    min_on_plane: float = 0.08
+    max_below_plane: float = 0.05
+    min_covered: float = 0.9
+    min_overlap: float = 0.8
+    seed: int = 0
