@@ -25,6 +25,7 @@ from pimper_torch.memory import bytes_of, release_memory, require_memory
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.repair import Repair
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.patches.sources import Sources
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.radiometry import Encoding
@@ -32,6 +33,8 @@ from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     Mesh,
+    PatchSet,
+    Record,
     Silhouettes,
     SparseScene,
     Surface,
@@ -41,9 +44,15 @@ from pimper_torch.records import (
 from pimper_torch.reporting import Observer
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours, TraceContours
+from pimper_torch.silhouettes.correct import CorrectSilhouettes, change
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.silhouettes.settings import SilhouetteConfig
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
+
+# Change of a view's silhouette, one less intersection over union, above which the coarse surface is
+# made again. The armadillo of one colour, 24 views of 800x600, where it was 0.022: accuracy
+# 1.11 -> 0.88 % of the diagonal, normals 15.6 -> 14.2 degrees; later passes alone do not get there.
+_MOVED = 0.015
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +91,21 @@ class CoarseToFineConfig:
         require(sound, "scales", self.scales, "one at least, above 0 each")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Confined(Record):
+    """The scene as silhouettes confine it.
+
+    Attributes:
+        scene: Photographs, masked, with cameras and cloud.
+        silhouettes: Of all views.
+        contours: What they say about the surface.
+    """
+
+    scene: SparseScene
+    silhouettes: Silhouettes
+    contours: Contours
+
+
 class CoarseToFine(Chain):
     """A closed surface of what all views see, remeshed and fused again at every scale.
 
@@ -100,6 +124,9 @@ class CoarseToFine(Chain):
         super().__init__(config.kernels, observer)
         self.reconstruct = Reconstruct(config.reconstruct, cache)
         self.silhouettes = FindSilhouettes(config.silhouettes)
+        self.correct: Callable[[SparseScene, Silhouettes, Mesh], Silhouettes] = CorrectSilhouettes(
+            config.silhouettes
+        )
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
         self.coarse_surface: Callable[[SparseScene, Contours, Mesh | None], CoarseMesh] = (
             CoarseSurface(config.coarse_surface)
@@ -117,40 +144,69 @@ class CoarseToFine(Chain):
     def passes(
         self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
-        """Run the stages behind the coarse mesh once a scale."""
-        scene = self.placed(views, sparse_model)
-        silhouettes = self.silhouettes(scene)
-        scene = masked(scene, silhouettes)
-        cameras = scene.cameras
-        contours = self.contours(silhouettes, cameras)
-        coarse = self.coarse_surface(scene, contours, mesh)
-        sources = self.warp.prepare(scene.views) if isinstance(self.warp, Prepares) else None
+        """Run the stages behind the coarse mesh once a scale.
+
+        The first pass runs again where the surface that it gives corrects the silhouettes.
+        """
+        placed = self.placed(views, sparse_model)
+        confined = self._confined(placed, self.silhouettes(placed))
+        coarse = self.coarse_surface(confined.scene, confined.contours, mesh)
+        sources = self._sources(confined.scene.views)
         heights: SweptPatches | None = None
         surface: Surface | None = None
         first, last = self.config.scales[0], len(self.config.scales)
         for number, scale in enumerate(self.config.scales, start=1):
             with held() as cautions:
                 if heights is not None and surface is not None:
-                    coarse = self.remesh(heights, surface, contours)
-                patches = self.decompose(coarse, cameras, surface, scale)
+                    coarse = self.remesh(heights, surface, confined.contours)
+                patches = self.decompose(coarse, placed.cameras, surface, scale)
                 if number == 1:
                     limit = bytes_of(self.config.max_memory)
                     require_memory(limit, patches, first, self.config.scales[-1])
-                heights = photometry_and_heights(
-                    self.warp, self.factorize, self.sweep, scene.views, cameras, patches, sources
-                )
-                if number == last:
-                    sources = None  # as much memory as the photographs themselves
+                heights = self._heights(confined.scene, patches, sources)
+                if number == last > 1:
+                    sources = None  # as large as the photographs
                 release_memory()
-                surface = self.repair(self.fuse(heights, contours, number == last))
+                surface = self.repair(self.fuse(heights, confined.contours, number == last))
+                if number == 1:
+                    before = confined.silhouettes
+                    corrected = self.correct(placed, before, surface.mesh)
+                    if change(before, corrected) > _MOVED:
+                        confined = self._confined(placed, corrected)
+                        coarse = self.coarse_surface(confined.scene, confined.contours, mesh)
+                        sources = self._sources(confined.scene.views)
+                        patches = self.decompose(coarse, placed.cameras, None, scale)
+                        heights = self._heights(confined.scene, patches, sources)
+                        surface = self.repair(self.fuse(heights, confined.contours, last == 1))
             if number == last:  # what earlier passes would warn of as well
                 for message in cautions:
                     caution(message, stacklevel=3)
             yield Step(
                 scale=scale,
                 last=number == last,
-                scene=scene,
-                silhouettes=silhouettes,
+                scene=confined.scene,
+                silhouettes=confined.silhouettes,
                 heights=heights,
                 surface=surface,
             )
+
+    def _confined(self, placed: SparseScene, silhouettes: Silhouettes) -> _Confined:
+        """Confine the scene to what silhouettes show."""
+        scene = masked(placed, silhouettes)
+        return _Confined(
+            scene=scene,
+            silhouettes=silhouettes,
+            contours=self.contours(silhouettes, scene.cameras),
+        )
+
+    def _sources(self, views: Views) -> Sources | None:
+        """Prepare photographs for the warp, if it wants them so."""
+        return self.warp.prepare(views) if isinstance(self.warp, Prepares) else None
+
+    def _heights(
+        self, scene: SparseScene, patches: PatchSet, sources: Sources | None
+    ) -> SweptPatches:
+        """Give normals, albedo, light and swept heights of all patches."""
+        return photometry_and_heights(
+            self.warp, self.factorize, self.sweep, scene.views, scene.cameras, patches, sources
+        )

@@ -46,8 +46,8 @@ class CorrectSilhouettes(Stage):
             mesh: The surface, in the scene's frame.
 
         Returns:
-            Silhouettes that were found, corrected; masks that a person gave, and everything, as
-            they are.
+            Silhouettes that were found, corrected in the views whose new cut the surface confirms;
+            masks that a person gave, and everything, as they are.
         """
         if silhouettes.source != "found":
             return silhouettes
@@ -70,7 +70,19 @@ class CorrectSilhouettes(Stage):
             margins_px=of_views(lambda view: signed_distance(seen[view]), cues.num_views),
             on_plane=cues.plane is not None,
         )
-        return silhouettes_of(cuts, scene.views, self.details.min_covered)
+        corrected = silhouettes_of(cuts, scene.views, self.details.min_covered)
+        confirmed = corrected.reliable
+        return silhouettes.replace(
+            inside=torch.where(confirmed[:, None, None], corrected.inside, silhouettes.inside),
+            reliable=silhouettes.reliable | confirmed,
+        )
+
+
+def change(before: Silhouettes, after: Silhouettes) -> float:
+    """Give one less the intersection over union of the silhouette that changed most."""
+    one, other = before.masks.flatten(1), after.masks.flatten(1)
+    either = (one | other).sum(dim=1)
+    return float(1 - ((one & other).sum(dim=1) / either.clamp_min(1)).where(either > 0, 1).amin())
 
 
 def projections(
