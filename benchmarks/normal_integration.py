@@ -23,8 +23,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.evidence.datasets.diligent import NormalMap, read_normal_map
 from pimper_torch.evidence.metrics.maps import mean_absolute_depth_error
-from pimper_torch.linalg.rasters import RasterSystem
 from pimper_torch.single_view.integration.normal_map import IntegratedMap, integrate_normal_map
+from pimper_torch.single_view.integration.rasters import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
 PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1": 0.635}

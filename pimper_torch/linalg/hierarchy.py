@@ -45,11 +45,6 @@ _CENTER, _RADIUS = 1 + 1 / _SPAN, 1 - 1 / _SPAN
 _GAIN = 1 / (2 * _CENTER / _RADIUS - _RADIUS / _CENTER)
 _OF_STEP, _OF_REST = 1 + _GAIN * _RADIUS / _CENTER, 2 * _GAIN / _RADIUS
 
-# Coarse levels of other values are kept if none of them has left this factor. Measured: noise
-# of a factor 1.26 (one sigma) on weights over 8 decades takes 27 cycles instead of 16; one new
-# strong tie in a thousand makes all that is kept useless.
-_KEPT_FACTOR = 2.0
-
 
 class Level:
     """A matrix, how to smooth it and how to reach the next one.
@@ -311,13 +306,6 @@ def torch_product(matrix: csr_array, device: torch.device) -> Product:
             check_invariants=False,
         ).to(device)
     return lambda vector: moved @ vector
-
-
-def may_keep(new: Float[Tensor, "..."], old: Float[Tensor, "..."]) -> bool:
-    """Tell whether a hierarchy made from ``old`` entries serves for ``new`` ones."""
-    ordered = torch.minimum(new.abs(), old.abs()), torch.maximum(new.abs(), old.abs())
-    same_signs = bool((new.sign() == old.sign()).all())
-    return same_signs and bool((ordered[1] <= _KEPT_FACTOR * ordered[0]).all())
 
 
 def _columns(vectors: Float[Tensor, "unknown ..."]) -> np.ndarray:

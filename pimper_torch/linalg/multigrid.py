@@ -2,23 +2,20 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 from torch import Tensor
 
-from pimper_torch.linalg.adjoint import solve_adjointly
-from pimper_torch.linalg.aggregation import dominant_diagonal
 from pimper_torch.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
 from pimper_torch.linalg.hierarchy import (
     Hierarchy,
     Product,
-    may_keep,
     sparse_product,
     with_product,
 )
-from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
+from pimper_torch.linalg.prepared import PreparedMatrix
+from pimper_torch.linalg.singular import WORST_RESIDUAL, SingularSystemError
 
 # Of the error's energy norm next to the solution's. A digit costs one to two cycles.
 DEFAULT_TOLERANCE = 1e-10
@@ -26,12 +23,9 @@ DEFAULT_TOLERANCE = 1e-10
 # The hardest systems of the benchmark take 25 cycles.
 _MAX_CYCLES = 300
 
-# An answer whose residual, with the diagonal scaled to 1, is larger next to the right-hand
-# side than this is no answer; the same bound as that of SparseCholesky.
-_WORST_MISFIT = 1e-6
-
-# Who asks for less gets residuals of so many times the error at most.
-_MISFIT_TOLERANCES = 10.0
+# Residual, in tolerances, that is accepted where a larger error was asked for: a choice, as the
+# hierarchy only estimates the energy norm that the tolerance bounds.
+_RESIDUAL_TOLERANCES = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,9 +139,8 @@ def _checked(
     found, cycles, converged = reached
     scale = diagonal.rsqrt().reshape(-1, *[1] * (rhs.ndim - 1))
     size = (scale * rhs).norm(dim=0)
-    misfit = (scale * residual).norm(dim=0)
-    fraction = float((misfit / torch.where(size > 0, size, 1)).max())
-    worst = max(_WORST_MISFIT, _MISFIT_TOLERANCES * tolerance)
+    fraction = float(((scale * residual).norm(dim=0) / torch.where(size > 0, size, 1)).max())
+    worst = max(WORST_RESIDUAL, _RESIDUAL_TOLERANCES * tolerance)
     if not (fraction < worst and converged):
         raise SingularSystemError(
             f"{what} ({len(rhs)} unknowns) did not converge: after {cycles} iterations of "
@@ -159,24 +152,20 @@ def _checked(
     return Iterate(values=found, iterations=cycles, residual=fraction)
 
 
-class Multigrid:
-    r"""A hierarchy for a sparse matrix, ready for any number of right-hand sides.
+class Multigrid(PreparedMatrix):
+    r"""A hierarchy for a sparse matrix; arguments as for its base, and the tolerance.
 
     What :class:`~pimper_torch.linalg.sparse.SparseCholesky` is for some 100,000 unknowns on
     the CPU, this is for millions, and on CUDA: memory and time grow with the unknowns only.
     Made for graph Laplacians and their like, whose off-diagonal entries are mostly negative.
 
     Args:
-        rows: Row of each entry; entries named twice add up.
-        cols: Column of each entry.
-        values: Of the entries; solutions are differentiable in them.
-        size: Rows of the square matrix.
-        what: Names the system in errors.
+        rows: See :class:`~pimper_torch.linalg.prepared.PreparedMatrix`.
+        cols: The same.
+        values: The same.
+        size: The same.
+        what: The same.
         tolerance: Of the error, in the energy norm, relative.
-
-    Raises:
-        SingularSystemError: Entries that are not finite, or an unknown without a positive
-            diagonal.
 
     >>> index = torch.tensor([0, 1])
     >>> grid = Multigrid(index, index, torch.tensor([2.0, 4.0]), size=2)
@@ -193,28 +182,14 @@ class Multigrid:
         what: str = "the linear system",
         tolerance: float = DEFAULT_TOLERANCE,
     ) -> None:
-        self.rows, self.cols, self._origin = rows, cols, values.detach()
-        self._size, self._what, self._tolerance = size, what, tolerance
-        matrix = _compressed(rows, cols, values, size)
-        self._take(matrix, values)
-        self._hierarchy = Hierarchy(matrix, values.device)
+        super().__init__(rows, cols, values, size, what)
+        self._tolerance = tolerance
+        self._diagonal = self._diagonal.to(values.device)
+        self._product = sparse_product(self._matrix, values.device)
+        self._hierarchy = Hierarchy(self._matrix, values.device)
 
-    def solve(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
-        """Solve for one right-hand side or several at once.
-
-        Differentiable in ``rhs`` and in the matrix's ``values``, any number of times.
-
-        Raises:
-            SingularSystemError: No convergence, with iterations and residual.
-        """
-        return solve_adjointly(self, self._values, rhs)
-
-    def iterate(
-        self,
-        rhs: Float[Tensor, "unknown ..."],
-        start: Float[Tensor, "unknown ..."] | None = None,
-    ) -> Iterate:
-        """Solve and say how; not differentiable."""
+    def iterate(self, rhs: Float[Tensor, "unknown ..."]) -> Iterate:
+        """Solve and report the iterations; not differentiable."""
         with torch.no_grad():
             return solve_with_hierarchy(
                 self._product,
@@ -223,47 +198,11 @@ class Multigrid:
                 rhs.detach().to(self._diagonal),
                 self._tolerance,
                 self._what,
-                None if start is None else start.detach().to(self._diagonal),
             )
 
     def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         """Solve without a trace for autograd."""
         if rhs.numel() == 0:
             return rhs.clone()
-        columns = rhs if rhs.ndim == 1 else rhs.reshape(self._size, -1)
+        columns = rhs if rhs.ndim == 1 else rhs.reshape(len(rhs), -1)
         return self.iterate(columns).values.reshape(rhs.shape).to(rhs)
-
-    def refreshed(self, values: Float[Tensor, " entry"]) -> "Multigrid":
-        """Prepare the matrix with other values of the same entries.
-
-        Coarse levels are kept while every value is within a factor two of the one they were
-        made from; else this is as a new matrix.
-        """
-        new, old = values.detach(), self._origin
-        if not may_keep(new, old.to(new)):
-            return Multigrid(self.rows, self.cols, values, self._size, self._what, self._tolerance)
-        other = object.__new__(Multigrid)
-        other.__dict__.update(self.__dict__)
-        matrix = _compressed(self.rows, self.cols, values, self._size)
-        other._take(matrix, values)
-        dominant = torch.from_numpy(dominant_diagonal(matrix)).to(values.device)
-        other._hierarchy = self._hierarchy.with_product(other._product, dominant)
-        return other
-
-    def _take(self, matrix: csr_array, values: Float[Tensor, " entry"]) -> None:
-        diagonal = torch.from_numpy(matrix.diagonal())
-        refuse_hopeless(torch.from_numpy(matrix.data), diagonal, self._what)
-        self._values = values
-        self._diagonal = diagonal.to(values.device)
-        self._product = sparse_product(matrix, values.device)
-
-
-def _compressed(
-    rows: Int[Tensor, " entry"],
-    cols: Int[Tensor, " entry"],
-    values: Float[Tensor, " entry"],
-    size: int,
-) -> csr_array:
-    place = (rows.cpu().numpy().astype(np.int32), cols.cpu().numpy().astype(np.int32))
-    numbers = values.detach().double().cpu().numpy()
-    return coo_array((numbers, place), shape=(size, size)).tocsr()

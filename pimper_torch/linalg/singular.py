@@ -6,6 +6,10 @@ from torch import Tensor
 
 from pimper_torch.errors import PimperError
 
+# An answer whose residual, with the diagonal scaled to 1, is larger than this next to the
+# right-hand side is refused: a choice, far above rounding and far below any noise of the data.
+WORST_RESIDUAL = 1e-6
+
 
 class SingularSystemError(PimperError):
     """Linear equations that do not determine their unknowns."""

@@ -1,7 +1,6 @@
 """One door to the solvers of sparse matrices: whichever suits size and device."""
 
 from contextlib import suppress
-from typing import Literal
 
 import numpy as np
 import torch
@@ -34,10 +33,12 @@ def prepare(
     size: int,
     what: str = "the linear system",
     *,
-    method: Literal["auto", "cholesky", "multigrid"] = "auto",
     tolerance: float = DEFAULT_TOLERANCE,
 ) -> SparseCholesky | Multigrid:
     """Prepare a sparse symmetric positive definite matrix for any number of solves.
+
+    Multigrid serves more than 50,000 unknowns whose couplings are mostly negative, as those of
+    Laplacians are, and sparse Cholesky all others.
 
     Args:
         rows: Row of each entry; entries named twice add up.
@@ -45,8 +46,6 @@ def prepare(
         values: Of the entries; solutions are differentiable in them.
         size: Rows of the square matrix.
         what: Names the system in errors.
-        method: ``"auto"`` takes multigrid for more than 50,000 unknowns whose couplings are
-            mostly negative, as those of Laplacians are, and sparse Cholesky for the rest.
         tolerance: Of multigrid: of the error, in the energy norm, relative.
 
     Returns:
@@ -56,9 +55,7 @@ def prepare(
         SingularSystemError: See :class:`~pimper_torch.linalg.sparse.SparseCholesky` and
             :class:`~pimper_torch.linalg.multigrid.Multigrid`.
     """
-    if method == "multigrid" or (
-        method == "auto" and size > _CHOLESKY_UNKNOWNS and _like_a_laplacian(rows, cols, values)
-    ):
+    if size > _CHOLESKY_UNKNOWNS and _like_a_laplacian(rows, cols, values):
         return Multigrid(rows, cols, values, size, what, tolerance)
     return SparseCholesky(rows, cols, values, size, what)
 

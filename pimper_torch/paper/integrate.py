@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.config import require
-from pimper_torch.geometry.filling import fill_smoothly
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.geometry.surfaces import slopes_from_normals
-from pimper_torch.linalg.poisson import integrate_weighted
+from pimper_torch.paper.filling import fill_smoothly
+from pimper_torch.paper.poisson import integrate_weighted
 from pimper_torch.progress import track
 from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
 from pimper_torch.records.patches import Photometry, Templates

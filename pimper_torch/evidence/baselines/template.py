@@ -17,12 +17,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.filling import fill_smoothly
 from pimper_torch.geometry.frames import invert_rigid, rigid, rotate, transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.meshing.extract import large_components
+from pimper_torch.paper.filling import fill_smoothly
 from pimper_torch.patches.decompose import sample_spacing
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.progress import track

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.linalg.sparse import scatter_blocks, solve_spd
+from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import Record
 
 
@@ -171,5 +171,28 @@ def solve_transforms(
         torch.cat([every, second, first]),
         torch.cat([diagonal, cross, cross.mT]),
     )
-    found = solve_spd(rows, cols, values, rhs.reshape(-1), what="the alignment of the patches")
+    factor = SparseCholesky(rows, cols, values, rhs.numel(), "the alignment of the patches")
+    found = factor.solve(rhs.reshape(-1))
     return fixed.index_copy(1, free, found.reshape(len(transforms), -1))
+
+
+def scatter_blocks(
+    block_rows: Int[Tensor, " block"],
+    block_cols: Int[Tensor, " block"],
+    blocks: Float[Tensor, "block unknown unknown"],
+) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
+    """Spread small dense blocks into the entries of a sparse matrix.
+
+    Args:
+        block_rows: Which block row each block stands in.
+        block_cols: Which block column.
+        blocks: Square, all of one size.
+
+    Returns:
+        Rows, columns and values for :class:`SparseCholesky`; duplicates are left to it.
+    """
+    side = blocks.shape[-1]
+    within = torch.arange(side, device=blocks.device)
+    rows = (side * block_rows[:, None, None] + within[:, None]).expand(blocks.shape)
+    cols = (side * block_cols[:, None, None] + within).expand(blocks.shape)
+    return rows.reshape(-1), cols.reshape(-1), blocks.reshape(-1)

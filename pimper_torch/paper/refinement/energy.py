@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_pairs
-from pimper_torch.linalg.meshes import (
+from pimper_torch.paper.refinement.finite_elements import (
     Elements,
     cotangent_laplacian,
     elements,

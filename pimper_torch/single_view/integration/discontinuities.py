@@ -28,10 +28,10 @@ from torch import Tensor
 
 from pimper_torch.config import require
 from pimper_torch.linalg.multigrid import Iterate
-from pimper_torch.linalg.poisson import differences, differences_transposed
-from pimper_torch.linalg.rasters import Method, RasterSystem
+from pimper_torch.paper.poisson import differences, differences_transposed
 from pimper_torch.progress import report
 from pimper_torch.records import Convergence, Record, StopCause
+from pimper_torch.single_view.integration.rasters import Method, RasterSystem
 from pimper_torch.single_view.integration.steps import Steps
 
 # The first scale, in pixels, and by how much each round divides it.

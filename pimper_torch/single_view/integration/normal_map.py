@@ -13,8 +13,6 @@ from torch.nn.functional import avg_pool2d, pad
 
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.geometry.pixels import crop_intrinsics
-from pimper_torch.linalg.rasters import Method as Solver
-from pimper_torch.linalg.rasters import RasterSystem
 from pimper_torch.records import Record
 from pimper_torch.single_view.integration.discontinuities import (
     Continuity,
@@ -22,6 +20,8 @@ from pimper_torch.single_view.integration.discontinuities import (
     find_discontinuities,
 )
 from pimper_torch.single_view.integration.frankot_chellappa import integrate_fourier
+from pimper_torch.single_view.integration.rasters import Method as Solver
+from pimper_torch.single_view.integration.rasters import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
 Raster = Tensor | np.ndarray

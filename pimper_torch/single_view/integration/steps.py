@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.geometry.filling import fill_smoothly
 from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.paper.filling import fill_smoothly
 from pimper_torch.records import Record
 
 # Cosine between ray and normal below which a slope is nothing but rounding.

@@ -6,6 +6,7 @@ from pimper_torch.paper.alignment.system import (
     Pulls,
     curvature_along,
     mismatches,
+    scatter_blocks,
     seam_stiffness,
     solve_transforms,
 )
@@ -128,3 +129,13 @@ def test_two_height_fields_of_one_sphere_are_met_in_the_same_points(
     # Bilinear samples 0.02 apart on a curvature of 0.5: h^2/8 times twice that.
     assert apart.max() < 2e-4
     assert_close(from_center, torch.full_like(from_center, 2.0), atol=1e-4, rtol=0)
+
+
+def test_blocks_land_where_kronecker_puts_them(generator):
+    blocks = torch.randn(3, 2, 2, generator=generator, dtype=torch.float64)
+    rows, cols, values = scatter_blocks(torch.tensor([0, 2, 2]), torch.tensor([1, 0, 0]), blocks)
+    expected = torch.zeros(6, 6, dtype=torch.float64)
+    expected[0:2, 2:4] = blocks[0]
+    expected[4:6, 0:2] = blocks[1] + blocks[2]
+    dense = torch.zeros(6, 6, dtype=torch.float64)
+    assert_close(dense.index_put((rows, cols), values, accumulate=True), expected)

@@ -6,9 +6,9 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
-from pimper_torch.linalg.rasters import RasterSystem
 from pimper_torch.single_view.integration.discontinuities import DiscontinuityConfig
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map
+from pimper_torch.single_view.integration.rasters import RasterSystem
 from pimper_torch.single_view.integration.steps import orthographic_steps
 
 ALL = ["discontinuities", "weighted", "cosine", "frankot-chellappa"]

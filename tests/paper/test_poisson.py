@@ -3,7 +3,7 @@ import scipy.fft
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.linalg.poisson import (
+from pimper_torch.paper.poisson import (
     cosine_basis,
     differences,
     differences_transposed,

@@ -1,12 +1,12 @@
-"""Parts of a raster that hang together without any anchor: each has a free constant."""
+"""Connected components of a raster without any anchor: each has a free constant."""
 
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
+
+from pimper_torch.geometry.components import graph_components
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +54,8 @@ def free_components(
     """Find the components without anchor; a pixel without any edge is none.
 
     Args:
-        right: Whether a pixel and the next in its row hang together.
-        down: Whether it and the one below do.
+        right: Whether a pixel and the next in its row are connected.
+        down: Whether it and the one below are.
         anchored: Whether a pixel's height is known.
     """
     label = _labels(right, down, anchored.shape)
@@ -86,8 +86,6 @@ def _labels(
         return torch.zeros(count, dtype=torch.long, device=right.device)
     pixel = torch.arange(count, dtype=torch.int32).reshape(shape)
     across, along = right.cpu(), down.cpu()
-    one = torch.cat([pixel[:, :-1][across], pixel[:-1][along]]).numpy()
-    other = torch.cat([pixel[:, 1:][across], pixel[1:][along]]).numpy()
-    graph = coo_array((one >= 0, (one, other)), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    return torch.from_numpy(label).long().to(right.device)
+    one = torch.cat([pixel[:, :-1][across], pixel[:-1][along]])
+    other = torch.cat([pixel[:, 1:][across], pixel[1:][along]])
+    return graph_components(torch.stack([one, other], dim=1), count).long().to(right.device)

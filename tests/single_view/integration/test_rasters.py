@@ -9,9 +9,10 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.linalg import hierarchy
-from pimper_torch.linalg.poisson import differences, differences_transposed
-from pimper_torch.linalg.rasters import RasterSystem
 from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.paper.poisson import differences, differences_transposed
+from pimper_torch.single_view.integration.rasters import RasterSystem
+from pimper_torch.single_view.integration.stencil import may_keep
 
 
 @dataclass(frozen=True)
@@ -399,3 +400,12 @@ def test_cuda_gives_what_the_cpu_gives(weighted, generator):
     moved = [part.cuda() for part in (weighted.right, weighted.down, weighted.anchor)]
     found = RasterSystem(*moved, method="multigrid").solve(source.cuda())
     assert_close(found.cpu(), expected, atol=1e-5, rtol=0)
+
+
+def test_levels_are_kept_only_for_values_near_those_they_were_made_from():
+    old = torch.tensor([1.0, -2.0, 0.0, 1e-8])
+    assert may_keep(torch.tensor([1.9, -1.1, 0.0, 1.5e-8]), old)
+    for place, value in ((0, 2.1), (1, -0.9), (1, 2.0), (2, 1e-9), (3, 0.0)):
+        new = old.clone()
+        new[place] = value
+        assert not may_keep(new, old)

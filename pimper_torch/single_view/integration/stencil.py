@@ -13,10 +13,15 @@ from jaxtyping import Float
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from pimper_torch.linalg.hierarchy import Hierarchy, may_keep
+from pimper_torch.linalg.hierarchy import Hierarchy
 from pimper_torch.linalg.multigrid import Iterate, solve_with_hierarchy
-from pimper_torch.linalg.poisson import solve_poisson
 from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.paper.poisson import solve_poisson
+
+# Coarse levels of other values are kept if none of them has left this factor. Measured: noise
+# of a factor 1.26 (one sigma) on weights over 8 decades takes 27 cycles instead of 16; one new
+# strong tie in a thousand makes all that is kept useless.
+_KEPT_FACTOR = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,3 +183,10 @@ class MultigridRaster:
             stencil.product, stencil.diagonal.reshape(-1)
         )
         return other
+
+
+def may_keep(new: Float[Tensor, "..."], old: Float[Tensor, "..."]) -> bool:
+    """Tell whether a hierarchy made from ``old`` entries serves for ``new`` ones."""
+    ordered = torch.minimum(new.abs(), old.abs()), torch.maximum(new.abs(), old.abs())
+    same_signs = bool((new.sign() == old.sign()).all())
+    return same_signs and bool((ordered[1] <= _KEPT_FACTOR * ordered[0]).all())

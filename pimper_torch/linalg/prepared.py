@@ -1,0 +1,92 @@
+"""What factors and hierarchies share: assembly of the matrix, and gradients of solutions."""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from torch import Tensor
+
+from pimper_torch.linalg.singular import refuse_hopeless
+
+
+class PreparedMatrix(ABC):
+    r"""A sparse symmetric positive definite matrix, ready for any number of right-hand sides.
+
+    :math:`A_{ij} = \sum_{k: (r_k, c_k) = (i, j)} v_k`: entries named twice add up, as they do
+    when normal equations are collected term by term. Both triangles must be given.
+
+    Args:
+        rows: Row of each entry.
+        cols: Column of each entry.
+        values: Of the entries; solutions are differentiable in them.
+        size: Rows of the square matrix.
+        what: Names the system in errors, such as ``"the alignment"``.
+
+    Raises:
+        SingularSystemError: Entries that are not finite, or an unknown without a positive
+            diagonal.
+    """
+
+    def __init__(
+        self,
+        rows: Int[Tensor, " entry"],
+        cols: Int[Tensor, " entry"],
+        values: Float[Tensor, " entry"],
+        size: int,
+        what: str = "the linear system",
+    ) -> None:
+        self.rows, self.cols, self._values, self._what = rows, cols, values, what
+        index = tuple(part.cpu().numpy().astype(np.int32) for part in (rows, cols))
+        entries = values.detach().double().cpu().numpy()
+        self._matrix = coo_array((entries, index), shape=(size, size)).tocsr()
+        self._diagonal = torch.from_numpy(self._matrix.diagonal())
+        refuse_hopeless(torch.from_numpy(self._matrix.data), self._diagonal, what)
+
+    def solve(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+        """Solve for one right-hand side or several at once.
+
+        Differentiable in ``rhs`` and in the matrix's ``values``, any number of times, by adjoint
+        solves with the same preparation. A gradient with respect to ``values`` treats the
+        entries as free; used through a symmetric assembly it is exact.
+
+        Raises:
+            SingularSystemError: The solution does not satisfy the equations to 1e-6 of the
+                right-hand side, or the right-hand side is not finite.
+        """
+        solution: Tensor = _Solve.apply(self, self._values, rhs)  # type: ignore[no-untyped-call]
+        return solution
+
+    @abstractmethod
+    def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+        """Solve without a trace for autograd, with the same errors; in device and dtype of rhs."""
+
+
+class _Solve(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
+        prepared: PreparedMatrix,
+        values: Float[Tensor, " entry"],
+        rhs: Float[Tensor, "unknown ..."],
+    ) -> Float[Tensor, "unknown ..."]:
+        solution = prepared.solve_values(rhs.detach())
+        ctx.prepared = prepared
+        ctx.save_for_backward(values, solution)
+        return solution
+
+    @staticmethod
+    def backward(
+        ctx: Any,  # noqa: ANN401
+        upstream: Float[Tensor, "unknown ..."],
+    ) -> tuple[None, Float[Tensor, " entry"] | None, Float[Tensor, "unknown ..."]]:
+        values, solution = ctx.saved_tensors
+        prepared: PreparedMatrix = ctx.prepared
+        adjoint: Tensor = _Solve.apply(prepared, values, upstream)  # type: ignore[no-untyped-call]
+        into_values = None
+        if ctx.needs_input_grad[1]:
+            products = adjoint[prepared.rows] * solution[prepared.cols]
+            into_values = -products.reshape(len(values), -1).sum(dim=1).to(values)
+        return None, into_values, adjoint
