@@ -1,7 +1,7 @@
-"""Coarser unknowns for a sparse symmetric matrix: what ``linalg/aggregation.py`` does in numpy.
+"""Aggregates and prolongation of algebraic multigrid: twin of ``linalg/aggregation.py``.
 
-Matrices are compressed rows, both triangles. Names and constants are those of that module. Where
-there are a ``first`` and a ``last`` row, nothing is done for any but those between.
+Matrices are compressed rows, both triangles. Names and constants are those of that module.
+Functions with ``first`` and ``last`` work on the rows from ``first`` up to ``last`` alone.
 """
 
 import numpy as np
@@ -27,13 +27,13 @@ def diagonals(
 ) -> None:
     """Write the diagonal, and one with which Jacobi's iteration has a spectrum within [0, 2]."""
     for row in range(first, last):
-        total, own = 0.0, 0.0
-        for place in range(starts[row], starts[row + 1]):
-            total += abs(entries[place])
-            if columns[place] == row:
-                own += entries[place]
-        diagonal[row] = own
-        dominant[row] = max(own, total / 2)
+        total, center = 0.0, 0.0
+        for index in range(starts[row], starts[row + 1]):
+            total += abs(entries[index])
+            if columns[index] == row:
+                center += entries[index]
+        diagonal[row] = center
+        dominant[row] = max(center, total / 2)
 
 
 @compiled(f"UniTuple(float64, 2)({_MATRIX}, {_ROWS})")
@@ -43,10 +43,10 @@ def off_diagonal(
     """Add up the positive entries off the diagonal, and the sizes of all of them."""
     positive, size = 0.0, 0.0
     for row in range(first, last):
-        for place in range(starts[row], starts[row + 1]):
-            if columns[place] != row:
-                positive += max(entries[place], 0.0)
-                size += abs(entries[place])
+        for index in range(starts[row], starts[row + 1]):
+            if columns[index] != row:
+                positive += max(entries[index], 0.0)
+                size += abs(entries[index])
     return positive, size
 
 
@@ -65,8 +65,8 @@ def smooth_ones(
     """Take one damped step of Jacobi's iteration from ``ones`` towards 0."""
     for row in range(first, last):
         image = 0.0
-        for place in range(starts[row], starts[row + 1]):
-            image += entries[place] * ones[columns[place]]
+        for index in range(starts[row], starts[row + 1]):
+            image += entries[index] * ones[columns[index]]
         smoother[row] = ones[row] - damping * image / dominant[row]
 
 
@@ -82,24 +82,24 @@ def ties(
     first: int,
     last: int,
 ) -> None:
-    """Write each row's largest tie, the sum of ties over the diagonal, and the row's sum.
+    """Write each row's largest coupling, the sum of couplings over the diagonal, and the row sum.
 
-    A tie is minus an entry off the diagonal, of the matrix in units, if it is positive.
+    A coupling is the negative of a negative entry off the diagonal, the matrix scaled by units.
     """
     for row in range(first, last):
-        most, total, own, rest = 0.0, 0.0, 0.0, 0.0
-        for place in range(starts[row], starts[row + 1]):
-            column = columns[place]
-            entry = units[row] * entries[place] * units[column]
-            rest += entry
+        most, total, center, row_sum = 0.0, 0.0, 0.0, 0.0
+        for index in range(starts[row], starts[row + 1]):
+            column = columns[index]
+            entry = units[row] * entries[index] * units[column]
+            row_sum += entry
             if column == row:
-                own += entry
+                center += entry
             elif entry < 0:
                 total -= entry
                 most = max(most, -entry)
         largest[row] = most
-        tied[row] = total / own
-        excess[row] = rest
+        tied[row] = total / center
+        excess[row] = row_sum
 
 
 @compiled(
@@ -113,56 +113,56 @@ def strong_ties(
     units: Array,
     largest: Array,
     tied: Array,
-    least_strong: float,
-    least_tied: float,
+    min_strength: float,
+    min_tied: float,
     strong: Array,
     first: int,
     last: int,
 ) -> None:
-    """Mark entries that may found an aggregate.
+    """Mark the strong connections, which may root an aggregate.
 
     Args:
         starts: Of the rows.
         columns: Of the entries.
         entries: Of the matrix.
-        units: What unknowns are measured in.
-        largest: Tie of each row.
-        tied: Sum of each row's ties over its diagonal.
-        least_strong: Of an entry next to the largest of both rows.
-        least_tied: Of an unknown that is not left to smoothing.
+        units: Scale of each unknown.
+        largest: Coupling of each row.
+        tied: Sum of each row's couplings over its diagonal.
+        min_strength: Of an entry over the largest coupling of both rows.
+        min_tied: Of an unknown; below it, smoothing alone solves for it.
         strong: Written.
         first: Row.
         last: Row after those.
     """
     for row in range(first, last):
-        for place in range(starts[row], starts[row + 1]):
-            column = columns[place]
-            tie = -units[row] * entries[place] * units[column]
-            strong[place] = (
-                tie > 0
+        for index in range(starts[row], starts[row + 1]):
+            column = columns[index]
+            coupling = -units[row] * entries[index] * units[column]
+            strong[index] = (
+                coupling > 0
                 and column != row
-                and tied[row] > least_tied
-                and tied[column] > least_tied
-                and tie >= least_strong * max(largest[row], largest[column])
+                and tied[row] > min_tied
+                and tied[column] > min_tied
+                and coupling >= min_strength * max(largest[row], largest[column])
             )
 
 
 @compiled("int32(int32[::1], int32[::1], boolean[::1], int64[::1], int32[::1])")
 def roots(starts: Array, columns: Array, strong: Array, order: Array, label: Array) -> int:
-    """Number unknowns more than two strong ties apart, taken in order; -1 for the others."""
+    """Label root unknowns more than two strong connections apart, in order; -1 for the others."""
     covered = np.zeros(len(label), np.bool_)
     label[:] = -1
     for row in order:
         if covered[row]:
             continue
-        for place in range(starts[row], starts[row + 1]):
-            if strong[place]:
+        for index in range(starts[row], starts[row + 1]):
+            if strong[index]:
                 label[row] = 0
-                near = columns[place]
-                covered[near] = True
-                for beyond in range(starts[near], starts[near + 1]):
-                    if strong[beyond]:
-                        covered[columns[beyond]] = True
+                neighbour = columns[index]
+                covered[neighbour] = True
+                for second in range(starts[neighbour], starts[neighbour + 1]):
+                    if strong[second]:
+                        covered[columns[second]] = True
     count = 0
     for row in range(len(label)):
         if label[row] == 0:
@@ -183,18 +183,18 @@ def joined(
     first: int,
     last: int,
 ) -> None:
-    """Write labels where those without one have that of their strongest tie that has one."""
+    """Give unlabelled unknowns the label of their strongest connection that has one."""
     for row in range(first, last):
         found[row] = label[row]
         if label[row] >= 0:
             continue
         most = 0.0
-        for place in range(starts[row], starts[row + 1]):
-            column = columns[place]
-            if strong[place] and label[column] >= 0:
-                tie = -units[row] * entries[place] * units[column]
-                if tie >= most:
-                    most = tie
+        for index in range(starts[row], starts[row + 1]):
+            column = columns[index]
+            if strong[index] and label[column] >= 0:
+                coupling = -units[row] * entries[index] * units[column]
+                if coupling >= most:
+                    most = coupling
                     found[row] = label[column]
 
 
@@ -209,30 +209,30 @@ def followed(
     units: Array,
     largest: Array,
     tied: Array,
-    least_tied: float,
+    min_tied: float,
     label: Array,
     found: Array,
     first: int,
     last: int,
 ) -> bool:
-    """Write labels where those without one have that of what they are tied to most; tell if any.
+    """Give unlabelled unknowns the label of their largest coupling; true if any got one.
 
-    Ties grow along such chains, so that they are short.
+    Couplings grow along such chains, so that they are short.
     """
-    moved = False
+    changed = False
     for row in range(first, last):
         found[row] = label[row]
-        if label[row] >= 0 or tied[row] <= least_tied or largest[row] <= 0:
+        if label[row] >= 0 or tied[row] <= min_tied or largest[row] <= 0:
             continue
-        leader = -1
-        for place in range(starts[row], starts[row + 1]):
-            column = columns[place]
-            if column != row and -units[row] * entries[place] * units[column] == largest[row]:
-                leader = column
-        if leader >= 0 and label[leader] >= 0:
-            found[row] = label[leader]
-            moved = True
-    return moved
+        strongest = -1
+        for index in range(starts[row], starts[row + 1]):
+            column = columns[index]
+            if column != row and -units[row] * entries[index] * units[column] == largest[row]:
+                strongest = column
+        if strongest >= 0 and label[strongest] >= 0:
+            found[row] = label[strongest]
+            changed = True
+    return changed
 
 
 @compiled(
@@ -247,7 +247,7 @@ def spread(
     largest: Array,
     excess: Array,
     label: Array,
-    least_strong: float,
+    min_strength: float,
     damping: float,
     first: int,
     last: int,
@@ -255,42 +255,42 @@ def spread(
     """Give rows of the prolongation: aggregates, smoothed by one averaging step, in units.
 
     Returns:
-        How many entries each row has, their columns, and the entries.
+        Entries per row, their columns, and the entries.
     """
     counts = np.empty(last - first, np.int32)
-    room = starts[last] - starts[first] + last - first
-    names, values = np.empty(room, np.int32), np.empty(room)
+    capacity = starts[last] - starts[first] + last - first
+    aggregates, values = np.empty(capacity, np.int32), np.empty(capacity)
     count = 0
     for row in range(first, last):
         begin = count
         total = max(excess[row], 0.0)
         if label[row] >= 0:
-            names[count], values[count] = label[row], 0.0
+            aggregates[count], values[count] = label[row], 0.0
             count += 1
-        for place in range(starts[row], starts[row + 1]):
-            column = columns[place]
+        for index in range(starts[row], starts[row + 1]):
+            column = columns[index]
             if column == row:
                 continue
-            tie = -units[row] * entries[place] * units[column]
-            if not (tie > 0 and tie > least_strong * largest[row]):
+            coupling = -units[row] * entries[index] * units[column]
+            if not (coupling > 0 and coupling > min_strength * largest[row]):
                 continue
-            total += tie
+            total += coupling
             if label[column] < 0:
                 continue
-            at = begin
-            while at < count and names[at] != label[column]:
-                at += 1
-            if at == count:
-                names[at], values[at] = label[column], 0.0
+            slot = begin
+            while slot < count and aggregates[slot] != label[column]:
+                slot += 1
+            if slot == count:
+                aggregates[slot], values[slot] = label[column], 0.0
                 count += 1
-            values[at] += tie
+            values[slot] += coupling
         fraction = damping / total if total > 0 else 0.0
-        for at in range(begin, count):
-            values[at] *= fraction * units[row]
+        for slot in range(begin, count):
+            values[slot] *= fraction * units[row]
         if label[row] >= 0:
             values[begin] += (1 - damping) * units[row]
         counts[row - first] = count - begin
-    return counts, names[:count].copy(), values[:count].copy()
+    return counts, aggregates[:count].copy(), values[:count].copy()
 
 
 @compiled(f"{_FOUND}({_MATRIX}, {_MATRIX}, {_MATRIX}, {_ROWS})")
@@ -307,7 +307,7 @@ def coarser(
     first: int,
     last: int,
 ) -> tuple[Array, Array, Array]:
-    """Give rows of ``P^T A P``: what :func:`spread` gives of them; no product between is kept.
+    """Give rows of the Galerkin product ``P^T A P``, without an intermediate product.
 
     Args:
         starts: Of the rows of A.
@@ -324,33 +324,33 @@ def coarser(
     """
     size = len(gather_starts) - 1
     counts = np.empty(last - first, np.int32)
-    seen, listed, sums = np.full(size, -1, np.int32), np.empty(size, np.int32), np.empty(size)
-    room = 16 * (last - first)
-    names, values = np.empty(room, np.int32), np.empty(room)
+    marker, touched, sums = np.full(size, -1, np.int32), np.empty(size, np.int32), np.empty(size)
+    capacity = 16 * (last - first)
+    aggregates, values = np.empty(capacity, np.int32), np.empty(capacity)
     filled = 0
     for row in range(first, last):
         count = 0
-        for one in range(gather_starts[row], gather_starts[row + 1]):
-            fine, weight = np.uint32(gather_columns[one]), gather_entries[one]
-            for two in range(starts[fine], starts[fine + 1]):
-                near, tie = np.uint32(columns[two]), weight * entries[two]
-                for three in range(spread_starts[near], spread_starts[near + 1]):
-                    name = np.uint32(spread_columns[three])
-                    if seen[name] == row:
-                        sums[name] += tie * spread_entries[three]
+        for i in range(gather_starts[row], gather_starts[row + 1]):
+            fine, weight = np.uint32(gather_columns[i]), gather_entries[i]
+            for j in range(starts[fine], starts[fine + 1]):
+                neighbour, coupling = np.uint32(columns[j]), weight * entries[j]
+                for k in range(spread_starts[neighbour], spread_starts[neighbour + 1]):
+                    aggregate = np.uint32(spread_columns[k])
+                    if marker[aggregate] == row:
+                        sums[aggregate] += coupling * spread_entries[k]
                     else:
-                        seen[name] = row
-                        sums[name] = tie * spread_entries[three]
-                        listed[count] = name
+                        marker[aggregate] = row
+                        sums[aggregate] = coupling * spread_entries[k]
+                        touched[count] = aggregate
                         count += 1
-        if filled + count > room:
-            room = 2 * room + count
-            more, still = np.empty(room, np.int32), np.empty(room)
-            more[:filled], still[:filled] = names[:filled], values[:filled]
-            names, values = more, still
-        for place in range(count):
-            name = listed[place]
-            names[filled + place], values[filled + place] = name, sums[name]
+        if filled + count > capacity:
+            capacity = 2 * capacity + count
+            wider, wider_values = np.empty(capacity, np.int32), np.empty(capacity)
+            wider[:filled], wider_values[:filled] = aggregates[:filled], values[:filled]
+            aggregates, values = wider, wider_values
+        for index in range(count):
+            aggregate = touched[index]
+            aggregates[filled + index], values[filled + index] = aggregate, sums[aggregate]
         filled += count
         counts[row - first] = count
-    return counts, names[:filled].copy(), values[:filled].copy()
+    return counts, aggregates[:filled].copy(), values[:filled].copy()

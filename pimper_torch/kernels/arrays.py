@@ -1,4 +1,4 @@
-"""Tensors as kernels take them."""
+"""Tensors as contiguous arrays on the CPU."""
 
 from typing import Any
 
@@ -8,5 +8,5 @@ from torch import Tensor
 
 
 def as_array(values: Tensor, dtype: torch.dtype | None = None) -> NDArray[Any]:
-    """Share a tensor's memory where it has the type and lies in a row, else copy it."""
+    """Share a tensor's memory if it has the type and is contiguous on the CPU, else copy it."""
     return values.detach().to("cpu", dtype).contiguous().numpy()

@@ -1,4 +1,4 @@
-"""Symmetric positive systems of a few hundred unknowns, in the reader's own thread.
+"""Symmetric positive systems of a few hundred unknowns, solved in the calling thread.
 
 LAPACK would be as fast, but starts threads of its own at these sizes.
 """
@@ -14,17 +14,17 @@ Doubles = NDArray[np.float64]
 
 
 @compiled(fast=True)
-def solve_damped(matrix: Doubles, ridge: float, side: Doubles, factor: Doubles) -> bool:
-    """Solve ``(matrix + ridge) x = side`` in place by Cholesky's factorization ``U^T U``.
+def solve_damped(matrix: Doubles, ridge: float, rhs: Doubles, factor: Doubles) -> bool:
+    """Solve ``(matrix + ridge) x = rhs`` in place by Cholesky's factorization ``U^T U``.
 
     Args:
         matrix: Its upper triangle; the size is a multiple of 4.
         ridge: Added to the diagonal.
-        side: Becomes the solution.
-        factor: Space for ``U``.
+        rhs: Becomes the solution.
+        factor: Workspace for ``U``.
 
     Returns:
-        Whether the matrix is positive; else the side means nothing.
+        Whether the damped matrix is positive definite; if not, ``rhs`` is undefined.
     """
     size = len(matrix)
     for i in range(size):
@@ -49,14 +49,14 @@ def solve_damped(matrix: Doubles, ridge: float, side: Doubles, factor: Doubles) 
             for j in range(i, size):
                 row[j] -= p * a[j] + q * b[j] + r * c[j] + s * d[j]
     for i in range(size):
-        side[i] /= factor[i, i]
-        _subtract(side, factor[i], side[i], i + 1)
+        rhs[i] /= factor[i, i]
+        _subtract(rhs, factor[i], rhs[i], i + 1)
     for i in range(size - 1, -1, -1):
         row = factor[i]
         total = 0.0
         for j in range(i + 1, size):
-            total += row[j] * side[j]
-        side[i] = (side[i] - total) / row[i]
+            total += row[j] * rhs[j]
+        rhs[i] = (rhs[i] - total) / row[i]
     return True
 
 

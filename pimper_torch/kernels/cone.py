@@ -1,8 +1,7 @@
-"""Steps of samples along the photometric cone: twin of ``photometry.bilinear.follow``.
+"""Gauss-Newton steps of samples on the photometric cone: twin of ``photometry.bilinear.follow``.
 
-Every sample has 14 numbers of its own: its normal equations ``A``, ten of them packed, and ``b``.
-They are copied to tiles of so many samples whose rows are a constant apart: only so does the
-compiler see that what is written does not overlap what is read, and works in several lanes.
+A sample has 14 values: its normal equations ``A``, ten packed entries, and ``b``. They are copied
+to tiles of constant stride: only then can the compiler exclude aliasing, and vectorize.
 """
 
 import math
@@ -19,9 +18,10 @@ Four = tuple[float, float, float, float]
 Six = tuple[float, float, float, float, float, float]
 Ten = tuple[float, float, float, float, float, float, float, float, float, float]
 
+# Samples of a tile: a choice, two cache lines of float32 a row.
 TILE = 32
 
-# As in the reference.
+# As in ``photometry.bilinear`` and ``photometry.quadratics``.
 LONGEST_STEP = 0.3
 _ROUNDINGS = 8 * float(np.finfo(np.float32).eps)
 _TINY = float(np.finfo(np.float64).tiny) ** 0.5
@@ -29,12 +29,12 @@ _TINY = float(np.finfo(np.float64).tiny) ** 0.5
 
 @compiled(fast=True)
 def follow(equations: Floats, shading: Floats, steps: int) -> None:
-    """Bring every sample nearer to its minimum by Gauss-Newton steps, in place.
+    """Take Gauss-Newton steps of every sample on the cone, in place.
 
     Args:
         equations: 14 rows: ``A`` and ``b``; a multiple of TILE samples.
         shading: 4 rows.
-        steps: Of each sample; one that does not help is not taken.
+        steps: Of each sample; one that does not lower its objective is rejected.
     """
     tile = np.empty(18 * TILE, np.float64)
     for first in range(0, shading.shape[1], TILE):
@@ -65,11 +65,11 @@ def _step(tile: Doubles) -> None:
     for k in range(TILE):
         a, b, s = at(tile, k)
         image = apply(a, s)
-        value = gain(s, image, b)
+        value = objective(s, image, b)
         moved = step_along(
             a, (b[0] - image[0], b[1] - image[1], b[2] - image[2], b[3] - image[3]), s
         )
-        after = gain(moved, apply(a, moved), b)
+        after = objective(moved, apply(a, moved), b)
         better = after <= value + _ROUNDINGS * abs(value)
         tile[14 * TILE + k] = moved[0] if better else s[0]
         tile[15 * TILE + k] = moved[1] if better else s[1]
@@ -109,7 +109,7 @@ def apply(a: Ten, v: Four) -> Four:
 
 
 @compiled(fast=True, inline=True)
-def gain(s: Four, image: Four, b: Four) -> float:
+def objective(s: Four, image: Four, b: Four) -> float:
     """Give ``s . (A s - 2 b)``."""
     return (
         s[0] * (image[0] - 2 * b[0])
@@ -121,7 +121,7 @@ def gain(s: Four, image: Four, b: Four) -> float:
 
 @compiled(fast=True, inline=True)
 def step_along(a: Ten, slope: Four, s: Four) -> Four:
-    """Take the step ``(B^T A B)^-1 B^T slope`` along the cone, at most as long as it holds."""
+    """Take the step ``(B^T A B)^-1 B^T slope`` along the cone, of bounded length."""
     n, first, second = frame(s)
     m = raised(congruence(a, n, first, second))
     inverse = inverse_factor(m)
@@ -162,7 +162,7 @@ def project(b: float, x: float, y: float, z: float) -> Four:
 
 @compiled(fast=True, inline=True)
 def frame(s: Four) -> tuple[Three, Three, Three]:
-    """Give the normal, zero where there is none, and two tangents; see ``photometry.cone``."""
+    """Give the normal, zero at the apex, and two tangents; see ``photometry.cone``."""
     square = s[1] * s[1] + s[2] * s[2] + s[3] * s[3]
     inverse = 1 / math.sqrt(square if square > 0 else 1.0)
     x, y, z = s[1] * inverse, s[2] * inverse, s[3] * inverse
@@ -194,7 +194,7 @@ def congruence(a: Ten, n: Three, first: Three, second: Three) -> Six:
 
 @compiled(fast=True, inline=True)
 def raised(m: Six) -> Six:
-    """Raise the diagonal a little, so that the matrix can be inverted."""
+    """Raise the diagonal, so that the matrix can be inverted."""
     more = 1e-9 * (m[0] + m[3] + m[5])
     return m[0] + more, m[1], m[2], m[3] + more, m[4], m[5] + more
 
@@ -216,7 +216,7 @@ def inverse_factor(m: Six) -> Six:
 
 @compiled(fast=True)
 def whitening(equations: Floats, shading: Floats, vectors: Floats) -> None:
-    """Give the rows of ``C^-1 B^T``: products of lights with them, weighed, are whitened slopes.
+    """Give the rows of ``C^-1 B^T``: times lights and weights they are whitened derivatives.
 
     Args:
         equations: 14 rows: ``A`` and ``b``; a multiple of TILE samples.

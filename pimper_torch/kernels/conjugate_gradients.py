@@ -1,6 +1,6 @@
-"""The vectors of conjugate gradients, updated in place, in as few passes as they need.
+"""Fused vector updates of conjugate gradients, in place.
 
-They have one column a right-hand side, in float64; what multigrid takes and gives may be in
+Vectors have one column per right-hand side, in float64; those of the preconditioner may be in
 float32.
 """
 
@@ -10,7 +10,7 @@ from pimper_torch.kernels.switch import compiled
 
 Array = np.ndarray
 
-# Rows whose products are added up together: sums do not depend on how many threads take part.
+# Rows of a block: sums of blocks do not depend on the number of threads.
 BLOCK = 4096
 
 _WIDE = "float64[:,::1]"
@@ -18,14 +18,14 @@ _REALS = ("float32[:,::1]", "float64[:,::1]")
 
 
 @compiled(*(f"void({_WIDE}, {real}, {_WIDE}, int64, int64)" for real in _REALS))
-def dots(one: Array, other: Array, sums: Array, first: int, last: int) -> None:
+def dots(a: Array, b: Array, sums: Array, first: int, last: int) -> None:
     """Write the inner products of the blocks of rows from ``first`` up to ``last``."""
     for block in range(first, last):
-        for side in range(one.shape[1]):
+        for column in range(a.shape[1]):
             total = 0.0
-            for row in range(block * BLOCK, min((block + 1) * BLOCK, len(one))):
-                total += one[row, side] * other[row, side]
-            sums[block, side] = total
+            for row in range(block * BLOCK, min((block + 1) * BLOCK, len(a))):
+                total += a[row, column] * b[row, column]
+            sums[block, column] = total
 
 
 @compiled(
@@ -39,23 +39,23 @@ def moved(
     residual: Array,
     direction: Array,
     image: Array,
-    length: Array,
+    step_length: Array,
     rounded: Array,
     first: int,
     last: int,
 ) -> None:
-    """Go along the directions by ``length``, and round the residual that is left."""
+    """Update solution and residual along the directions; copy the residual, rounded."""
     for row in range(first, last):
-        for side in range(len(length)):
-            found[row, side] += length[side] * direction[row, side]
-            left = residual[row, side] - length[side] * image[row, side]
-            residual[row, side] = left
-            rounded[row, side] = left
+        for column in range(len(step_length)):
+            found[row, column] += step_length[column] * direction[row, column]
+            remaining = residual[row, column] - step_length[column] * image[row, column]
+            residual[row, column] = remaining
+            rounded[row, column] = remaining
 
 
 @compiled(*(f"void({_WIDE}, {real}, float64[::1], int64, int64)" for real in _REALS))
-def rotated(direction: Array, better: Array, growth: Array, first: int, last: int) -> None:
-    """Make the directions ``better + growth * direction``."""
+def rotated(direction: Array, z: Array, beta: Array, first: int, last: int) -> None:
+    """Set the directions to ``z + beta * direction``, ``z`` the preconditioned residual."""
     for row in range(first, last):
-        for side in range(len(growth)):
-            direction[row, side] = better[row, side] + growth[side] * direction[row, side]
+        for column in range(len(beta)):
+            direction[row, column] = z[row, column] + beta[column] * direction[row, column]

@@ -1,7 +1,7 @@
-"""Vertices of a mesh taken out one by one, as long as all of them stay near what is left.
+"""Mesh decimation by half-edge collapses under a bound on the distance of removed vertices.
 
-It has no twin in torch: which vertices stay is a choice, constant to autograd, and what it must
-keep to is checked against the nearest points of the surface.
+It has no twin in torch: which vertices stay is constant to autograd. Tests check the bound against
+the nearest points of the surface.
 """
 
 import numpy as np
@@ -10,27 +10,27 @@ from numpy.typing import NDArray
 from pimper_torch.kernels.switch import compiled
 
 Floats = NDArray[np.float32]
-Numbers = NDArray[np.int32]
+Indices = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
-# Fans of more faces, and more removed vertices on one fan, are left as they are.
+# Choices. Fans with more faces, or more removed vertices, are not changed: bounds of workspace.
 _MAX_FACES, _MAX_POINTS = 24, 2048
-# A new face may be as long and narrow as this (4 sqrt(3) area / squared sides, 1 if equilateral),
-# or as the worst of those that it replaces.
+# A new face has at least this shape (4 sqrt(3) area / squared sides, 1 if equilateral), or that of
+# the worst face that it replaces; and this cosine between its normal and the mean of theirs.
 _MIN_SHAPE = 0.2
-# Cosine between a new face's normal and the mean of those that it replaces.
 _MIN_COSINE = 0.2
-_RIVALS = 3  # neighbours that a vertex is tried to merge with, those that give the best faces
+# Neighbours that a vertex is tried to merge with, best new shapes first.
+_MAX_CANDIDATES = 3
 
 
 @compiled("void(int32[:,::1], int32[::1], int32[::1])")
-def link_corners(faces: Numbers, head: Numbers, following: Numbers) -> None:
-    """Chain the corners of every vertex.
+def link_corners(faces: Indices, head: Indices, following: Indices) -> None:
+    """Link the corners of every vertex in a list.
 
     Args:
-        faces: Corners are counted through its rows.
-        head: First corner of every vertex; -1 for none, written here.
-        following: The next corner of the same vertex, -1 at the end; written here.
+        faces: Corner ``3 f + s`` is slot ``s`` of face ``f``.
+        head: Result: first corner of every vertex; -1 for none.
+        following: Result: the next corner of the same vertex, -1 at the end.
     """
     head[:] = -1
     for face in range(len(faces)):
@@ -42,17 +42,17 @@ def link_corners(faces: Numbers, head: Numbers, following: Numbers) -> None:
 
 @compiled("void(float32[:,::1], int64, int64, int64, int64, float64[::1])")
 def closest(
-    points: Floats, first: int, second: int, third: int, asked: int, found: NDArray[np.float64]
+    points: Floats, first: int, second: int, third: int, query: int, found: NDArray[np.float64]
 ) -> None:
-    """Find the point of a triangle that is nearest to another.
+    """Find the point of a triangle that is nearest to a vertex.
 
     Args:
         points: Of all vertices.
         first: Corner of the triangle.
         second: Corner.
         third: Corner.
-        asked: The vertex that is not in the triangle.
-        found: Squared distance and three barycentric coordinates, written here.
+        query: The vertex.
+        found: Result: squared distance and three barycentric coordinates.
 
     Source: Ericson, Real-Time Collision Detection, 2005, 5.1.5.
     """
@@ -68,9 +68,9 @@ def closest(
         np.float64(points[third, 2]) - az,
     )
     apx, apy, apz = (
-        np.float64(points[asked, 0]) - ax,
-        np.float64(points[asked, 1]) - ay,
-        np.float64(points[asked, 2]) - az,
+        np.float64(points[query, 0]) - ax,
+        np.float64(points[query, 1]) - ay,
+        np.float64(points[query, 2]) - az,
     )
     bb = abx * abx + aby * aby + abz * abz
     cc = acx * acx + acy * acy + acz * acz
@@ -108,20 +108,20 @@ def closest(
 
 @compiled("int64(int64, int32[:,::1], int32[::1], int32[::1], int32[::1], int32[::1])")
 def fan(
-    vertex: int, faces: Numbers, head: Numbers, following: Numbers, ring: Numbers, owner: Numbers
+    vertex: int, faces: Indices, head: Indices, following: Indices, ring: Indices, owner: Indices
 ) -> int:
-    """Walk round a vertex.
+    """Sort the faces and neighbours of a vertex around it.
 
     Args:
-        vertex: Where faces are taken out, the first corner of which is -1, they leave the chain.
+        vertex: Removed faces, with -1 in their first slot, are unlinked from its list.
         faces: Of the mesh.
-        head: Of the chains of corners.
-        following: Of the chains of corners.
-        ring: The neighbours in order, written here.
-        owner: The face between each of them and the next, written here.
+        head: See :func:`link_corners`.
+        following: See :func:`link_corners`.
+        ring: Result: the neighbours in order.
+        owner: Result: the face between each neighbour and the next.
 
     Returns:
-        Their number; 0 where they do not close round the vertex, or are too many.
+        Their count; 0 where they do not close around the vertex, or are too many.
     """
     count, before, corner = 0, -1, head[vertex]
     while corner >= 0:
@@ -141,39 +141,39 @@ def fan(
             count += 1
             before = corner
         corner = after
-    for place in range(1, count):  # sort: each begins where the one before ends
-        wanted = ring[_MAX_FACES + place - 1]
+    for index in range(1, count):  # sort: each begins where the one before ends
+        wanted = ring[_MAX_FACES + index - 1]
         if wanted == ring[0]:
             return 0  # two fans meet in the vertex
-        other = place
+        other = index
         while other < count and ring[other] != wanted:
             other += 1
         if other == count:
             return 0
-        ring[place], ring[other] = ring[other], ring[place]
-        owner[place], owner[other] = owner[other], owner[place]
-        there = _MAX_FACES + place
-        ring[there], ring[there + other - place] = ring[there + other - place], ring[there]
+        ring[index], ring[other] = ring[other], ring[index]
+        owner[index], owner[other] = owner[other], owner[index]
+        there = _MAX_FACES + index
+        ring[there], ring[there + other - index] = ring[there + other - index], ring[there]
     return count if count >= 3 and ring[_MAX_FACES + count - 1] == ring[0] else 0
 
 
 @compiled("boolean(int64, int64, int64, int32[:,::1], int32[::1], int32[::1], int32[::1])")
 def may_merge(
     vertex: int,
-    place: int,
+    index: int,
     count: int,
-    faces: Numbers,
-    head: Numbers,
-    following: Numbers,
-    ring: Numbers,
+    faces: Indices,
+    head: Indices,
+    following: Indices,
+    ring: Indices,
 ) -> bool:
-    """Tell whether a vertex can become its neighbour without two sheets sharing an edge.
+    """Tell whether collapsing a vertex on its neighbour keeps the mesh manifold.
 
-    The two have no neighbours in common but the two between which their edge runs, and the face
-    that these span with the neighbour is not there yet.
+    The link condition: the two share only the two neighbours opposite of their edge, and the face
+    of these and the neighbour does not exist yet.
     """
-    neighbour = ring[place]
-    left, right = ring[(place + count - 1) % count], ring[(place + 1) % count]
+    neighbour = ring[index]
+    left, right = ring[(index + count - 1) % count], ring[(index + 1) % count]
     corner = head[neighbour]
     while corner >= 0:
         face = corner // 3
@@ -186,7 +186,7 @@ def may_merge(
                 for other in range(count):
                     third = ring[other]
                     shared = third in (one, two)
-                    if shared and other != place and third != left and third != right:
+                    if shared and other != index and third != left and third != right:
                         return False
         corner = following[corner]
     return True
@@ -196,7 +196,7 @@ def may_merge(
 def shape(
     points: Floats, first: int, second: int, third: int, normal: NDArray[np.float64]
 ) -> float:
-    """Give a triangle's shape, 1 if equilateral, and its normal of twice its area."""
+    """Give a triangle's shape, 1 if equilateral, and its normal, twice the area long."""
     ux = np.float64(points[second, 0]) - points[first, 0]
     uy = np.float64(points[second, 1]) - points[first, 1]
     uz = np.float64(points[second, 2]) - points[first, 2]
@@ -220,44 +220,43 @@ def shape(
 def decimate(
     points: Floats,
     normals: Floats,
-    told: Floats,
+    attributes: Floats,
     bound: float,
     cosine: float,
     iterations: int,
-    faces: Numbers,
-    head: Numbers,
-    following: Numbers,
+    faces: Indices,
+    head: Indices,
+    following: Indices,
     part: NDArray[np.int8],
-    mine: int,
-    fresh: Flags,
-    first_removed: Numbers,
-    next_removed: Numbers,
+    own_part: int,
+    candidates: Flags,
+    first_removed: Indices,
+    next_removed: Indices,
     deviation: Floats,
 ) -> int:
-    """Merge vertices with neighbours as long as all removed ones stay near the surface.
+    """Collapse vertices on neighbours as long as all removed ones stay near the surface.
 
-    Every removed vertex is on the list of a face. A vertex merges with a neighbour if it and
-    all on the lists of its faces are within ``bound`` of the faces that come in their place,
-    with normals, blended from the corners, within the given cosine of their own, and with all
-    else that is told, blended, within 1 of their own. In one round no face changes twice, so that
-    the mesh thins out evenly.
+    Every removed vertex is on the list of a face. A vertex is collapsed if it and all on the
+    lists of its faces are within ``bound`` of the new faces, their normals within the given cosine
+    of the interpolated ones, and their attributes within 1 of the interpolated ones. In one
+    iteration no face changes twice, so that the mesh is decimated evenly.
 
     Args:
         points: Of all vertices.
         normals: Unit.
-        told: Of every vertex, in units of what it may be off.
+        attributes: Of every vertex, in units of their tolerance.
         bound: Distance.
         cosine: Of the angle between normals.
         iterations: At most.
-        faces: Written in place: faces taken out have -1 in their first corner.
-        head: Chains of corners, from :func:`link_corners`; written in place.
+        faces: Updated: removed faces have -1 in their first slot.
+        head: From :func:`link_corners`; updated.
         following: The same.
-        part: Vertices of other parts, and their neighbours, stay as they are.
-        mine: The part to thin out.
-        fresh: Whether a vertex is worth trying; written in place.
-        first_removed: First removed vertex on every face's list, or -1; written in place.
-        next_removed: The next on the same list; written in place.
-        deviation: Distance and cosine of every removed vertex; written in place.
+        part: Vertices of other parts, and their neighbours, stay.
+        own_part: The part to decimate.
+        candidates: Whether a vertex is to be tried; updated.
+        first_removed: First removed vertex on every face's list, or -1; updated.
+        next_removed: The next on the same list; updated.
+        deviation: Distance and cosine of every removed vertex; updated.
 
     Returns:
         How many vertices were removed.
@@ -265,84 +264,84 @@ def decimate(
     ring = np.empty(2 * _MAX_FACES, np.int32)
     owner = np.empty(_MAX_FACES, np.int32)
     score = np.empty(_MAX_FACES, np.float64)
-    listed = np.empty(_MAX_POINTS, np.int32)
-    placed = np.empty(_MAX_POINTS, np.int32)
-    off = np.empty((_MAX_POINTS, 2), np.float32)
+    removed_points = np.empty(_MAX_POINTS, np.int32)
+    new_face = np.empty(_MAX_POINTS, np.int32)
+    errors = np.empty((_MAX_POINTS, 2), np.float32)
     normal, mean, found = np.empty(3), np.empty(3), np.empty(4)
     touched = np.full(len(head), -1, np.int8)
     total = 0
     for sweep in range(iterations):
         removed = 0
         for vertex in range(len(head)):
-            if not fresh[vertex] or part[vertex] != mine or touched[vertex] == sweep:
+            if not candidates[vertex] or part[vertex] != own_part or touched[vertex] == sweep:
                 continue
-            fresh[vertex] = False
+            candidates[vertex] = False
             count = fan(vertex, faces, head, following, ring, owner)
             if count == 0:
                 continue
             inside = True
-            for place in range(count):
-                inside = inside and part[ring[place]] == mine
+            for index in range(count):
+                inside = inside and part[ring[index]] == own_part
             if not inside:
                 continue
-            # Everything on the lists of the faces round it, and the vertex itself first.
-            listed[0], size = vertex, 1
-            for place in range(count):
-                point = first_removed[owner[place]]
+            # The vertex itself, and all removed vertices of its faces.
+            removed_points[0], size = vertex, 1
+            for index in range(count):
+                point = first_removed[owner[index]]
                 while point >= 0 and size < _MAX_POINTS:
-                    listed[size] = point
+                    removed_points[size] = point
                     size += 1
                     point = next_removed[point]
             if size == _MAX_POINTS:
                 continue
             mean[:] = 0
             worst = _MIN_SHAPE
-            for place in range(count):
+            for index in range(count):
                 worst = min(
                     worst,
-                    shape(points, vertex, ring[place], ring[(place + 1) % count], normal),
+                    shape(points, vertex, ring[index], ring[(index + 1) % count], normal),
                 )
                 mean += normal
             mean /= max(np.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2), 1e-300)
-            for place in range(count):
-                least = 2.0
+            for index in range(count):
+                worst_new = 2.0
                 for step in range(1, count - 1):
-                    one, two = ring[(place + step) % count], ring[(place + step + 1) % count]
-                    good = shape(points, ring[place], one, two, normal)
+                    one, two = ring[(index + step) % count], ring[(index + step + 1) % count]
+                    quality = shape(points, ring[index], one, two, normal)
                     along = normal[0] * mean[0] + normal[1] * mean[1] + normal[2] * mean[2]
-                    size_of = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-                    if good < worst or along <= _MIN_COSINE * size_of:
-                        least = -1.0
+                    area = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+                    if quality < worst or along <= _MIN_COSINE * area:
+                        worst_new = -1.0
                         break
-                    least = min(least, good)
-                score[place] = least
+                    worst_new = min(worst_new, quality)
+                score[index] = worst_new
             merged = False
-            for _ in range(min(_RIVALS, count)):
-                place = 0
+            for _ in range(min(_MAX_CANDIDATES, count)):
+                index = 0
                 for other in range(1, count):
-                    if score[other] > score[place]:
-                        place = other
-                if score[place] <= 0:
+                    if score[other] > score[index]:
+                        index = other
+                if score[index] <= 0:
                     break
-                score[place] = -1.0
-                if not may_merge(vertex, place, count, faces, head, following, ring):
+                score[index] = -1.0
+                if not may_merge(vertex, index, count, faces, head, following, ring):
                     continue
-                neighbour = ring[place]
-                fits = True
+                neighbour = ring[index]
+                accepted = True
                 for item in range(size):
-                    point = listed[item]
+                    point = removed_points[item]
                     best, chosen = np.inf, 0
                     b0, b1, b2 = 0.0, 0.0, 0.0
                     for step in range(1, count - 1):
-                        one, two = ring[(place + step) % count], ring[(place + step + 1) % count]
+                        one, two = ring[(index + step) % count], ring[(index + step + 1) % count]
                         closest(points, neighbour, one, two, point, found)
                         if found[0] < best:
                             best, chosen = found[0], step
                             b0, b1, b2 = found[1], found[2], found[3]
                     if best > bound * bound:
-                        fits = False
+                        accepted = False
                         break
-                    one, two = ring[(place + chosen) % count], ring[(place + chosen + 1) % count]
+                    one, two = ring[(index + chosen) % count], ring[(index + chosen + 1) % count]
                     dot, length = 0.0, 0.0
                     for axis in range(3):
                         blend = (
@@ -353,23 +352,23 @@ def decimate(
                         dot += blend * normals[point, axis]
                         length += blend * blend
                     if not dot >= cosine * np.sqrt(length):
-                        fits = False
+                        accepted = False
                         break
-                    for channel in range(told.shape[1]):
+                    for channel in range(attributes.shape[1]):
                         blend = (
-                            b0 * told[neighbour, channel]
-                            + b1 * told[one, channel]
-                            + b2 * told[two, channel]
+                            b0 * attributes[neighbour, channel]
+                            + b1 * attributes[one, channel]
+                            + b2 * attributes[two, channel]
                         )
-                        if not abs(blend - told[point, channel]) <= 1:
-                            fits = False
+                        if not abs(blend - attributes[point, channel]) <= 1:
+                            accepted = False
                             break
-                    if not fits:
+                    if not accepted:
                         break
-                    placed[item] = owner[(place + chosen) % count]
-                    off[item, 0] = np.sqrt(best)
-                    off[item, 1] = dot / np.sqrt(length)
-                if fits:
+                    new_face[item] = owner[(index + chosen) % count]
+                    errors[item, 0] = np.sqrt(best)
+                    errors[item, 1] = dot / np.sqrt(length)
+                if accepted:
                     merged = True
                     break
             if not merged:
@@ -377,7 +376,7 @@ def decimate(
             for other in range(count):
                 face = owner[other]
                 first_removed[face] = -1
-                if other == place or other == (place + count - 1) % count:
+                if other == index or other == (index + count - 1) % count:
                     faces[face, 0] = -1
                     continue
                 slot = 0
@@ -388,13 +387,13 @@ def decimate(
                 head[neighbour] = 3 * face + slot
             head[vertex] = -1
             for item in range(size):
-                point, face = listed[item], placed[item]
+                point, face = removed_points[item], new_face[item]
                 next_removed[point] = first_removed[face]
                 first_removed[face] = point
-                deviation[point, 0], deviation[point, 1] = off[item, 0], off[item, 1]
+                deviation[point, 0], deviation[point, 1] = errors[item, 0], errors[item, 1]
             for other in range(count):
                 touched[ring[other]] = sweep
-                fresh[ring[other]] = True
+                candidates[ring[other]] = True
             removed += 1
         total += removed
         if removed == 0:
@@ -403,16 +402,16 @@ def decimate(
 
 
 @compiled("void(int32[::1], int32[::1], int32[::1])")
-def read_lists(first: Numbers, after: Numbers, face: Numbers) -> None:
-    """Write for every vertex on the list of a face which one it is.
+def read_lists(first: Indices, after: Indices, face: Indices) -> None:
+    """Write the face of every removed vertex.
 
     Args:
         first: First vertex on every face's list, or -1.
         after: The next on the same list.
-        face: Of every vertex, written here.
+        face: Result, of every vertex.
     """
-    for place in range(len(first)):
-        point = first[place]
+    for index in range(len(first)):
+        point = first[index]
         while point >= 0:
-            face[point] = place
+            face[point] = index
             point = after[point]

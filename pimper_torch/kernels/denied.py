@@ -1,4 +1,4 @@
-"""Views that see something behind points: the twin of ``oriented.denied``."""
+"""Views whose depth lies behind points (free-space violations): twin of ``oriented.denied``."""
 
 import numpy as np
 from numpy.typing import NDArray

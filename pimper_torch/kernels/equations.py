@@ -1,4 +1,4 @@
-"""Normal equations of sparse least squares, straight into compressed rows."""
+"""Normal equations of sparse least squares, assembled in compressed rows."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ _FOUND = "Tuple((int32[::1], int32[::1], float64[::1]))"
 
 @compiled("void(int64[:,::1], int32[::1])")
 def count(unknowns: Array, counts: Array) -> None:
-    """Add up how many entries each row gets, those that come twice counted twice."""
+    """Count the entries of each row, duplicates included."""
     for equation in range(len(unknowns)):
         for term in range(unknowns.shape[1]):
             counts[unknowns[equation, term]] += unknowns.shape[1]
@@ -32,17 +32,17 @@ def fill(
     columns: Array,
     entries: Array,
 ) -> None:
-    """Write the entries of equations where their rows end by now, and move the ends on."""
+    """Append the entries of equations to their rows; ``ends`` are updated."""
     terms = unknowns.shape[1]
     for equation in range(len(unknowns)):
-        for one in range(terms):
-            row = unknowns[equation, one]
-            scaled = weights[equation] * coefficients[equation, one]
-            for other in range(terms):
-                at = ends[row]
-                columns[at] = unknowns[equation, other]
-                entries[at] = scaled * coefficients[equation, other]
-                ends[row] = at + 1
+        for first_term in range(terms):
+            row = unknowns[equation, first_term]
+            scaled = weights[equation] * coefficients[equation, first_term]
+            for second_term in range(terms):
+                slot = ends[row]
+                columns[slot] = unknowns[equation, second_term]
+                entries[slot] = scaled * coefficients[equation, second_term]
+                ends[row] = slot + 1
 
 
 @compiled(
@@ -54,11 +54,11 @@ def fill(
 def add_sides(
     unknowns: Array, coefficients: Array, targets: Array, weights: Array, side: Array
 ) -> None:
-    """Add what equations ask for to the right-hand side."""
+    """Add the equations' targets to the right-hand side."""
     for equation in range(len(unknowns)):
-        asked = weights[equation] * targets[equation]
+        weighted = weights[equation] * targets[equation]
         for term in range(unknowns.shape[1]):
-            side[unknowns[equation, term]] += coefficients[equation, term] * asked
+            side[unknowns[equation, term]] += coefficients[equation, term] * weighted
 
 
 @compiled(
@@ -80,17 +80,21 @@ def judge(
     answer: Array,
     square: Array,
 ) -> float:
-    """Write squared residuals in units of what is claimed; give what a probe sees used up."""
+    """Write squared standardized residuals; return the probe's estimate of the degrees of freedom.
+
+    The probe's term of the trace of the hat matrix, ``sum_e w_e i_e (a_e p) (a_e x)`` with ``x``
+    the solution for the probe ``p`` (Hutchinson's estimator).
+    """
     used = 0.0
     for equation in range(len(unknowns)):
-        left, asked, told = float(targets[equation]), 0.0, 0.0
+        residual, probed, response = float(targets[equation]), 0.0, 0.0
         for term in range(unknowns.shape[1]):
-            at, coefficient = unknowns[equation, term], coefficients[equation, term]
-            left -= coefficient * heights[at]
-            asked += coefficient * probe[at]
-            told += coefficient * answer[at]
-        square[equation] = information[equation] * left * left * correlated[equation]
-        used += weights[equation] * information[equation] * asked * told
+            slot, coefficient = unknowns[equation, term], coefficients[equation, term]
+            residual -= coefficient * heights[slot]
+            probed += coefficient * probe[slot]
+            response += coefficient * answer[slot]
+        square[equation] = information[equation] * residual * residual * correlated[equation]
+        used += weights[equation] * information[equation] * probed * response
     return used
 
 
@@ -98,23 +102,23 @@ def judge(
 def merged(
     starts: Array, ends: Array, columns: Array, entries: Array
 ) -> tuple[Array, Array, Array]:
-    """Sort every row, and add up entries that come twice."""
+    """Sort every row by column, and add up duplicates."""
     size = len(ends)
     first = np.zeros(size + 1, np.int32)
     filled = 0
     for row in range(size):
         begin = filled
-        for place in range(starts[row], ends[row]):
-            column, entry = columns[place], entries[place]
-            at = filled
-            while at > begin and columns[at - 1] >= column:
-                at -= 1
-            if at < filled and columns[at] == column:
-                entries[at] += entry
+        for index in range(starts[row], ends[row]):
+            column, entry = columns[index], entries[index]
+            slot = filled
+            while slot > begin and columns[slot - 1] >= column:
+                slot -= 1
+            if slot < filled and columns[slot] == column:
+                entries[slot] += entry
                 continue
-            for later in range(filled, at, -1):
+            for later in range(filled, slot, -1):
                 columns[later], entries[later] = columns[later - 1], entries[later - 1]
-            columns[at], entries[at] = column, entry
+            columns[slot], entries[slot] = column, entry
             filled += 1
         first[row + 1] = filled
     return first, columns[:filled].copy(), entries[:filled].copy()

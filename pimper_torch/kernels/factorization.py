@@ -1,10 +1,9 @@
 """Damped variable projection on the cone, patch by patch.
 
 Twin of ``photometry.variable_projection.solve_variable_projection`` for first-order light. A patch
-is packed first: samples and views that show nothing of it cost nothing. What is left stays in the
-cache while it is iterated. Radiance, weights and shading are float32, as they are in the
-reference there; sums over samples are taken in eight or sixteen parts, and those over views in
-float64.
+is packed first, without samples and views that have no data, and stays in the cache while it is
+iterated. Radiance, weights and shading are float32; sums over samples are vectorized, those over
+views are float64.
 """
 
 import math
@@ -22,8 +21,8 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# As in the reference: damping, steps of the samples, roundings that are zero, least spread; and
-# the codes of StopCause.
+# As in ``variable_projection`` and ``bilinear``: damping, steps of the samples, the residual that
+# counts as zero in roundings, minimum spread; and the codes of StopCause.
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 5.0
 _FOLLOWING = 2
 _ROUNDINGS = 30.0
@@ -37,21 +36,21 @@ _COLUMNS = (0, 1, 2, 3, 1, 2, 3, 2, 3, 3)
 
 
 class Patch(NamedTuple):
-    """A packed patch: views that count, and samples, padded to whole tiles.
+    """A packed patch: views and samples with data, padded to whole tiles.
 
     Attributes:
         radiance: View by sample.
-        given: How much each entry counts; 0 in the padding.
+        given: Weight of each entry; 0 in the padding.
         weight: The same, robust weights included.
-        residual: Space.
+        residual: Workspace.
         prior: Packed entry by sample.
         equations: The samples' normal equations: ten packed entries and the right-hand side.
         anchor: View by 4.
         regularization: Of each view.
-        slack: Sum of the pulls on the views that are left out, times 4.
-        num_views: Those too.
-        told: So many samples, the first, tell the spread.
-        level: Least spread of residuals.
+        slack: Sum of the regularization of the omitted views, times 4.
+        num_views: Omitted views included.
+        num_spread: The spread is estimated from so many samples, the first.
+        level: Minimum spread of residuals.
         scale: Of Cauchy's loss, in spreads; 0 for squares.
     """
 
@@ -65,7 +64,7 @@ class Patch(NamedTuple):
     regularization: Floats
     slack: float
     num_views: int
-    told: int
+    num_spread: int
     level: float
     scale: float
 
@@ -74,14 +73,14 @@ class Patch(NamedTuple):
 def _views_that_count(
     given: Floats, anchor: Floats, regularization: Floats, lights: Floats
 ) -> Integers:
-    """List the views that show something, or whose light is not where it is pulled to."""
+    """List the views with data, and those whose light is not at its anchor."""
     found = np.empty(len(given), np.int64)
     count = 0
     for f in range(len(given)):
-        settled = regularization[f] > 0
+        fixed = regularization[f] > 0
         for i in range(4):
-            settled = settled and lights[f, i] == anchor[f, i]
-        if not settled or np.any(given[f] > 0):
+            fixed = fixed and lights[f, i] == anchor[f, i]
+        if not fixed or np.any(given[f] > 0):
             found[count] = f
             count += 1
     return found[:count]
@@ -89,7 +88,7 @@ def _views_that_count(
 
 @compiled()
 def _samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
-    """List the samples with weight, and how many tell the spread: these are the first."""
+    """List the samples with data, those that estimate the spread first, and count the latter."""
     seen = np.zeros(given.shape[1], np.bool_)
     for f in range(len(given)):
         row = given[f]
@@ -101,12 +100,12 @@ def _samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
         if seen[k]:
             found[count] = k
             count += 1
-    told = count
+    num_spread = count
     for k in range(len(seen)):
         if seen[k] and k % stride > 0:
             found[count] = k
             count += 1
-    return found[:count], told
+    return found[:count], num_spread
 
 
 @compiled()
@@ -118,13 +117,13 @@ def _packed(
     prior: Floats,
     views: Integers,
     samples: Integers,
-    told: int,
+    num_spread: int,
     scale: float,
 ) -> Patch:
     num_views, num_samples = len(views), len(samples)
     padded = TILE * (-(-num_samples // TILE))
     shape = (num_views, padded)
-    left, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    radiance_rows, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     own_anchor, own_regularization = (
         np.empty((num_views, 4), np.float32),
         np.empty(num_views, np.float32),
@@ -133,32 +132,32 @@ def _packed(
     for f in range(len(regularization)):
         slack += 4 * regularization[f]
     for f in range(num_views):
-        source, heavy = radiance[views[f]], given[views[f]]
+        source, weights_row = radiance[views[f]], given[views[f]]
         for k in range(num_samples):
-            left[f, k], weight[f, k] = source[samples[k]], heavy[samples[k]]
-            size += abs(left[f, k])
+            radiance_rows[f, k], weight[f, k] = source[samples[k]], weights_row[samples[k]]
+            size += abs(radiance_rows[f, k])
             count += weight[f, k]
         own_anchor[f], own_regularization[f] = anchor[views[f]], regularization[views[f]]
         slack -= 4 * own_regularization[f]
-    known = np.zeros((10, padded), np.float32)
+    prior_rows = np.zeros((10, padded), np.float32)
     for i in range(10):
         for k in range(num_samples):
-            known[i, k] = prior[i, samples[k]]
-    # The padding's equations can be solved, too.
+            prior_rows[i, k] = prior[i, samples[k]]
+    # The identity: the padding's equations are regular.
     for i in (0, 4, 7, 9):
-        known[i, num_samples:] = 1
+        prior_rows[i, num_samples:] = 1
     return Patch(
-        radiance=left,
+        radiance=radiance_rows,
         given=weight,
         weight=weight.copy(),
         residual=np.empty(shape, np.float32),
-        prior=known,
+        prior=prior_rows,
         equations=np.empty((14, padded), np.float32),
         anchor=own_anchor,
         regularization=own_regularization,
         slack=max(slack, 0.0),
         num_views=len(regularization),
-        told=told,
+        num_spread=num_spread,
         level=_SMALLEST_SPREAD * size / max(count, 1.0),
         scale=scale,
     )
@@ -168,15 +167,15 @@ def _packed(
 def _solve(
     patch: Patch, lights: Floats, shading: Floats, limits: tuple[int, float, int, int]
 ) -> tuple[int, int]:
-    """Iterate one patch; lights and shading become the answer.
+    """Iterate one patch; lights and shading are replaced by the solution.
 
     Returns:
-        The steps taken, and the code of the cause.
+        The number of steps, and the code of the stop cause.
     """
     max_iterations, tolerance, small_steps, curvature_samples = limits
     size = lights.size
     slope, step = np.zeros((len(lights), 4)), np.zeros(size)
-    other_slope, other_lights, other = np.zeros_like(slope), lights.copy(), shading.copy()
+    new_slope, new_lights, new_shading = np.zeros_like(slope), lights.copy(), shading.copy()
     curvature, factor = np.zeros((size, size)), np.empty((size, size))
     spread = _reweigh(patch, lights, shading, 0.0)
     energy = _energy(patch)
@@ -194,12 +193,12 @@ def _solve(
         if solve_damped(curvature, damping * max(mean, 1e-300), step, factor):
             for f in range(len(lights)):
                 for i in range(4):
-                    other_lights[f, i] = lights[f, i] + step[4 * f + i]
-            other[:] = shading
-            _keep_scale(patch, lights, other_lights, other)
-            _equations(patch, other_lights)
-            follow(patch.equations, other, _FOLLOWING)
-            after = _evaluate(patch, other_lights, other, other_slope)
+                    new_lights[f, i] = lights[f, i] + step[4 * f + i]
+            new_shading[:] = shading
+            _keep_scale(patch, lights, new_lights, new_shading)
+            _equations(patch, new_lights)
+            follow(patch.equations, new_shading, _FOLLOWING)
+            after = _evaluate(patch, new_lights, new_shading, new_slope)
         better = after < cost
         exact = cost <= (_ROUNDINGS * _EPS) ** 2 * energy
         if better:
@@ -208,7 +207,7 @@ def _solve(
         stalled = damping > 1 / _EPS and not exact
         damping = max(damping, _EPS)
         if better:
-            lights[:], shading[:], slope[:] = other_lights, other, other_slope
+            lights[:], shading[:], slope[:] = new_lights, new_shading, new_slope
             cost = after
             if patch.scale > 0:
                 spread = _reweigh(patch, lights, shading, spread)
@@ -224,35 +223,35 @@ def _solve(
 
 
 @compiled(fast=True)
-def _reweigh(patch: Patch, lights: Floats, shading: Floats, guess: float) -> float:
-    """Let robust weights follow the residuals; give the scale that the next call starts from."""
+def _reweigh(patch: Patch, lights: Floats, shading: Floats, start_scale: float) -> float:
+    """Update the robust weights; return the scale that the next call starts from."""
     if patch.scale == 0:
         return 0.0
-    squares = np.empty(patch.radiance.shape[0] * patch.told, np.float32)
+    squares = np.empty(patch.radiance.shape[0] * patch.num_spread, np.float32)
     count = 0
     for f in range(len(lights)):
         _residual(patch, lights[f], shading, f)
-        rest, given = patch.residual[f], patch.given[f]
-        for k in range(patch.told):
-            squares[count] = rest[k] * rest[k]
+        residual_row, given = patch.residual[f], patch.given[f]
+        for k in range(patch.num_spread):
+            squares[count] = residual_row[k] * residual_row[k]
             count += given[k] > 0
-    variance, scale = robust_variance(squares[:count], guess)
+    variance, scale = robust_variance(squares[:count], start_scale)
     width = patch.scale * max(math.sqrt(variance), patch.level)
     one, inverse = np.float32(1), np.float32(1 / width if width > 0 else 0.0)
     for f in range(len(lights)):
-        rest, given, weight = patch.residual[f], patch.given[f], patch.weight[f]
-        for k in range(len(rest)):
-            relative = rest[k] * inverse
+        residual_row, given, weight = patch.residual[f], patch.given[f], patch.weight[f]
+        for k in range(len(residual_row)):
+            relative = residual_row[k] * inverse
             weight[k] = given[k] / (one + relative * relative)
     return scale
 
 
 @compiled(fast=True)
 def _residual(patch: Patch, light: Floats, shading: Floats, f: int) -> None:
-    radiance, rest = patch.radiance[f], patch.residual[f]
+    radiance, residual_row = patch.radiance[f], patch.residual[f]
     s, x, y, z = shading[0], shading[1], shading[2], shading[3]
-    for k in range(len(rest)):
-        rest[k] = radiance[k] - (
+    for k in range(len(residual_row)):
+        residual_row[k] = radiance[k] - (
             light[0] * s[k] + light[1] * x[k] + light[2] * y[k] + light[3] * z[k]
         )
 
@@ -273,9 +272,9 @@ def _energy(patch: Patch) -> float:
 def _equations(patch: Patch, lights: Floats) -> None:
     """Assemble the samples' normal equations."""
     for i in range(10):
-        total, known = patch.equations[i], patch.prior[i]
+        total, prior_rows = patch.equations[i], patch.prior[i]
         row, column = _ROWS[i], _COLUMNS[i]
-        total[:] = known
+        total[:] = prior_rows
         for f in range(len(lights)):
             weight, factor = patch.weight[f], lights[f, row] * lights[f, column]
             for k in range(len(total)):
@@ -291,7 +290,7 @@ def _equations(patch: Patch, lights: Floats) -> None:
 
 @compiled(fast=True)
 def _evaluate(patch: Patch, lights: Floats, shading: Floats, slope: Doubles) -> float:
-    """Give the objective; the slope becomes minus half its gradient by the lights."""
+    """Return the objective, and write minus half its gradient by the lights to ``slope``."""
     s, x, y, z = shading[0], shading[1], shading[2], shading[3]
     zero = np.float32(0)
     total = 0.0
@@ -299,21 +298,21 @@ def _evaluate(patch: Patch, lights: Floats, shading: Floats, slope: Doubles) -> 
         radiance, weight, light = patch.radiance[f], patch.weight[f], lights[f]
         cost, on_s, on_x, on_y, on_z = zero, zero, zero, zero, zero
         for k in range(len(s)):
-            rest = radiance[k] - (
+            residual = radiance[k] - (
                 light[0] * s[k] + light[1] * x[k] + light[2] * y[k] + light[3] * z[k]
             )
-            heavy = weight[k] * rest
-            cost += heavy * rest
-            on_s += heavy * s[k]
-            on_x += heavy * x[k]
-            on_y += heavy * y[k]
-            on_z += heavy * z[k]
+            weighted = weight[k] * residual
+            cost += weighted * residual
+            on_s += weighted * s[k]
+            on_x += weighted * x[k]
+            on_y += weighted * y[k]
+            on_z += weighted * z[k]
         total += float(cost)
         slope[f, 0], slope[f, 1], slope[f, 2], slope[f, 3] = on_s, on_x, on_y, on_z
         for i in range(4):
-            apart = float(light[i]) - float(patch.anchor[f, i])
-            total += patch.regularization[f] * apart * apart
-            slope[f, i] -= patch.regularization[f] * apart
+            difference = float(light[i]) - float(patch.anchor[f, i])
+            total += patch.regularization[f] * difference * difference
+            slope[f, i] -= patch.regularization[f] * difference
     return total + _bent(patch.prior, s, x, y, z)
 
 
@@ -331,17 +330,17 @@ def _bent(p: Floats, s: Floats, x: Floats, y: Floats, z: Floats) -> float:
 
 @compiled()
 def _keep_scale(patch: Patch, before: Floats, lights: Floats, shading: Floats) -> None:
-    """Hold the size of lights that nothing else holds, and shrink shading by as much."""
-    was, size = 0.0, 0.0
+    """Normalize lights without regularization to their former size; rescale shading inversely."""
+    before_size, size = 0.0, 0.0
     for f in range(len(lights)):
         if patch.regularization[f] > 0:
             return
         for i in range(4):
-            was += before[f, i] ** 2
+            before_size += before[f, i] ** 2
             size += lights[f, i] ** 2
-    if patch.slack > 0 or not (was > 0 and size > 0):
+    if patch.slack > 0 or not (before_size > 0 and size > 0):
         return
-    factor = np.float32(math.sqrt(was / size))
+    factor = np.float32(math.sqrt(before_size / size))
     lights *= factor
     shading /= factor
 
@@ -350,33 +349,36 @@ def _keep_scale(patch: Patch, before: Floats, lights: Floats, shading: Floats) -
 def _curvature(
     patch: Patch, lights: Floats, shading: Floats, samples: int, curvature: Doubles
 ) -> None:
-    """Sum the Gauss-Newton matrix of the lights, its upper triangle; equations are those there."""
+    """Sum the upper triangle of the Gauss-Newton matrix, with the present equations."""
     num_views, num_samples = patch.radiance.shape
     whitener = np.empty((12, num_samples), np.float32)
     whitening(patch.equations, shading, whitener)
     stride = max(1, num_samples // samples) if samples > 0 else 1
-    some = -(-num_samples // stride)
-    white, pairs = np.empty((3, num_views, some), np.float32), np.empty((10, some), np.float32)
+    chosen = -(-num_samples // stride)
+    white, pairs = (
+        np.empty((3, num_views, chosen), np.float32),
+        np.empty((10, chosen), np.float32),
+    )
     for i in range(10):
         target, first, second = pairs[i], shading[_ROWS[i]], shading[_COLUMNS[i]]
-        for k in range(some):
+        for k in range(chosen):
             target[k] = first[k * stride] * second[k * stride]
     for j in range(3):
         a, b, c, d = whitener[4 * j], whitener[4 * j + 1], whitener[4 * j + 2], whitener[4 * j + 3]
         for f in range(num_views):
             target, weight, light = white[j, f], patch.weight[f], lights[f]
-            for k in range(some):
+            for k in range(chosen):
                 at = k * stride
                 target[k] = weight[at] * (
                     light[0] * a[at] + light[1] * b[at] + light[2] * c[at] + light[3] * d[at]
                 )
-    heavy = np.zeros(some, np.float32)
+    weights_row = np.zeros(chosen, np.float32)
     for f in range(num_views):
-        for k in range(some):
-            heavy[k] = patch.weight[f, k * stride]
+        for k in range(chosen):
+            weights_row[k] = patch.weight[f, k * stride]
         for g in range(f, num_views):
-            _block(white, f, g, heavy, pairs, float(stride), curvature)
-            heavy[:] = 0
+            _block(white, f, g, weights_row, pairs, float(stride), curvature)
+            weights_row[:] = 0
         for i in range(4):
             curvature[4 * f + i, 4 * f + i] += patch.regularization[f]
 
@@ -386,20 +388,20 @@ def _block(
     white: Floats,
     f: int,
     g: int,
-    heavy: Floats,
+    weights_row: Floats,
     pairs: Floats,
     factor: float,
     curvature: Doubles,
 ) -> None:
-    """Sum the block of two views, ``n n^T`` times their weight less what samples explain."""
+    """Sum the block of two views: ``n n^T`` times the Schur complement of the samples."""
     u, v, w = white[0, f], white[1, f], white[2, f]
     x, y, z = white[0, g], white[1, g], white[2, g]
     a, b, c, d, e = pairs[0], pairs[1], pairs[2], pairs[3], pairs[4]
     i, j, h, m, n = pairs[5], pairs[6], pairs[7], pairs[8], pairs[9]
     zero = np.float32(0)
     sa = sb = sc = sd = se = si = sj = sh = sm = sn = zero
-    for k in range(len(heavy)):
-        fraction = heavy[k] - (u[k] * x[k] + v[k] * y[k] + w[k] * z[k])
+    for k in range(len(weights_row)):
+        fraction = weights_row[k] - (u[k] * x[k] + v[k] * y[k] + w[k] * z[k])
         sa += fraction * a[k]
         sb += fraction * b[k]
         sc += fraction * c[k]
@@ -411,10 +413,10 @@ def _block(
         sm += fraction * m[k]
         sn += fraction * n[k]
     sums = (sa, sb, sc, sd, se, si, sj, sh, sm, sn)
-    for place in range(10):
-        row, column = _ROWS[place], _COLUMNS[place]
-        curvature[4 * f + row, 4 * g + column] = factor * sums[place]
-        curvature[4 * f + column, 4 * g + row] = factor * sums[place]
+    for index in range(10):
+        row, column = _ROWS[index], _COLUMNS[index]
+        curvature[4 * f + row, 4 * g + column] = factor * sums[index]
+        curvature[4 * f + column, 4 * g + row] = factor * sums[index]
 
 
 @compiled(fast=True)
@@ -422,9 +424,9 @@ def _root_mean_square(patch: Patch, lights: Floats, shading: Floats) -> tuple[fl
     total, count = 0.0, 0.0
     for f in range(len(lights)):
         _residual(patch, lights[f], shading, f)
-        rest, given = patch.residual[f], patch.given[f]
-        for k in range(len(rest)):
-            total += given[k] * rest[k] * rest[k]
+        residual_row, given = patch.residual[f], patch.given[f]
+        for k in range(len(residual_row)):
+            total += given[k] * residual_row[k] * residual_row[k]
             count += given[k]
     return (math.sqrt(total / count) if count > 0 else 0.0), count > 0
 
@@ -459,26 +461,26 @@ def solve_on_cone(
     Args:
         radiance: Patch, view, sample; zero where missing.
         given: The weights; 0 where missing.
-        anchor: What lights are pulled to.
-        regularization: How strongly.
+        anchor: Of the lights.
+        regularization: Weight of the anchor.
         prior: Patch, packed, sample.
         scale: Of Cauchy's loss, in standard deviations; 0 for squares.
-        stride: The spread is taken over every so many samples.
-        max_iterations: Steps at most.
-        tolerance: See the reference.
-        small_steps: See the reference.
-        curvature_samples: See the reference.
-        lights: The start, and then the answer.
-        shading: The start, and then the answer; what has no weight stays.
-        weight: Zero; becomes what each entry counted.
-        iterations: Becomes the steps taken.
-        residual: Becomes the root mean square.
-        cause: Becomes the code of the cause.
+        stride: The spread is estimated from every so many samples.
+        max_iterations: Maximum number of steps.
+        tolerance: See the twin.
+        small_steps: See the twin.
+        curvature_samples: See the twin; 0 for all.
+        lights: The start, replaced by the solution.
+        shading: The start, replaced by the solution; samples without weight keep it.
+        weight: Result, zero before: final weights.
+        iterations: Result: number of steps.
+        residual: Result: root mean square.
+        cause: Result: code of the stop cause.
     """
     limits = (max_iterations, tolerance, small_steps, curvature_samples)
     for p in range(len(radiance)):
         views = _views_that_count(given[p], anchor[p], regularization[p], lights[p])
-        samples, told = _samples_that_count(given[p], stride)
+        samples, num_spread = _samples_that_count(given[p], stride)
         patch = _packed(
             radiance[p],
             given[p],
@@ -487,7 +489,7 @@ def solve_on_cone(
             prior[p],
             views,
             samples,
-            told,
+            num_spread,
             scale,
         )
         light = np.empty((len(views), 4), np.float32)
@@ -498,8 +500,8 @@ def solve_on_cone(
             for i in range(4):
                 shade[i, k] = shading[p, i, samples[k]]
         iterations[p], cause[p] = _solve(patch, light, shade, limits)
-        residual[p], some = _root_mean_square(patch, light, shade)
-        if not some:
+        residual[p], has_data = _root_mean_square(patch, light, shade)
+        if not has_data:
             cause[p] = _EMPTY
         for f in range(len(views)):
             lights[p, views[f]] = light[f]

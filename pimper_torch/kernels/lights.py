@@ -1,7 +1,7 @@
 """Lights and albedo fitted together: twin of ``photometry.light_fit``'s descent.
 
-Everything is view by sample, so that loops run along samples; a multiple of TILE of them, the last
-ones seen by no view.
+Arrays are view by sample, so that loops run along samples. Their count is a multiple of TILE; no
+view sees those of the padding.
 """
 
 import math
@@ -15,26 +15,30 @@ from pimper_torch.kernels.switch import compiled
 
 Doubles = NDArray[np.float64]
 
-# Samples whose equations are summed at once: those of 24 views then fit the cache.
+# Samples whose equations are summed together: those of 24 views then fit the cache.
 TILE = 256
 
-# As in the reference: Cauchy's scale in deviations, its least in brightnesses; and the damping.
+# As in ``light_fit`` and ``image_samples``: Cauchy's scale in standard deviations, its minimum in
+# mean brightnesses; the damping; and the fraction of a view's diagonal added to each entry.
 _TUNING, _MIN_SCALE = 2.385, 1e-4
 _DAMPING, _LESS, _MORE, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 0.25, 10.0, 1e-9, 1e6
-_FLOOR, _LARGE = 1e-9, 1e100
+_FLOOR = 1e-9
+
+# Products above this are replaced by their logarithm: a factor more does not overflow float64.
+_LARGE = 1e100
 
 
 @compiled(fast=True)
-def _shade(known: Doubles, lights: Doubles, shading: Doubles) -> None:
-    """Give the radiance of albedo 1: soft light has four numbers a view, a point light five."""
+def _shade(geometry: Doubles, lights: Doubles, shading: Doubles) -> None:
+    """Give the radiance of albedo 1, by the four harmonics or the five values of a point light."""
     for v in range(len(lights)):
         light, row = lights[v], shading[v]
-        a, b, c, d = known[0], known[1], known[2], known[3]
+        a, b, c, d = geometry[0], geometry[1], geometry[2], geometry[3]
         if len(light) == 4:
             for i in range(len(row)):
                 row[i] = light[0] * a[i] + light[1] * b[i] + light[2] * c[i] + light[3] * d[i]
             continue
-        e, f = known[4], known[5]
+        e, f = geometry[4], geometry[5]
         strength, x, y, z = _direction(light)
         for i in range(len(row)):
             p, q, r = x - light[4] * d[i], y - light[4] * e[i], z - light[4] * f[i]
@@ -51,17 +55,17 @@ def _direction(light: Doubles) -> tuple[float, float, float, float]:
 
 
 @compiled(fast=True)
-def _slopes(known: Doubles, light: Doubles, first: int, slopes: Doubles) -> None:
-    """Give the derivatives of a view's shading by its numbers, for a tile's samples."""
+def _slopes(geometry: Doubles, light: Doubles, first: int, slopes: Doubles) -> None:
+    """Give the derivatives of a view's shading by its light's parameters, for one tile."""
     if len(light) == 4:
         for j in range(4):
-            row = known[j, first : first + TILE]
+            row = geometry[j, first : first + TILE]
             for i in range(TILE):
                 slopes[j * TILE + i] = row[i]
         return
-    some = slice(first, first + TILE)
-    a, b, c = known[0, some], known[1, some], known[2, some]
-    d, e, f = known[3, some], known[4, some], known[5, some]
+    samples = slice(first, first + TILE)
+    a, b, c = geometry[0, samples], geometry[1, samples], geometry[2, samples]
+    d, e, f = geometry[3, samples], geometry[4, samples], geometry[5, samples]
     strength, x, y, z = _direction(light)
     for i in range(TILE):
         k, m, n = a[i], b[i], c[i]
@@ -71,10 +75,10 @@ def _slopes(known: Doubles, light: Doubles, first: int, slopes: Doubles) -> None
         facing = k * p + m * q + n * r
         lit = 1.0 if facing > 0 else 0.0
         inverse = 1 / distance
-        fall = lit * inverse * inverse * inverse
-        more = 3 * facing * inverse * inverse
-        g, h, j = fall * (k - more * p), fall * (m - more * q), fall * (n - more * r)
-        along = facing * fall - (g * x + h * y + j * z)
+        falloff = lit * inverse * inverse * inverse
+        radial = 3 * facing * inverse * inverse
+        g, h, j = falloff * (k - radial * p), falloff * (m - radial * q), falloff * (n - radial * r)
+        along = facing * falloff - (g * x + h * y + j * z)
         slopes[i] = 1.0
         slopes[TILE + i] = g + along * x
         slopes[2 * TILE + i] = h + along * y
@@ -83,35 +87,35 @@ def _slopes(known: Doubles, light: Doubles, first: int, slopes: Doubles) -> None
 
 
 @compiled()
-def _admit(lights: Doubles, closest: float) -> None:
-    """Bring the lights back to what makes sense: see the reference's models."""
+def _clamp(lights: Doubles, max_closeness: float) -> None:
+    """Project the parameters on their bounds: see ``light_models``."""
     for light in lights:
         light[0] = max(light[0], 0.0)
         if len(light) == 5:
-            light[4] = min(max(light[4], 0.0), closest)
+            light[4] = min(max(light[4], 0.0), max_closeness)
 
 
 @compiled(fast=True)
-def _leave(
+def _residuals(
     radiance: Doubles, seen: Doubles, albedo: Doubles, shading: Doubles, residual: Doubles
 ) -> None:
     for v in range(len(radiance)):
-        x, there, shade, left = radiance[v], seen[v], shading[v], residual[v]
+        x, visible, shade, left = radiance[v], seen[v], shading[v], residual[v]
         for i in range(len(albedo)):
-            left[i] = there[i] * (x[i] - albedo[i] * shade[i])
+            left[i] = visible[i] * (x[i] - albedo[i] * shade[i])
 
 
 @compiled(fast=True)
 def _weigh(residual: Doubles, seen: Doubles, scale: Doubles, weight: Doubles) -> float:
-    """Weigh by Cauchy's function, and give the sum of its loss."""
+    """Set Cauchy's weights, and return the sum of the loss."""
     total = 0.0
     for v in range(len(residual)):
-        left, there, heavy = residual[v], seen[v], weight[v]
+        left, visible, weights = residual[v], seen[v], weight[v]
         inverse = 1 / scale[v] if scale[v] > 0 else 0.0
         for i in range(len(left)):
             relative = left[i] * inverse
-            heavy[i] = there[i] / (1 + relative * relative)
-        # One logarithm of many factors.
+            weights[i] = visible[i] / (1 + relative * relative)
+        # A logarithm of a product is cheaper than a sum of logarithms.
         product, logarithm = 1.0, 0.0
         for i in range(len(left)):
             relative = left[i] * inverse
@@ -129,10 +133,10 @@ def _scales(
 ) -> None:
     squares = np.empty(residual.shape[1] + 1)
     for v in range(len(residual)):
-        left, there, count = residual[v], seen[v], 0
+        left, visible, count = residual[v], seen[v], 0
         for i in range(len(left)):
             squares[count] = left[i] * left[i]
-            count += there[i] > 0
+            count += visible[i] > 0
         variance, guess[v] = robust_variance(squares[:count], guess[v])
         scale[v] = widen * _TUNING * max(math.sqrt(variance), _MIN_SCALE * level[v])
 
@@ -147,10 +151,10 @@ def _settle(
     residual: Doubles,
     albedo: Doubles,
 ) -> float:
-    """Give the albedo that suits shading best, by the weights there are, then by its own.
+    """Solve for albedo with the present weights, and again with weights from its residuals.
 
     Returns:
-        The loss of the residuals that are left; weights and residuals go with it.
+        The loss of the last residuals; weights and residuals are updated.
     """
     square, product = np.empty_like(albedo), np.empty_like(albedo)
     cost = 0.0
@@ -158,22 +162,22 @@ def _settle(
         square[:] = 0
         product[:] = 0
         for v in range(len(radiance)):
-            x, heavy, shade = radiance[v], weight[v], shading[v]
+            x, weights, shade = radiance[v], weight[v], shading[v]
             for i in range(len(albedo)):
-                square[i] += heavy[i] * shade[i] * shade[i]
+                square[i] += weights[i] * shade[i] * shade[i]
             for i in range(len(albedo)):
-                product[i] += heavy[i] * shade[i] * x[i]
+                product[i] += weights[i] * shade[i] * x[i]
         for i in range(len(albedo)):
             if square[i] > 0:
                 albedo[i] = product[i] / square[i]
-        _leave(radiance, seen, albedo, shading, residual)
+        _residuals(radiance, seen, albedo, shading, residual)
         cost = _weigh(residual, seen, scale, weight)
     return cost
 
 
 @compiled(fast=True)
 def _tile(
-    known: Doubles,
+    geometry: Doubles,
     lights: Doubles,
     shading: Doubles,
     residual: Doubles,
@@ -183,145 +187,147 @@ def _tile(
     slopes: Doubles,
     cross: Doubles,
     own: Doubles,
-    regularization: Doubles,
+    albedo_gradient: Doubles,
     matrix: Doubles,
-    downhill: Doubles,
+    gradient: Doubles,
 ) -> None:
-    """Add a tile's part of the lights' own equations, and set up its albedos'."""
+    """Add a tile's part of the equations of the lights, and set up those of its albedos."""
     num_views, size = lights.shape
-    some = slice(first, first + TILE)
-    square, push, rho = own[some], regularization[some], albedo[some]
+    samples = slice(first, first + TILE)
+    square, by_albedo, albedo_tile = own[samples], albedo_gradient[samples], albedo[samples]
     square[:] = 0
-    push[:] = 0
-    by = np.empty(TILE)
+    by_albedo[:] = 0
+    weighted_slope = np.empty(TILE)
     for v in range(num_views):
-        _slopes(known, lights[v], first, slopes)
-        heavy, shade, left = weight[v, some], shading[v, some], residual[v, some]
+        _slopes(geometry, lights[v], first, slopes)
+        weights, shade, left = weight[v, samples], shading[v, samples], residual[v, samples]
         for i in range(TILE):
-            square[i] += heavy[i] * shade[i] * shade[i]
+            square[i] += weights[i] * shade[i] * shade[i]
         for i in range(TILE):
-            push[i] += heavy[i] * left[i] * shade[i]
+            by_albedo[i] += weights[i] * left[i] * shade[i]
         for p in range(size):
             for i in range(TILE):
-                by[i] = heavy[i] * rho[i] * slopes[p * TILE + i]
+                weighted_slope[i] = weights[i] * albedo_tile[i] * slopes[p * TILE + i]
             total = 0.0
-            row = cross[v * size + p, some]
+            row = cross[v * size + p, samples]
             for i in range(TILE):
-                row[i] = by[i] * shade[i]
+                row[i] = weighted_slope[i] * shade[i]
             for i in range(TILE):
-                total += by[i] * left[i]
-            downhill[v * size + p] += total
+                total += weighted_slope[i] * left[i]
+            gradient[v * size + p] += total
             for q in range(p, size):
                 total = 0.0
                 for i in range(TILE):
-                    total += by[i] * (rho[i] * slopes[q * TILE + i])
+                    total += weighted_slope[i] * (albedo_tile[i] * slopes[q * TILE + i])
                 matrix[v * size + p, v * size + q] += total
 
 
 @compiled(fast=True)
 def _eliminate(cross: Doubles, inverse: Doubles, first: int, matrix: Doubles) -> None:
-    """Take what a tile's albedos explain from the lights' equations, upper triangle."""
-    heavy = np.empty(TILE)
-    some = slice(first, first + TILE)
-    own = inverse[some]
+    """Subtract a tile's part of the Schur complement from the equations, upper triangle."""
+    weights = np.empty(TILE)
+    samples = slice(first, first + TILE)
+    own = inverse[samples]
     for p in range(len(cross)):
-        row = cross[p, some]
+        row = cross[p, samples]
         shows = 0.0
         for i in range(TILE):
-            heavy[i] = own[i] * row[i]
-            shows += heavy[i] * heavy[i]
+            weights[i] = own[i] * row[i]
+            shows += weights[i] * weights[i]
         if shows == 0:
             continue
         q = p
         while q + 4 <= len(cross):
-            a, b = cross[q, some], cross[q + 1, some]
-            c, d = cross[q + 2, some], cross[q + 3, some]
+            a, b = cross[q, samples], cross[q + 1, samples]
+            c, d = cross[q + 2, samples], cross[q + 3, samples]
             on_a = on_b = on_c = on_d = 0.0
             for i in range(TILE):
-                on_a += heavy[i] * a[i]
-                on_b += heavy[i] * b[i]
-                on_c += heavy[i] * c[i]
-                on_d += heavy[i] * d[i]
+                on_a += weights[i] * a[i]
+                on_b += weights[i] * b[i]
+                on_c += weights[i] * c[i]
+                on_d += weights[i] * d[i]
             matrix[p, q] -= on_a
             matrix[p, q + 1] -= on_b
             matrix[p, q + 2] -= on_c
             matrix[p, q + 3] -= on_d
             q += 4
         while q < len(cross):
-            a = cross[q, some]
+            a = cross[q, samples]
             on_a = 0.0
             for i in range(TILE):
-                on_a += heavy[i] * a[i]
+                on_a += weights[i] * a[i]
             matrix[p, q] -= on_a
             q += 1
 
 
 @compiled(fast=True)
 def _step(
-    known: Doubles,
+    geometry: Doubles,
     lights: Doubles,
     shading: Doubles,
     residual: Doubles,
     weight: Doubles,
     albedo: Doubles,
     damping: float,
-    closest: float,
+    max_closeness: float,
     cross: Doubles,
-    moved: Doubles,
-    changed: Doubles,
+    new_lights: Doubles,
+    new_albedo: Doubles,
 ) -> bool:
-    """Solve Gauss-Newton's damped equations, albedos eliminated; tell whether they allow it."""
+    """Solve the damped Gauss-Newton equations, albedos eliminated; false if not positive."""
     num_views, size = lights.shape
     count, num_samples = num_views * size, len(albedo)
     padded = 4 * (-(-count // 4))
-    matrix, downhill = np.zeros((padded, padded)), np.zeros(padded)
-    own, regularization = np.empty(num_samples), np.empty(num_samples)
+    matrix, gradient = np.zeros((padded, padded)), np.zeros(padded)
+    own, albedo_gradient = np.empty(num_samples), np.empty(num_samples)
     slopes = np.empty(size * TILE)
     for first in range(0, num_samples, TILE):
         _tile(
-            known, lights, shading, residual, weight, albedo, first,
-            slopes, cross, own, regularization, matrix, downhill,
+            geometry, lights, shading, residual, weight, albedo, first,
+            slopes, cross, own, albedo_gradient, matrix, gradient,
         )  # fmt: skip
     for v in range(num_views):
         total = 0.0
         for p in range(size):
             total += matrix[v * size + p, v * size + p]
         for p in range(size):
-            at = v * size + p
-            matrix[at, at] += damping * matrix[at, at] + (_FLOOR * total if total > 0 else 1.0)
+            index = v * size + p
+            matrix[index, index] += damping * matrix[index, index] + (
+                _FLOOR * total if total > 0 else 1.0
+            )
     for i in range(num_samples):
         own[i] = 1 / (own[i] * (1 + damping)) if own[i] > 0 else 0.0
     for first in range(0, num_samples, TILE):
         _eliminate(cross, own, first, matrix)
     for v in range(num_views):
         for p in range(size):
-            moved[v, p] = lights[v, p] + downhill[v * size + p]
-    _admit(moved, closest)
-    side = np.zeros(padded)
-    for at in range(count):
-        v, p = at // size, at % size
-        row = cross[at]
+            new_lights[v, p] = lights[v, p] + gradient[v * size + p]
+    _clamp(new_lights, max_closeness)
+    rhs = np.zeros(padded)
+    for index in range(count):
+        v, p = index // size, index % size
+        row = cross[index]
         total = 0.0
         for i in range(num_samples):
-            total += row[i] * own[i] * regularization[i]
-        side[at] = downhill[at] - total
-        if moved[v, p] == lights[v, p]:
-            # A parameter that would only be pushed over its bound stays out of the others' way.
-            matrix[at, :] = 0
-            matrix[:, at] = 0
-            matrix[at, at], side[at] = 1.0, 0.0
-    for at in range(count, padded):
-        matrix[at, at] = 1.0
-    if not solve_damped(matrix, 0.0, side, np.empty_like(matrix)):
+            total += row[i] * own[i] * albedo_gradient[i]
+        rhs[index] = gradient[index] - total
+        if new_lights[v, p] == lights[v, p]:
+            # Active bound: the gradient points out of the feasible set.
+            matrix[index, :] = 0
+            matrix[:, index] = 0
+            matrix[index, index], rhs[index] = 1.0, 0.0
+    for index in range(count, padded):
+        matrix[index, index] = 1.0
+    if not solve_damped(matrix, 0.0, rhs, np.empty_like(matrix)):
         return False
-    for at in range(count):
-        moved[at // size, at % size] = lights[at // size, at % size] + side[at]
-        row, by = cross[at], side[at]
+    for index in range(count):
+        new_lights[index // size, index % size] = lights[index // size, index % size] + rhs[index]
+        row, step = cross[index], rhs[index]
         for i in range(num_samples):
-            regularization[i] -= by * row[i]
+            albedo_gradient[i] -= step * row[i]
     for i in range(num_samples):
-        changed[i] = albedo[i] + own[i] * regularization[i]
-    _admit(moved, closest)
+        new_albedo[i] = albedo[i] + own[i] * albedo_gradient[i]
+    _clamp(new_lights, max_closeness)
     return True
 
 
@@ -330,38 +336,39 @@ def _step(
     " float64[:,::1], float64[::1])"
 )
 def fit(
-    known: Doubles,
+    geometry: Doubles,
     radiance: Doubles,
     seen: Doubles,
     level: Doubles,
-    closest: float,
+    max_closeness: float,
     limit: int,
     min_gain: float,
     lights: Doubles,
     albedo: Doubles,
 ) -> None:
-    """Step on lights and albedo together; both hold the start, and then the answer.
+    """Minimize over lights and albedo together, in place.
 
     Args:
-        known: Rows of the samples: of soft light the four harmonics; of a point light the normal's
-            coordinates and the place's.
+        geometry: Rows of the samples: the four harmonics; or, for a point light, the coordinates
+            of the normals and of the points.
         radiance: View by sample; zero where not seen.
         seen: 1 or 0.
-        level: Brightness of each view.
-        closest: A point light's closeness at most.
-        limit: Steps at most.
-        min_gain: Fraction of the loss that the last step gains at most.
-        lights: View by number.
-        albedo: Of each sample.
+        level: Mean brightness of each view.
+        max_closeness: Upper bound of a point light's inverse distance.
+        limit: Maximum number of steps.
+        min_gain: A step that lowers the loss by less than this fraction is the last.
+        lights: View by parameter; the start, replaced by the solution.
+        albedo: Of each sample; the start, replaced by the solution.
     """
     shading, residual = np.empty_like(radiance), np.empty_like(radiance)
-    under, left, weight = np.empty_like(radiance), np.empty_like(radiance), np.empty_like(radiance)
+    trial_shading, new_residual = np.empty_like(radiance), np.empty_like(radiance)
+    weight = np.empty_like(radiance)
     cross = np.empty((lights.size, len(albedo)))
-    moved, changed = np.empty_like(lights), np.empty_like(albedo)
+    new_lights, new_albedo = np.empty_like(lights), np.empty_like(albedo)
     scale, guess = np.zeros(len(lights)), np.zeros(len(lights))
-    _admit(lights, closest)
-    _shade(known, lights, shading)
-    _leave(radiance, seen, albedo, shading, residual)
+    _clamp(lights, max_closeness)
+    _shade(geometry, lights, shading)
+    _residuals(radiance, seen, albedo, shading, residual)
     damping = _DAMPING
     for step in range(limit):
         widen = max(1.0, 4.0 * 0.7**step)
@@ -369,14 +376,14 @@ def fit(
         cost = _weigh(residual, seen, scale, weight)
         after = np.inf
         if _step(
-            known, lights, shading, residual, weight, albedo, damping, closest,
-            cross, moved, changed,
+            geometry, lights, shading, residual, weight, albedo, damping, max_closeness,
+            cross, new_lights, new_albedo,
         ):  # fmt: skip
-            _shade(known, moved, under)
-            after = _settle(radiance, seen, under, scale, weight, left, changed)
+            _shade(geometry, new_lights, trial_shading)
+            after = _settle(radiance, seen, trial_shading, scale, weight, new_residual, new_albedo)
         if after < cost:
-            lights[:], albedo[:] = moved, changed
-            shading[:], residual[:] = under, left
+            lights[:], albedo[:] = new_lights, new_albedo
+            shading[:], residual[:] = trial_shading, new_residual
             damping = max(damping * _LESS, _MIN_DAMPING)
             if widen == 1 and after > cost * (1 - min_gain):
                 break

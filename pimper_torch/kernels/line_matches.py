@@ -1,7 +1,4 @@
-"""The most alike of the features near each feature's epipolar line, of two photographs at once.
-
-The compiled twin of :func:`pimper_torch.sfm.guided.likeness`.
-"""
+"""The best matches near each feature's epipolar line: twin of ``sfm.guided.likeness``."""
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +28,7 @@ def most_alike(
     first_best: Indices,
     second_best: Indices,
 ) -> None:
-    """Find, for every feature, the two largest products of descriptors among those near.
+    """Find, for every feature, the two largest products of descriptors near its epipolar line.
 
     Args:
         first: Pixels in one photograph.
@@ -41,15 +38,15 @@ def most_alike(
         matrix: Homography from the first photograph, or fundamental matrix.
         planar: Whether it is a homography.
         max_error_px: Distance from the mapped point, or Sampson's from the epipolar line.
-        first_products: The largest and the second largest go there, before that -1.
+        first_products: Result, -1 before: the largest and the second largest.
         second_products: The same for features of the other photograph.
-        first_best: Which feature the largest is with, before that -1.
+        first_best: Result, -1 before: index of the feature with the largest.
         second_best: The same.
     """
     count, length = len(second), second_descriptors.shape[1]
     x, y = np.empty(count, np.float32), np.empty(count, np.float32)
-    slope, near = np.zeros(count, np.float32), np.empty(count, np.int64)
-    # From the centre of all on, single precision tells a hundredth of a pixel.
+    slope, candidates = np.zeros(count, np.float32), np.empty(count, np.int64)
+    # Relative to the centroid, float32 resolves a hundredth of a pixel.
     centre_x, centre_y = second[:, 0].mean(), second[:, 1].mean()
     for j in range(count):
         u, v = second[j, 0], second[j, 1]
@@ -68,18 +65,18 @@ def most_alike(
         if planar:
             at_x, at_y = np.float32(a / c - centre_x), np.float32(b / c - centre_y)
             for j in range(count):
-                near[found] = j
+                candidates[found] = j
                 found += (x[j] - at_x) ** 2 + (y[j] - at_y) ** 2 <= limit
         else:
             line_x, line_y = np.float32(a), np.float32(b)
             offset = np.float32(a * centre_x + b * centre_y + c)
             own = np.float32(max_error_px**2 * (a * a + b * b))
             for j in range(count):
-                near[found] = j
+                candidates[found] = j
                 found += (x[j] * line_x + y[j] * line_y + offset) ** 2 <= own + slope[j]
         mine = first_descriptors[i]
-        for place in range(found):
-            j = near[place]
+        for index in range(found):
+            j = candidates[index]
             theirs = second_descriptors[j]
             product = np.float32(0)
             for k in range(length):

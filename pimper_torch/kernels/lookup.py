@@ -1,4 +1,4 @@
-"""Where a place lies between the pixels of a level of a pyramid."""
+"""Bilinear interpolation in one level of a pyramid, and the levels of a footprint."""
 
 import math
 from typing import Any
@@ -15,19 +15,19 @@ Array = NDArray[Any]
     "Tuple((int64, int64, int64, float32, float32))(int64, int64, float64, float64)",
 )
 def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int, float, float]:
-    """Give the pixel to the upper left, the steps to the others, and how far on the place lies.
+    """Give the upper left one of the four pixels around a point, and bilinear weights.
 
     Args:
         height: Of the level.
         width: Of it.
-        x: To the right, counted from the first pixel's centre; what lies beyond is at the border.
+        x: To the right, counted from the first pixel's centre; clamped to the border.
         y: Down.
 
     Returns:
         An index, the steps to the pixels at the right and below (0 at the border), and the
         weights of these.
     """
-    # Not a number compares false, and is at the border too.
+    # NaN compares false, and is clamped to the border too.
     x = min(x, width - 1.0) if x > 0 else 0.0
     y = min(y, height - 1.0) if y > 0 else 0.0
     column, row = int(x), int(y)
@@ -38,11 +38,11 @@ def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int,
 
 @compiled("Tuple((int64, float32))(float64, int64)")
 def blended_level(squared_footprint: float, count: int) -> tuple[int, float]:
-    """Give the finer of the two levels that a footprint lies between, and the other's weight.
+    """Give the finer of the two levels around a footprint, and the weight of the coarser one.
 
     Args:
-        squared_footprint: Pixels of the finest level.
-        count: Of the levels.
+        squared_footprint: Area of the footprint, pixels of the finest level.
+        count: Number of levels.
     """
     if squared_footprint <= 1:
         return 0, 0.0

@@ -1,7 +1,4 @@
-"""Patches of a view aligned with templates, one after the other.
-
-The compiled twin of the iterations in :func:`pimper_torch.sfm.track observations._iterated`.
-"""
+"""Patches of a view aligned with templates: twin of ``sfm.track_observations._iterated``."""
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +23,7 @@ def align(
     values: Floats,
     slopes: Floats,
     inverse: Floats,
-    places: Floats,
+    offsets: Floats,
     root: Floats,
     light: Floats,
     limits: Doubles,
@@ -43,21 +40,21 @@ def align(
         values: Of the templates, light taken out.
         slopes: By a step along the plane.
         inverse: Of the slopes' normal equations.
-        places: Steps of the plane, homogeneous, one column a sample.
+        offsets: Steps of the plane, homogeneous, one column a sample.
         root: Of the window's weights.
-        light: What light may change, orthonormal columns.
-        limits: Iterations; the longest step; the one that ends; iterations after which a patch
-            must have some correlation; which; bounds of the contrast; the longest shift.
-        shift: Along the plane goes there; infinite where the patch was lost or did not arrive.
-        deviation: Of the place along its worst direction, in steps.
-        correlation: With the template.
+        light: Basis of changes of light, orthonormal columns.
+        limits: Iterations; the longest step; the step that converges; iterations after which the
+            correlation is tested; its minimum; bounds of the contrast; the longest shift.
+        shift: Result, along the plane; infinite where the patch was lost or did not converge.
+        deviation: Result: of the point along its worst direction, in steps.
+        correlation: Result: with the template.
     """
     height, width = log.shape
-    samples, ways = light.shape
+    samples, num_components = light.shape
     patch = np.empty(samples, np.float32)
-    iterations, trial = int(limits[0]), int(limits[3])
-    longest, converged, hopeless = limits[1], limits[2], limits[4]
-    least, most, farthest = limits[5], limits[6], limits[7]
+    iterations, grace = int(limits[0]), int(limits[3])
+    max_step, converged, min_correlation = limits[1], limits[2], limits[4]
+    min_contrast, max_contrast, max_shift = limits[5], limits[6], limits[7]
     total = np.float32(0)
     for s in range(samples):
         total += root[s] * root[s]
@@ -70,21 +67,21 @@ def align(
             power += template[s] * template[s]
         power = max(power, np.float32(1e-12))
         trace = (float(inverse[t, 0, 0]) + inverse[t, 1, 1]) / 2
-        apart = (float(inverse[t, 0, 0]) - inverse[t, 1, 1]) / 2
-        spread = trace + np.sqrt(apart**2 + float(inverse[t, 0, 1]) ** 2)
+        half_difference = (float(inverse[t, 0, 0]) - inverse[t, 1, 1]) / 2
+        spread = trace + np.sqrt(half_difference**2 + float(inverse[t, 0, 1]) ** 2)
         along, across = 0.0, 0.0
-        arrived = False
+        has_converged = False
         for iteration in range(iterations):
             at_x = h[0, 2] + h[0, 0] * along + h[0, 1] * across
             at_y = h[1, 2] + h[1, 0] * along + h[1, 1] * across
             at_z = h[2, 2] + h[2, 0] * along + h[2, 1] * across
             for s in range(samples):
-                u, v = places[0, s], places[1, s]
+                u, v = offsets[0, s], offsets[1, s]
                 z = at_z + h[2, 0] * u + h[2, 1] * v
                 over = 1 / z if z > 0 else 0.0
                 x = (at_x + h[0, 0] * u + h[0, 1] * v) * over - 0.5
                 y = (at_y + h[1, 0] * u + h[1, 1] * v) * over - 0.5
-                # Written so that what is no number is inside the photograph, too.
+                # NaN compares false, and is clamped into the photograph too.
                 x = min(x, width - 1.0) if x > 0 else 0.0
                 y = min(y, height - 1.0) if y > 0 else 0.0
                 column, row = min(int(x), width - 2), min(int(y), height - 2)
@@ -93,37 +90,37 @@ def align(
                 lower = log[row + 1, column]
                 lower += right * (log[row + 1, column + 1] - lower)
                 patch[s] = (upper + down * (lower - upper)) * root[s]
-            for way in range(ways):
+            for component in range(num_components):
                 fraction = np.float32(0)
                 for s in range(samples):
-                    fraction += patch[s] * light[s, way]
+                    fraction += patch[s] * light[s, component]
                 for s in range(samples):
-                    patch[s] -= fraction * light[s, way]
+                    patch[s] -= fraction * light[s, component]
             common, norm = np.float32(0), np.float32(0)
             for s in range(samples):
                 common += patch[s] * template[s]
                 norm += patch[s] * patch[s]
-            contrast = min(max(common / power, np.float32(least)), np.float32(most))
-            regularization_x, regularization_y, left = np.float32(0), np.float32(0), np.float32(0)
+            contrast = min(max(common / power, np.float32(min_contrast)), np.float32(max_contrast))
+            gradient_x, gradient_y, squares = np.float32(0), np.float32(0), np.float32(0)
             for s in range(samples):
                 residual = patch[s] / contrast - template[s]
-                regularization_x += slope[s, 0] * residual
-                regularization_y += slope[s, 1] * residual
-                left += residual * residual
-            step_x = -(inverse[t, 0, 0] * regularization_x + inverse[t, 0, 1] * regularization_y)
-            step_y = -(inverse[t, 1, 0] * regularization_x + inverse[t, 1, 1] * regularization_y)
+                gradient_x += slope[s, 0] * residual
+                gradient_y += slope[s, 1] * residual
+                squares += residual * residual
+            step_x = -(inverse[t, 0, 0] * gradient_x + inverse[t, 0, 1] * gradient_y)
+            step_y = -(inverse[t, 1, 0] * gradient_x + inverse[t, 1, 1] * gradient_y)
             length = np.sqrt(float(step_x) ** 2 + float(step_y) ** 2)
-            scale = longest / max(length, longest)
+            scale = max_step / max(length, max_step)
             along += step_x * scale
             across += step_y * scale
-            deviation[i] = np.sqrt(left / total * spread)
+            deviation[i] = np.sqrt(squares / total * spread)
             correlation[i] = common / max(np.sqrt(norm) * np.sqrt(power), np.float32(1e-12))
-            if np.sqrt(along**2 + across**2) > farthest:
+            if np.sqrt(along**2 + across**2) > max_shift:
                 break
-            if iteration >= trial and correlation[i] < hopeless:
+            if iteration >= grace and correlation[i] < min_correlation:
                 break
             if length <= converged:
-                arrived = True
+                has_converged = True
                 break
-        shift[i, 0] = along if arrived else np.inf
-        shift[i, 1] = across if arrived else np.inf
+        shift[i, 0] = along if has_converged else np.inf
+        shift[i, 1] = across if has_converged else np.inf

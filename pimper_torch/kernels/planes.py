@@ -1,4 +1,4 @@
-"""Planes through the inverse depths round every pixel: the twin of ``fitted_planes``."""
+"""Robust plane fits to the inverse depths around every pixel: twin of ``fitted_planes``."""
 
 import math
 
@@ -26,7 +26,7 @@ def plane_fits(
 
     Args:
         inverse_depth: Of a view.
-        valid: Which pixels count; only these get planes.
+        valid: Pixels that are used; only these get planes.
         step: Unit of the planes, inverse depth.
         radius: Of the windows, pixels.
         reach: Steps from the centre at which a pixel's first weight has fallen to 0.6.
@@ -38,54 +38,54 @@ def plane_fits(
     height, width = inverse_depth.shape
     side = 2 * radius + 1
     count = side * side
-    around, weight = np.empty(count), np.empty(count)
+    differences, weight = np.empty(count), np.empty(count)
     across_by, down_by = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
-    for place in range(count):
-        across_by[place], down_by[place] = place % side - radius, place // side - radius
+    for index in range(count):
+        across_by[index], down_by[index] = index % side - radius, index // side - radius
     for y in range(height):
         for x in range(width):
             if not valid[y, x]:
                 continue
             centre = inverse_depth[y, x]
-            for place in range(count):
-                row, column = y + down_by[place], x + across_by[place]
-                weight[place] = 0
-                around[place] = 0
+            for index in range(count):
+                row, column = y + down_by[index], x + across_by[index]
+                weight[index] = 0
+                differences[index] = 0
                 if 0 <= row < height and 0 <= column < width and valid[row, column]:
-                    away = (inverse_depth[row, column] - centre) / step
-                    around[place] = away
-                    weight[place] = math.exp(-((away / reach) ** 2) / 2)
+                    difference = (inverse_depth[row, column] - centre) / step
+                    differences[index] = difference
+                    weight[index] = math.exp(-((difference / reach) ** 2) / 2)
             offset = across = down = 0.0
             for _ in range(iterations):
                 # Upper triangle of the normal equations for (1, u, v), and their right side.
                 n, nu, nv, uu, uv, vv = ridge, 0.0, 0.0, ridge, 0.0, ridge
                 b, bu, bv = 0.0, 0.0, 0.0
-                for place in range(count):
-                    w = weight[place]
-                    u, v = across_by[place], down_by[place]
+                for index in range(count):
+                    w = weight[index]
+                    u, v = across_by[index], down_by[index]
                     n += w
                     nu += w * u
                     nv += w * v
                     uu += w * (u * u)
                     uv += w * (u * v)
                     vv += w * (v * v)
-                    told = w * around[place]
-                    b += told
-                    bu += told * u
-                    bv += told * v
+                    weighted = w * differences[index]
+                    b += weighted
+                    bu += weighted * u
+                    bv += weighted * v
                 first, second, third = uu * vv - uv * uv, uv * nv - nu * vv, nu * uv - uu * nv
-                whole = n * first + nu * second + nv * third
+                determinant = n * first + nu * second + nv * third
                 fourth, fifth, sixth = n * vv - nv * nv, nu * nv - n * uv, n * uu - nu * nu
-                offset = (first * b + second * bu + third * bv) / whole
-                across = (second * b + fourth * bu + fifth * bv) / whole
-                down = (third * b + fifth * bu + sixth * bv) / whole
+                offset = (first * b + second * bu + third * bv) / determinant
+                across = (second * b + fourth * bu + fifth * bv) / determinant
+                down = (third * b + fifth * bu + sixth * bv) / determinant
                 total = power = 0.0
-                for place in range(count):
-                    if weight[place] > 0:
-                        u, v = across_by[place], down_by[place]
-                        square = (around[place] - offset - across * u - down * v) ** 2
+                for index in range(count):
+                    if weight[index] > 0:
+                        u, v = across_by[index], down_by[index]
+                        square = (differences[index] - offset - across * u - down * v) ** 2
                         w = math.exp(-square / 2)
-                        weight[place] = w
+                        weight[index] = w
                         total += w
                         power += w * square
             fits[0, y, x], fits[1, y, x], fits[2, y, x] = offset, across, down

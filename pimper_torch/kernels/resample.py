@@ -1,7 +1,7 @@
-"""All views of a bucket of templates in one pass; the twin of what ``patches.warp`` does in torch.
+"""All views resampled on a bucket of templates in one pass: twin of ``patches.warp``.
 
-What is handed over is documented there and in ``patches.sources``: pyramids are rows of pixels,
-the finest level by itself, ``levels`` lists their height, width and the places of their planes.
+Pyramids are rows of pixels (see ``patches.sources``), the finest level in an array of its own;
+``levels`` lists height, width and offset of each.
 """
 
 import math
@@ -41,15 +41,14 @@ def register(
     radiance: Array,
     valid: Array,
 ) -> None:
-    """Resample, and say what is missing but for what is hidden.
+    """Resample the views, and mark valid samples, occlusion aside.
 
     Args:
-        finest: Images, a row a view.
-        coarser: Their further levels, one after another.
+        finest: Images, one row per view.
+        coarser: Their coarser levels, concatenated.
         unusable_finest: Fraction of every pixel that is unusable, in 255ths.
-        unusable_coarser: Of further levels.
-        levels: Height, width and where its planes start in a row of ``coarser``, counted in
-            planes' pixels: that of one channel.
+        unusable_coarser: Of the coarser levels.
+        levels: Height, width and offset in a row of ``coarser``, in pixels of one channel.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
         sizes_px: Of the views.
@@ -57,41 +56,41 @@ def register(
         spacing: Of every template.
         depth: Of every sample.
         outward: Unit normals, patch frame.
-        inside: Samples that are asked for.
-        min_facing: Cosine of the steepest angle.
-        dark_level: Of the mean over the channels.
-        radiance: Filled.
-        valid: Filled.
+        inside: Samples of the templates.
+        min_facing: Cosine of the steepest viewing angle.
+        dark_level: Mean over the channels below which a sample is invalid.
+        radiance: Result.
+        valid: Result.
     """
     patches, views, channels, height, width = radiance.shape
     fine_plane = levels[0, 0] * levels[0, 1]
     count = len(levels)
     fractions = shrinkage(levels)
     pixels = np.empty((height, width, 2), np.float64)
-    wanted = np.empty((height, width), np.bool_)
-    found = np.empty(channels, np.float32)
+    visible = np.empty((height, width), np.bool_)
+    blended = np.empty(channels, np.float32)
     steepest = min_facing * min_facing
     for patch in range(patches):
         for view in range(views):
             m = image_from_patch[patch * views + view]
-            away = centers_patch[patch * views + view]
-            some = False
+            center = centers_patch[patch * views + view]
+            any_sample = False
             for row in range(height):
                 y = origin[patch, 1] + spacing[patch] * row
                 for column in range(width):
-                    wanted[row, column] = False
+                    visible[row, column] = False
                     if not inside[patch, row, column]:
                         continue
                     x = origin[patch, 0] + spacing[patch] * column
                     z = depth[patch, row, column]
-                    a, b, c = away[0] - x, away[1] - y, away[2] - z
+                    a, b, c = center[0] - x, center[1] - y, center[2] - z
                     facing = a * outward[patch, row, column, 0]
                     facing += b * outward[patch, row, column, 1]
                     facing += c * outward[patch, row, column, 2]
                     if facing > 0 and facing * facing > steepest * (a * a + b * b + c * c):
-                        wanted[row, column] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] > 0
-                        some = some or wanted[row, column]
-            if not some:
+                        visible[row, column] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] > 0
+                        any_sample = any_sample or visible[row, column]
+            if not any_sample:
                 radiance[patch, view] = 0
                 valid[patch, view] = False
                 continue
@@ -100,89 +99,120 @@ def register(
                 for column in range(width):
                     x = origin[patch, 0] + spacing[patch] * column
                     z = depth[patch, row, column]
-                    far = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-                    near = 1 / far if far != 0 else 1.0
-                    pixels[row, column, 0] = near * (
+                    z_cam = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+                    inverse_z = 1 / z_cam if z_cam != 0 else 1.0
+                    pixels[row, column, 0] = inverse_z * (
                         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
                     )
-                    pixels[row, column, 1] = near * (
+                    pixels[row, column, 1] = inverse_z * (
                         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
                     )
             for row in range(height):
-                # The last difference is repeated, and is none along a single sample.
+                # Forward differences; the last one is repeated, and zero for a single sample.
                 above = max(0, min(row, height - 2))
                 below = min(above + 1, height - 1)
                 for column in range(width):
                     usable = False
-                    if wanted[row, column]:
+                    if visible[row, column]:
                         u, v = pixels[row, column, 0], pixels[row, column, 1]
                         left = max(0, min(column, width - 2))
                         right = min(left + 1, width - 1)
-                        ux = pixels[row, right, 0] - pixels[row, left, 0]
-                        vx = pixels[row, right, 1] - pixels[row, left, 1]
-                        uy = pixels[below, column, 0] - pixels[above, column, 0]
-                        vy = pixels[below, column, 1] - pixels[above, column, 1]
-                        area = max(1.0, abs(ux * vy - vx * uy))
+                        du_column = pixels[row, right, 0] - pixels[row, left, 0]
+                        dv_column = pixels[row, right, 1] - pixels[row, left, 1]
+                        du_row = pixels[below, column, 0] - pixels[above, column, 0]
+                        dv_row = pixels[below, column, 1] - pixels[above, column, 1]
+                        area = max(1.0, abs(du_column * dv_row - dv_column * du_row))
                         margin = 0.5 * math.sqrt(area)
                         if (
                             margin <= u <= sizes_px[view, 0] - margin
                             and margin <= v <= sizes_px[view, 1] - margin
                         ):
-                            level, rest = blended_level(area, count)
-                            lost = np.float32(0)
-                            for step in range(2 if rest > 0 else 1):
-                                weight = rest if step == 1 else np.float32(1) - rest
+                            level, blend = blended_level(area, count)
+                            unusable = np.float32(0)
+                            for step in range(2 if blend > 0 else 1):
+                                weight = blend if step == 1 else np.float32(1) - blend
                                 here = level + step
-                                tall, wide = levels[here, 0], levels[here, 1]
-                                at, aside, down, p, q = corners(
+                                tall, wide = (
+                                    levels[here, 0],
+                                    levels[here, 1],
+                                )
+                                at, aside, under, across, down = corners(
                                     tall,
                                     wide,
                                     u * fractions[here, 1] - 0.5,
                                     v * fractions[here, 0] - 0.5,
                                 )
                                 if here == 0:
-                                    lost += weight * bilinear(
-                                        unusable_finest, view, at, aside, down, p, q
+                                    unusable += weight * bilinear(
+                                        unusable_finest,
+                                        view,
+                                        at,
+                                        aside,
+                                        under,
+                                        across,
+                                        down,
                                     )
                                     for channel in range(channels):
-                                        found[channel] = weight * bilinear(
-                                            finest, view, at, aside, down, p, q
+                                        blended[channel] = weight * bilinear(
+                                            finest,
+                                            view,
+                                            at,
+                                            aside,
+                                            under,
+                                            across,
+                                            down,
                                         )
                                         at += fine_plane
                                     continue
                                 start = levels[here, 2]
-                                lost += weight * bilinear(
-                                    unusable_coarser, view, start + at, aside, down, p, q
+                                unusable += weight * bilinear(
+                                    unusable_coarser,
+                                    view,
+                                    start + at,
+                                    aside,
+                                    under,
+                                    across,
+                                    down,
                                 )
                                 at += channels * start
                                 for channel in range(channels):
-                                    value = weight * bilinear(coarser, view, at, aside, down, p, q)
-                                    found[channel] = value if step == 0 else found[channel] + value
+                                    value = weight * bilinear(
+                                        coarser,
+                                        view,
+                                        at,
+                                        aside,
+                                        under,
+                                        across,
+                                        down,
+                                    )
+                                    blended[channel] = (
+                                        value if step == 0 else blended[channel] + value
+                                    )
                                     at += tall * wide
                             mean = np.float32(0)
                             for channel in range(channels):
-                                mean += found[channel]
-                            usable = bool(lost < np.float32(25.5)) and bool(
+                                mean += blended[channel]
+                            usable = bool(unusable < np.float32(25.5)) and bool(
                                 mean > channels * dark_level
                             )
                     valid[patch, view, row, column] = usable
                     for channel in range(channels):
                         radiance[patch, view, channel, row, column] = (
-                            found[channel] if usable else np.float32(0)
+                            blended[channel] if usable else np.float32(0)
                         )
 
 
 @compiled(
     "int64(boolean[:,:,:,::1], int64[::1], int64[::1], boolean[:,:,:,::1])",
 )
-def sites(valid: Array, rows: Array, columns: Array, asked: Array) -> int:
+def sites(valid: Array, rows: Array, columns: Array, tested: Array) -> int:
     """Mark the sites of occlusion tests that have a valid sample, and count them.
 
     Args:
         valid: Of every patch, view and sample.
-        rows: Which row of sites answers for a row of samples.
+        rows: The row of sites of each row of samples.
         columns: Likewise.
-        asked: False throughout; filled.
+        tested: Result, false before.
     """
     count = 0
     patches, views, height, width = valid.shape
@@ -191,7 +221,7 @@ def sites(valid: Array, rows: Array, columns: Array, asked: Array) -> int:
             for row in range(height):
                 for column in range(width):
                     if valid[patch, view, row, column]:
-                        site = asked[patch, view, rows[row]]
+                        site = tested[patch, view, rows[row]]
                         if not site[columns[column]]:
                             site[columns[column]] = True
                             count += 1
@@ -203,7 +233,7 @@ def sites(valid: Array, rows: Array, columns: Array, asked: Array) -> int:
     "float32[:,::1], float32[:,::1], float32[::1])"
 )
 def sight_lines(
-    asked: Array,
+    tested: Array,
     points: Array,
     centers: Array,
     tolerance: Array,
@@ -211,24 +241,24 @@ def sight_lines(
     directions: Array,
     reach: Array,
 ) -> None:
-    """List the rays from cameras to just before the sites that are asked for.
+    """List the rays from cameras to the tested sites.
 
     Args:
-        asked: Of every patch, view and site.
+        tested: Of every patch, view and site.
         points: Of every patch and site, world.
         centers: Of the cameras, world.
-        tolerance: How far before the point of a patch's site a ray ends.
-        starts: Filled.
-        directions: Unit; filled.
-        reach: Filled.
+        tolerance: Of every patch: a ray ends so far before the point of its site.
+        starts: Result.
+        directions: Result; unit.
+        reach: Result: lengths.
     """
     ray = 0
-    patches, views, height, width = asked.shape
+    patches, views, height, width = tested.shape
     for patch in range(patches):
         for view in range(views):
             for row in range(height):
                 for column in range(width):
-                    if asked[patch, view, row, column]:
+                    if tested[patch, view, row, column]:
                         square = 0.0
                         for axis in range(3):
                             step = points[patch, row, column, axis] - centers[view, axis]
@@ -247,31 +277,31 @@ def sight_lines(
     "float32[:,:,:,:,::1], boolean[:,:,:,::1])"
 )
 def hide(
-    asked: Array, blocked: Array, rows: Array, columns: Array, radiance: Array, valid: Array
+    tested: Array, blocked: Array, rows: Array, columns: Array, radiance: Array, valid: Array
 ) -> None:
-    """Take away the samples whose site is hidden.
+    """Mark the samples of occluded sites as missing.
 
     Args:
-        asked: As :func:`sites` filled it; where a ray was blocked it stays true, else not.
-        blocked: Of every ray, in their order.
-        rows: As :func:`sites` takes it.
+        tested: From :func:`sites`; overwritten.
+        blocked: Of every ray, in the order of :func:`sight_lines`.
+        rows: See :func:`sites`.
         columns: Likewise.
-        radiance: Zero where hidden.
-        valid: False where hidden.
+        radiance: Becomes zero where occluded.
+        valid: Becomes false where occluded.
     """
     ray = 0
     patches, views, channels, height, width = radiance.shape
     for patch in range(patches):
         for view in range(views):
-            some = False
-            hidden = asked[patch, view]
+            any_sample = False
+            hidden = tested[patch, view]
             for row in range(hidden.shape[0]):
                 for column in range(hidden.shape[1]):
                     if hidden[row, column]:
                         hidden[row, column] = blocked[ray]
-                        some = some or blocked[ray]
+                        any_sample = any_sample or blocked[ray]
                         ray += 1
-            if not some:
+            if not any_sample:
                 continue
             for row in range(height):
                 for column in range(width):

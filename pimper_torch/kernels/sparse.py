@@ -1,7 +1,7 @@
-"""Products with sparse matrices in compressed rows, fused with what multigrid does with them.
+"""Products with sparse matrices in compressed rows, fused with the updates of multigrid.
 
-Vectors have one column a right-hand side, so that a matrix is read once for all of them. Every
-function works on the rows from ``first`` up to ``last`` alone. Sums are float64 in either type.
+Vectors have one column per right-hand side. Every function works on the rows from ``first`` up to
+``last`` alone. Sums are float64 in either type.
 """
 
 import numpy as np
@@ -47,33 +47,33 @@ def product(
     width = vectors.shape[1]
     if width == 1:
         for row in range(first, last):
-            one = 0.0
-            for place in range(starts[row], starts[row + 1]):
-                one += entries[place] * vectors[columns[place], 0]
-            found[row, 0] = keep * start[row, 0] + gain * one
+            total = 0.0
+            for index in range(starts[row], starts[row + 1]):
+                total += entries[index] * vectors[columns[index], 0]
+            found[row, 0] = keep * start[row, 0] + gain * total
     elif width == 2:
         for row in range(first, last):
-            one, two = 0.0, 0.0
-            for place in range(starts[row], starts[row + 1]):
-                column, entry = columns[place], entries[place]
-                one += entry * vectors[column, 0]
-                two += entry * vectors[column, 1]
-            found[row, 0] = keep * start[row, 0] + gain * one
-            found[row, 1] = keep * start[row, 1] + gain * two
+            total, second_total = 0.0, 0.0
+            for index in range(starts[row], starts[row + 1]):
+                column, entry = columns[index], entries[index]
+                total += entry * vectors[column, 0]
+                second_total += entry * vectors[column, 1]
+            found[row, 0] = keep * start[row, 0] + gain * total
+            found[row, 1] = keep * start[row, 1] + gain * second_total
     else:
         for row in range(first, last):
             for side in range(width):
-                one = 0.0
-                for place in range(starts[row], starts[row + 1]):
-                    one += entries[place] * vectors[columns[place], side]
-                found[row, side] = keep * start[row, side] + gain * one
+                total = 0.0
+                for index in range(starts[row], starts[row + 1]):
+                    total += entries[index] * vectors[columns[index], side]
+                found[row, side] = keep * start[row, side] + gain * total
 
 
 @compiled(*_types("void(D, V, V, float64, int64, int64)"))
 def scaled(
     inverse_diagonal: Array, residual: Array, step: Array, fraction: float, first: int, last: int
 ) -> None:
-    """Write ``share * D^-1 residual`` to ``step``."""
+    """Write ``fraction * D^-1 residual`` to ``step``."""
     for row in range(first, last):
         for side in range(residual.shape[1]):
             step[row, side] = fraction * inverse_diagonal[row] * residual[row, side]
@@ -101,27 +101,27 @@ def corrected(
     width = step.shape[1]
     if width == 1:
         for row in range(first, last):
-            rest = float(residual[row, 0])
-            for place in range(starts[row], starts[row + 1]):
-                rest -= entries[place] * step[columns[place], 0]
+            value = float(residual[row, 0])
+            for index in range(starts[row], starts[row + 1]):
+                value -= entries[index] * step[columns[index], 0]
             found[row, 0] = (
-                start[row, 0] + of_step * step[row, 0] + of_rest * inverse_diagonal[row] * rest
+                start[row, 0] + of_step * step[row, 0] + of_rest * inverse_diagonal[row] * value
             )
     elif width == 2:
         for row in range(first, last):
-            rest, more = float(residual[row, 0]), float(residual[row, 1])
-            for place in range(starts[row], starts[row + 1]):
-                column, entry = columns[place], entries[place]
-                rest -= entry * step[column, 0]
-                more -= entry * step[column, 1]
+            value, second_value = float(residual[row, 0]), float(residual[row, 1])
+            for index in range(starts[row], starts[row + 1]):
+                column, entry = columns[index], entries[index]
+                value -= entry * step[column, 0]
+                second_value -= entry * step[column, 1]
             gain = of_rest * inverse_diagonal[row]
-            found[row, 0] = start[row, 0] + of_step * step[row, 0] + gain * rest
-            found[row, 1] = start[row, 1] + of_step * step[row, 1] + gain * more
+            found[row, 0] = start[row, 0] + of_step * step[row, 0] + gain * value
+            found[row, 1] = start[row, 1] + of_step * step[row, 1] + gain * second_value
     else:
         for row in range(first, last):
             gain = of_rest * inverse_diagonal[row]
             for side in range(width):
-                rest = float(residual[row, side])
-                for place in range(starts[row], starts[row + 1]):
-                    rest -= entries[place] * step[columns[place], side]
-                found[row, side] = start[row, side] + of_step * step[row, side] + gain * rest
+                value = float(residual[row, side])
+                for index in range(starts[row], starts[row + 1]):
+                    value -= entries[index] * step[columns[index], side]
+                found[row, side] = start[row, side] + of_step * step[row, side] + gain * value

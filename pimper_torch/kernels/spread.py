@@ -1,4 +1,4 @@
-"""The scale of residuals, outliers apart: twin of ``photometry.robust.robust_variance``."""
+"""Robust scale of residuals: twin of ``photometry.robust.robust_variance``."""
 
 import math
 
@@ -9,8 +9,8 @@ from pimper_torch.kernels.switch import compiled
 
 Floats = NDArray[np.float32]
 
-# As in the reference: the scale of Gaussian noise of unit deviation, Newton's steps at most, each
-# at most so long, and the gain at which they end.
+# As in ``photometry.robust``: the scale of Gaussian noise of unit deviation, the limits on number
+# and length of Newton's steps, and the gain at which they end.
 _OF_GAUSSIAN = 0.6472404
 _SCALE_STEPS, _LONGEST_GAIN = 40, 1.5
 _CLOSE = float(np.finfo(np.float32).eps) ** 0.75
@@ -18,11 +18,11 @@ _CLOSE = float(np.finfo(np.float32).eps) ** 0.75
 
 @compiled(fast=True)
 def robust_variance(squares: Floats, guess: float) -> tuple[float, float]:
-    """Estimate the variance that squared residuals show.
+    """Estimate the variance from squared residuals, robustly.
 
     Args:
-        squares: Of all that is seen.
-        guess: Where Newton's method starts: the squared scale found before, or 0.
+        squares: Of the observed residuals.
+        guess: Where Newton's method starts: the squared scale of an earlier call, or 0.
 
     Returns:
         The variance, 0 where half of the squares are, and the squared scale.

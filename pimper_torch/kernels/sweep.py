@@ -1,6 +1,6 @@
-"""Costs of all heights of a bucket's samples; the twin of what ``sweep.sweep`` does in torch.
+"""Costs of all height hypotheses of a bucket's samples: twin of ``sweep.sweep``.
 
-What the arguments mean is told there; images are handed over as in ``kernels.resample``.
+Arguments are documented there; images are laid out as in ``kernels.resample``.
 """
 
 import math
@@ -14,10 +14,10 @@ from pimper_torch.kernels.switch import compiled
 
 Array = NDArray[Any]
 
-# As often the albedo that suits all views is found anew.
+# Reweighted least squares for the albedo, after the median.
 ALBEDO_ITERATIONS = 2
 
-# So many are multiplied before a logarithm is taken: no overflow up to residuals of 1e19 scales.
+# Factors multiplied before a logarithm is taken: no overflow up to residuals of 1e19 scales.
 _FACTORS = 8
 
 
@@ -32,41 +32,41 @@ def _gray(
     fractions: Array,
     view: int,
     level: int,
-    rest: float,
+    blend: float,
     u: float,
     v: float,
 ) -> float:
-    """Blend the two levels that a sample lies between."""
+    """Sample the pyramid trilinearly."""
     tall, wide = levels[level, 0], levels[level, 1]
-    place = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
-    at, right, below, across, down = place
+    index = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
+    at, right, below, across, down = index
     if level == 0:
         value = bilinear(finest, view, at, right, below, across, down)
     else:
         value = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
-    if rest > 0:
+    if blend > 0:
         level += 1
         tall, wide = levels[level, 0], levels[level, 1]
-        place = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
-        at, right, below, across, down = place
-        other = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
-        value += rest * (other - value)
+        index = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
+        at, right, below, across, down = index
+        coarser_value = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
+        value += blend * (coarser_value - value)
     return value
 
 
 @compiled("float32(float32[::1], int64[::1], int64)")
 def _lower_median(values: Array, order: Array, count: int) -> float:
-    """Give the centre one of the first few values, or the lower of two.
+    """Give the lower median of the first ``count`` values.
 
-    ``order`` comes to sort them; if it nearly does already, that takes as many steps as values.
+    By insertion sort of ``order``: linear time if it is nearly sorted.
     """
     for last in range(1, count):
-        moved = order[last]
-        place = last
-        while place > 0 and values[order[place - 1]] > values[moved]:
-            order[place] = order[place - 1]
-            place -= 1
-        order[place] = moved
+        candidate = order[last]
+        index = last
+        while index > 0 and values[order[index - 1]] > values[candidate]:
+            order[index] = order[index - 1]
+            index -= 1
+        order[index] = candidate
     return values[order[(count - 1) // 2]]
 
 
@@ -82,13 +82,13 @@ def _inconsistency(
     per_shading: Array,
     count: int,
     per_scale: float,
-    said: Array,
+    ratios: Array,
     order: Array,
 ) -> float:
-    """See :func:`~pimper_torch.sweep.consistency.inconsistency`: of one sample and height."""
+    """See :func:`~pimper_torch.sweep.consistency.inconsistency`; for one sample and height."""
     for view in range(count):
-        said[view] = radiance[step, view] * per_shading[view]
-    albedo = np.float32(_lower_median(said, order, count))
+        ratios[view] = radiance[step, view] * per_shading[view]
+    albedo = np.float32(_lower_median(ratios, order, count))
     one = np.float32(1)
     for _ in range(ALBEDO_ITERATIONS):
         square, product = np.float32(0), np.float32(0)
@@ -129,7 +129,7 @@ def costs(
     normals: Array,
     lights: Array,
     valid: Array,
-    asked: Array,
+    tested: Array,
     scale: Array,
     ladder: Array,
     num_views: int,
@@ -138,12 +138,12 @@ def costs(
     cost: Array,
     swept: Array,
 ) -> None:
-    """Choose the views that judge each sample, and give its cost at all heights.
+    """Choose the views of each sample, and evaluate its cost at all heights.
 
     Args:
-        finest: Gray images, a row a view.
-        coarser: Their further levels, one after another.
-        levels: Height, width and place of every level.
+        finest: Gray images, one row per view.
+        coarser: Their coarser levels, concatenated.
+        levels: Height, width and offset of every level.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
         focals: In pixels.
@@ -154,14 +154,14 @@ def costs(
         normals: That light shades, patch frame.
         lights: First-order harmonics of every patch and view.
         valid: Where a view has the sample.
-        asked: Samples that may be swept.
-        scale: Of residuals that are large, of every patch.
-        ladder: Heights that are tried, in units of ``spacing``.
-        num_views: At most so many judge a sample.
-        min_views: A sample that fewer views may judge is not swept.
-        min_facing: Cosine of the angle from which on footprints shrink no more.
-        cost: Zero throughout; filled.
-        swept: Zero throughout; 1 where a sample has costs.
+        tested: Samples that may be swept.
+        scale: Of the robust loss, for every patch.
+        ladder: Height hypotheses, in units of ``spacing``.
+        num_views: Maximum number of views of a sample.
+        min_views: A sample with fewer views is not swept.
+        min_facing: Lower bound of the cosine that shrinks footprints.
+        cost: Result, zero before.
+        swept: Result, zero before: 1 where a sample has costs.
     """
     patches, views, height, width = valid.shape
     heights, count_levels = len(ladder), len(levels)
@@ -173,7 +173,7 @@ def costs(
     footprints = np.empty(views, np.float64)
     lit = np.empty(limit, np.float32)
     per_lit = np.empty(limit, np.float32)
-    said = np.empty(limit, np.float32)
+    ratios = np.empty(limit, np.float32)
     order = np.empty(limit, np.int64)
     fractions = shrinkage(levels)
     radiance = np.empty((heights, limit), np.float32)
@@ -182,54 +182,54 @@ def costs(
         for row in range(height):
             y = origin[patch, 1] + spacing[patch] * row
             for column in range(width):
-                if not asked[patch, row, column]:
+                if not tested[patch, row, column]:
                     continue
-                having = 0
+                num_valid = 0
                 for view in range(views):
-                    having += valid[patch, view, row, column]
-                if having < min_views:
+                    num_valid += valid[patch, view, row, column]
+                if num_valid < min_views:
                     continue
                 x = origin[patch, 0] + spacing[patch] * column
                 z = np.float64(depth[patch, row, column])
                 ox = np.float64(outward[patch, row, column, 0])
                 oy = np.float64(outward[patch, row, column, 1])
                 oz = np.float64(outward[patch, row, column, 2])
-                typical = np.float32(0)
+                mean_shading = np.float32(0)
                 for view in range(views):
                     light = lights[patch, view]
                     shade = light[0] + light[1] * normals[patch, row, column, 0]
                     shade += light[2] * normals[patch, row, column, 1]
                     shade += light[3] * normals[patch, row, column, 2]
                     shading[view] = shade
-                    typical += max(shade, np.float32(0))
-                typical /= np.float32(views)
-                found = 0
+                    mean_shading += max(shade, np.float32(0))
+                mean_shading /= np.float32(views)
+                num_chosen = 0
                 for view in range(views):
                     if not valid[patch, view, row, column] or not shading[view] > 0:
                         continue
-                    away = centers_patch[patch * views + view]
-                    a, b, c = away[0] - x, away[1] - y, away[2] - z
+                    center = centers_patch[patch * views + view]
+                    a, b, c = center[0] - x, center[1] - y, center[2] - z
                     facing = a * ox + b * oy + c * oz
                     if not facing > 0:
                         continue
                     facing /= math.sqrt(a * a + b * b + c * c)
                     m = image_from_patch[patch * views + view]
-                    far = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-                    footprint = spacing[patch] * focals[view] / max(far, tiny)
+                    z_cam = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+                    footprint = spacing[patch] * focals[view] / max(z_cam, tiny)
                     facings[view], footprints[view] = facing, footprint
-                    rated = facing * min(footprint, 1.0) * min(shading[view] / typical, 1.0)
-                    rated = np.float32(rated)
-                    if found == limit and not rated > score[limit - 1]:
+                    rating = facing * min(footprint, 1.0) * min(shading[view] / mean_shading, 1.0)
+                    rating = np.float32(rating)
+                    if num_chosen == limit and not rating > score[limit - 1]:
                         continue
-                    place = min(found, limit - 1)
-                    while place > 0 and score[place - 1] < rated:
-                        score[place], chosen[place] = score[place - 1], chosen[place - 1]
-                        place -= 1
-                    score[place], chosen[place] = rated, view
-                    found = min(found + 1, limit)
-                if found < min_views:
+                    index = min(num_chosen, limit - 1)
+                    while index > 0 and score[index - 1] < rating:
+                        score[index], chosen[index] = score[index - 1], chosen[index - 1]
+                        index -= 1
+                    score[index], chosen[index] = rating, view
+                    num_chosen = min(num_chosen + 1, limit)
+                if num_chosen < min_views:
                     continue
-                for slot in range(found):
+                for slot in range(num_chosen):
                     view = chosen[slot]
                     lit[slot] = shading[view]
                     per_lit[slot] = np.float32(1) / shading[view]
@@ -241,13 +241,13 @@ def costs(
                     du = m[0, 0] * ox + m[0, 1] * oy + m[0, 2] * oz
                     dv = m[1, 0] * ox + m[1, 1] * oy + m[1, 2] * oz
                     dw = m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz
-                    squeezed = max(facings[view], min_facing)
+                    bounded = max(facings[view], min_facing)
                     footprint = footprints[view]
-                    level, rest = blended_level(footprint * footprint * squeezed, count_levels)
+                    level, blend = blended_level(footprint * footprint * bounded, count_levels)
                     for step in range(heights):
                         move = spacing[patch] * ladder[step]
-                        far = w0 + move * dw
-                        near = 1 / far if far != 0 else 1.0
+                        z_cam = w0 + move * dw
+                        inverse_z = 1 / z_cam if z_cam != 0 else 1.0
                         radiance[step, slot] = _gray(
                             finest,
                             coarser,
@@ -255,13 +255,13 @@ def costs(
                             fractions,
                             view,
                             level,
-                            rest,
-                            near * (u0 + move * du),
-                            near * (v0 + move * dv),
+                            blend,
+                            inverse_z * (u0 + move * du),
+                            inverse_z * (v0 + move * dv),
                         )
                 swept[patch, row, column] = 1
                 per_scale = np.float32(1) / scale[patch]
                 for step in range(heights):
                     cost[patch, step, row, column] = _inconsistency(
-                        radiance, step, lit, per_lit, found, per_scale, said, order
+                        radiance, step, lit, per_lit, num_chosen, per_scale, ratios, order
                     )

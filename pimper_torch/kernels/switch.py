@@ -1,4 +1,4 @@
-"""Whether a compiled kernel stands in for torch, and how kernels are compiled."""
+"""The choice between compiled kernels and torch, and how kernels are compiled."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -32,16 +32,16 @@ def using(kernels: Kernels) -> Iterator[None]:
 
 
 def compiled_for(*tensors: Tensor) -> bool:
-    """Tell whether a kernel may stand in: chosen, on the CPU, and without gradients."""
-    asked = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    """Tell whether compiled kernels may be used: chosen, tensors on the CPU, no gradients."""
+    tracked = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
     on_cpu = all(each.device.type == "cpu" for each in tensors)
-    return _chosen.get() == "numba" and on_cpu and not asked
+    return _chosen.get() == "numba" and on_cpu and not tracked
 
 
 def forget_stale() -> None:
-    """Delete machine code older than any kernel's source: kernels are parts of one another.
+    """Delete cached machine code older than any kernel's source: kernels inline one another.
 
-    Where the installation may not be written to, numba keeps it elsewhere, and nothing is deleted.
+    Where the installation is read-only, numba caches elsewhere, and nothing is deleted.
     """
     folder = Path(pimper_torch.kernels.__path__[0])
     newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
@@ -53,8 +53,8 @@ def forget_stale() -> None:
 
 forget_stale()
 
-# What compiled sums may do besides IEEE's arithmetic: add in another order, in several lanes at
-# once. NaN and infinity keep their meaning.
+# Relaxations of IEEE arithmetic for vectorized sums: reordering, fused and reciprocal operations.
+# NaN and infinity keep their meaning.
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
@@ -63,12 +63,12 @@ def compiled(
 ) -> Callable[[Function], Function]:
     """Compile a function for the given types when its module is imported.
 
-    Once an installation: the machine code is kept on disk. It holds no lock of the interpreter.
+    The machine code is cached on disk. The function releases the interpreter's lock (GIL).
 
     Args:
-        signatures: Without any, the function is a part of other kernels, and compiled with them.
-        fast: Whether sums may be taken in any order, as several lanes at once do.
-        inline: Whether it becomes a part of each loop that calls it, which several lanes need.
+        signatures: Without any, the function is compiled with the kernels that call it.
+        fast: Whether sums may be reordered, as vectorization needs.
+        inline: Whether it is inlined into its callers, as vectorized loops need.
     """
     import numba
 
@@ -80,12 +80,12 @@ def compiled(
         forceinline=inline,
         fastmath=_FAST if fast else False,
     )
-    # Checkers of shapes wrap what they check; Python inside them cannot be compiled.
+    # Shape checkers wrap functions; their wrappers cannot be compiled.
     return lambda function: decorate(unwrap(function))
 
 
 def compile_all() -> None:
-    """Compile every kernel that is not kept on disk yet; 50 s, once an installation."""
+    """Compile every kernel that is not cached yet; 50 s, once per installation."""
     names = [found.name for found in iter_modules(pimper_torch.kernels.__path__)]
     for name in track(names):
         import_module(f"{pimper_torch.kernels.__name__}.{name}")

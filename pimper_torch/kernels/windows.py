@@ -1,4 +1,4 @@
-"""Windows and their correlation through moved fields: the twin of ``Matcher``."""
+"""Window correlations of all hypotheses of inverse depth: twin of ``coarse.matching.Matcher``."""
 
 import math
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.switch import compiled
 
-# Bytes of windows' weights that are read again for every field: as much as stays in a core's cache.
+# Bytes of window weights that are read again for every hypothesis: those of a core's cache.
 _CACHED = 3 << 18
 
 _ROW = "float32[::1]"
@@ -19,60 +19,60 @@ _ROW = "float32[::1]"
 )
 def window_weights(
     tone: NDArray[np.float32],
-    here: NDArray[np.bool_],
+    valid: NDArray[np.bool_],
     spatial: NDArray[np.float64],
     likeness: float,
     weight: NDArray[np.float32],
     deviation: NDArray[np.float32],
     power: NDArray[np.float32],
 ) -> None:
-    """Fill in what :func:`window_scores` knows of every window of a view beforehand.
+    """Compute what :func:`window_scores` needs of every window of the reference view.
 
     Args:
         tone: Of the view, ``height width``.
-        here: Where it says something; elsewhere 0 is filled in.
-        spatial: Weight of every place of a window, row by row.
-        likeness: Difference of tone to the centre at which a weight has fallen to 0.6.
-        weight: Filled in, ``place height width``; adds up to 1.
-        deviation: Filled in: weight times the difference of the tone to the window's mean.
-        power: Filled in: variance of the tone in the window.
+        valid: Of its pixels; elsewhere the result is 0.
+        spatial: Weight of every entry of a window, row by row.
+        likeness: Difference of tone to the centre at which a weight falls to 0.6.
+        weight: Result, ``entry height width``; adds up to 1 over a window.
+        deviation: Result: weight times the difference of the tone to the window's mean.
+        power: Result: variance of the tone in the window.
     """
     height, width = tone.shape
-    num_places = len(spatial)
-    side = int(math.sqrt(num_places) + 0.5)
-    around, fraction = np.empty(num_places), np.empty(num_places)
-    rows, columns = np.empty(num_places, dtype=np.int64), np.empty(num_places, dtype=np.int64)
-    for place in range(num_places):
-        rows[place], columns[place] = place // side - side // 2, place % side - side // 2
+    num_entries = len(spatial)
+    side = int(math.sqrt(num_entries) + 0.5)
+    window_tones, raw = np.empty(num_entries), np.empty(num_entries)
+    rows, columns = np.empty(num_entries, dtype=np.int64), np.empty(num_entries, dtype=np.int64)
+    for entry in range(num_entries):
+        rows[entry], columns[entry] = entry // side - side // 2, entry % side - side // 2
     weight[:] = 0
     deviation[:] = 0
     power[:] = 0
     for y in range(height):
         for x in range(width):
-            if not here[y, x]:
+            if not valid[y, x]:
                 continue
             total = mean = variance = 0.0
-            for place in range(num_places):
-                row = min(max(y + rows[place], 0), height - 1)
-                column = min(max(x + columns[place], 0), width - 1)
-                around[place] = tone[row, column]
-                away = (around[place] - tone[y, x]) / likeness
-                fraction[place] = spatial[place] * math.exp(-away * away / 2) * here[row, column]
-                total += fraction[place]
-                mean += fraction[place] * around[place]
+            for entry in range(num_entries):
+                row = min(max(y + rows[entry], 0), height - 1)
+                column = min(max(x + columns[entry], 0), width - 1)
+                window_tones[entry] = tone[row, column]
+                away = (window_tones[entry] - tone[y, x]) / likeness
+                raw[entry] = spatial[entry] * math.exp(-away * away / 2) * valid[row, column]
+                total += raw[entry]
+                mean += raw[entry] * window_tones[entry]
             mean /= total
-            for place in range(num_places):
-                weighed = fraction[place] / total
-                off = weighed * (around[place] - mean)
-                weight[place, y, x], deviation[place, y, x] = weighed, off
-                variance += off * (around[place] - mean)
+            for entry in range(num_entries):
+                scaled = raw[entry] / total
+                centered = scaled * (window_tones[entry] - mean)
+                weight[entry, y, x], deviation[entry, y, x] = scaled, centered
+                variance += centered * (window_tones[entry] - mean)
             power[y, x] = variance
 
 
 # Loops of one written row and few read ones: only those become vector instructions.
 @compiled(f"void({_ROW}, {_ROW}, {_ROW}, {_ROW}, float32, float32, float32)")
-def _place(
-    places: NDArray[np.float32],
+def _project(
+    coordinates: NDArray[np.float32],
     field: NDArray[np.float32],
     ray: NDArray[np.float32],
     depth: NDArray[np.float32],
@@ -80,14 +80,14 @@ def _place(
     shift: float,
     shift_depth: float,
 ) -> None:
-    """Give one coordinate of the places that a row of pixels has in a source."""
-    tiny, near, zero = np.float32(np.finfo(np.float32).tiny), np.float32(1e-6), np.float32(0)
+    """Give one coordinate of a row of pixels in a source view."""
+    tiny, min_ratio, zero = np.float32(np.finfo(np.float32).tiny), np.float32(1e-6), np.float32(0)
     half, behind = np.float32(0.5), np.float32(-1e9)  # left of every picture
-    for x in range(len(places)):
+    for x in range(len(coordinates)):
         q = max(field[x] + offset, tiny)
         ratio = depth[x] + shift_depth * q
-        at = (ray[x] + shift * q) / max(ratio, near) - half
-        places[x] = at if ratio > zero else behind
+        at = (ray[x] + shift * q) / max(ratio, min_ratio) - half
+        coordinates[x] = at if ratio > zero else behind
 
 
 @compiled(
@@ -98,16 +98,16 @@ def _look_up(
     there: NDArray[np.bool_],
     across: NDArray[np.float32],
     down: NDArray[np.float32],
-    asked: NDArray[np.bool_],
+    wanted: NDArray[np.bool_],
     tone: NDArray[np.float32],
     usable: NDArray[np.bool_],
 ) -> None:
-    """Look a row of places up, bilinearly; say whether the nearest pixel is usable."""
+    """Sample a source bilinearly at a row of points; mark where the nearest pixel is usable."""
     height, width = tone.shape
     zero, half = np.float32(0), np.float32(0.5)
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     for x in range(len(values)):
-        if not asked[x]:
+        if not wanted[x]:
             continue
         u, v = min(max(across[x], zero), right), min(max(down[x], zero), bottom)
         column, line = np.uint32(u), np.uint32(v)
@@ -133,9 +133,9 @@ def _add_powers(
     values: NDArray[np.float32],
 ) -> None:
     for x in range(len(total)):
-        weighed = weight[x] * values[x]
-        total[x] += weighed
-        square[x] += weighed * values[x]
+        scaled = weight[x] * values[x]
+        total[x] += scaled
+        square[x] += scaled * values[x]
 
 
 @compiled(f"void({_ROW}, {_ROW}, {_ROW})")
@@ -149,21 +149,21 @@ def _correlate(
     found: NDArray[np.float32],
     mean: NDArray[np.float32],
     square: NDArray[np.float32],
-    both: NDArray[np.float32],
+    product: NDArray[np.float32],
     power: NDArray[np.float32],
-    told: NDArray[np.bool_],
+    valid_row: NDArray[np.bool_],
     floor: float,
 ) -> None:
     zero = np.float32(0)
     for x in range(len(found)):
         spread = max(square[x] - mean[x] * mean[x], zero)
-        likeness = both[x] / np.sqrt((spread + floor) * (power[x] + floor))
-        found[x] = likeness if told[x] else zero
+        likeness = product[x] / np.sqrt((spread + floor) * (power[x] + floor))
+        found[x] = likeness if valid_row[x] else zero
 
 
 @compiled(f"void({_ROW}, {_ROW})")
 def _swap(above: NDArray[np.float32], below: NDArray[np.float32]) -> None:
-    """Put the larger one of each pair above."""
+    """Sort each pair, the larger value first."""
     for x in range(len(above)):
         one, other = above[x], below[x]
         above[x], below[x] = max(one, other), min(one, other)
@@ -184,47 +184,47 @@ def window_scores(
     weight: NDArray[np.float32],
     deviation: NDArray[np.float32],
     power: NDArray[np.float32],
-    here: NDArray[np.bool_],
+    valid: NDArray[np.bool_],
     floor: float,
     best: int,
     scores: NDArray[np.float32],
 ) -> None:
-    """Fill in the score of every pixel for a field moved by every offset.
+    """Score every pixel for the field plus each offset.
 
-    Rows are taken band by band, so that a band's weights are read from the cache for all offsets
+    Rows are processed band by band, so that a band's weights stay in the cache for all offsets
     and sources.
 
     Args:
         field: Inverse depths, ``height width``.
-        offsets: That it is moved by; nowhere below the smallest positive number.
+        offsets: Added to the field, the sum clamped to the smallest positive float.
         ray: See :class:`~pimper_torch.coarse.matching.Pairing`, ``source 3 height width``.
         shift: Of the same, ``source 3``.
         tone: Of the sources, ``source height width``.
-        usable: Where the sources say something.
-        weight: Of the pixels of every window, ``place height width``; 0 where ``here`` is false.
+        usable: Valid pixels of the sources.
+        weight: Of the pixels of every window, ``place height width``; 0 where ``valid`` is false.
         deviation: That weight times the tone's difference to the window's mean.
         power: Variance of the tone in every window.
-        here: Where the view says something; 0 is filled in elsewhere.
-        floor: Variance below which a window says little.
-        best: Sources that are believed.
-        scores: Filled in, ``offset height width``.
+        valid: Of the reference view; elsewhere the score is 0.
+        floor: Added to variances: regularization of windows without texture.
+        best: The score is the mean of so many largest correlations.
+        scores: Result, ``offset height width``.
     """
     num_sources, height, width = tone.shape
-    num_places = weight.shape[0]
-    side = int(math.sqrt(num_places) + 0.5)
+    num_entries = weight.shape[0]
+    side = int(math.sqrt(num_entries) + 0.5)
     radius = side // 2
     best = min(best, num_sources)
-    band = max(8, _CACHED // (8 * num_places * width))
+    band = max(8, _CACHED // (8 * num_entries * width))
     seen = np.zeros((num_sources, band + 2 * radius, width + 2 * radius), dtype=np.float32)
     there = np.zeros((num_sources, band + 2 * radius, width), dtype=np.bool_)
     across, down = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     sums = np.empty((3, width), dtype=np.float32)
     found = np.empty((num_sources, width), dtype=np.float32)
-    # Columns that each row is asked about.
+    # Range of columns with valid pixels in each row.
     first, last = np.full(height, width), np.zeros(height, dtype=np.int64)
     for y in range(height):
         for x in range(width):
-            if here[y, x]:
+            if valid[y, x]:
                 first[y], last[y] = min(first[y], x), max(last[y], x + 1)
     scores[:] = 0
     for top in range(0, height, band):
@@ -239,11 +239,11 @@ def window_scores(
                     u, v = across[low:high], down[low:high]
                     moved, depth = field[y, low:high], ray[s, 2, y, low:high]
                     offset, along = offsets[index], shift[s, 2]
-                    _place(u, moved, ray[s, 0, y, low:high], depth, offset, shift[s, 0], along)
-                    _place(v, moved, ray[s, 1, y, low:high], depth, offset, shift[s, 1], along)
+                    _project(u, moved, ray[s, 0, y, low:high], depth, offset, shift[s, 0], along)
+                    _project(v, moved, ray[s, 1, y, low:high], depth, offset, shift[s, 1], along)
                     values = seen[s, row, low + radius : high + radius]
-                    asked = here[y, low:high]
-                    _look_up(values, there[s, row, low:high], u, v, asked, tone[s], usable[s])
+                    wanted = valid[y, low:high]
+                    _look_up(values, there[s, row, low:high], u, v, wanted, tone[s], usable[s])
                     seen[s, row, :radius] = seen[s, row, radius]
                     seen[s, row, width + radius :] = seen[s, row, width + radius - 1]
             for y in range(top, end):
@@ -251,21 +251,21 @@ def window_scores(
                 if low >= high:
                     continue
                 for s in range(num_sources):
-                    mean, square, both = sums[0, low:high], sums[1, low:high], sums[2, low:high]
+                    mean, square, product = sums[0, low:high], sums[1, low:high], sums[2, low:high]
                     sums[:] = 0
-                    for place in range(num_places):
-                        column = low + place % side
-                        values = seen[s, y - top + place // side, column : column + high - low]
-                        _add_powers(mean, square, weight[place, y, low:high], values)
-                        _add(both, deviation[place, y, low:high], values)
-                    told = there[s, y - top + radius, low:high]
+                    for entry in range(num_entries):
+                        column = low + entry % side
+                        values = seen[s, y - top + entry // side, column : column + high - low]
+                        _add_powers(mean, square, weight[entry, y, low:high], values)
+                        _add(product, deviation[entry, y, low:high], values)
+                    valid_row = there[s, y - top + radius, low:high]
                     likeness, varied = found[s, low:high], power[y, low:high]
-                    _correlate(likeness, mean, square, both, varied, told, floor)
+                    _correlate(likeness, mean, square, product, varied, valid_row, floor)
                 for rank in range(best):
                     for s in range(num_sources - 1, rank, -1):
                         _swap(found[s - 1, low:high], found[s, low:high])
                     scores[index, y, low:high] += found[rank, low:high]
                 scores[index, y, low:high] /= np.float32(best)
                 for x in range(low, high):
-                    if not here[y, x]:
+                    if not valid[y, x]:
                         scores[index, y, x] = 0
