@@ -43,8 +43,8 @@ SMALLEST_SPREAD = 1e-4
 # medians cost as much as a step.
 REWEIGH_EVERY = 3
 
-# A step along a curved manifold longer than this fraction of albedo, about radians of the normal,
-# leaves the place where its quadratic model holds.
+# Longest step along a curved manifold, as a fraction of albedo (about radians of the normal),
+# within which its quadratic model holds: a choice.
 LONGEST_STEP = 0.3
 
 
@@ -147,7 +147,7 @@ def equations_of_views(
 def curvature_of_views(
     shading: Float[Tensor, "patch rank sample"], weight: Float[Tensor, "patch view sample"]
 ) -> Float[Tensor, "patch unknown unknown"]:
-    """Write out what every view's samples say of its own light, one diagonal block a view."""
+    """Give the block diagonal of the Gauss-Newton matrix: one block per view, shading fixed."""
     batch, views, rank = len(weight), weight.shape[1], shading.shape[1]
     products = (shading[:, :, None] * shading[:, None]).flatten(1, 2)
     blocks = (weight @ products.mT).reshape(batch, views, rank, rank)
@@ -177,12 +177,12 @@ def evaluate(
     residual = problem.radiance - lights @ shading
     heavy = weight * residual
     cost = torch.linalg.vecdot(heavy.flatten(1), residual.flatten(1))
-    apart = lights - problem.anchor
-    cost = cost + (problem.regularization * apart.square().sum(dim=2)).sum(dim=1)
+    difference = lights - problem.anchor
+    cost = cost + (problem.regularization * difference.square().sum(dim=2)).sum(dim=1)
     if problem.prior is not None:
         bent = shading * apply_packed(problem.prior, shading)
         cost = cost + bent.sum(dim=(1, 2))
-    return cost, heavy @ shading.mT - problem.regularization[..., None] * apart
+    return cost, heavy @ shading.mT - problem.regularization[..., None] * difference
 
 
 def follow(
@@ -242,8 +242,8 @@ def curvature_along(
 ) -> Float[Tensor, "patch smaller sample"]:
     """Give ``B^T A B``, packed, raised a little so that it can be inverted."""
     curvature = congruence(packed, columns)
-    place = diagonal(len(columns))
-    curvature[:, place] += 1e-9 * curvature[:, place].sum(dim=1, keepdim=True)
+    slot = diagonal(len(columns))
+    curvature[:, slot] += 1e-9 * curvature[:, slot].sum(dim=1, keepdim=True)
     return curvature
 
 
@@ -253,7 +253,7 @@ def keep_scale(
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
 ) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch rank sample"]]:
-    """Hold the size of the lights where nothing else does, and shrink shading by as much."""
+    """Normalize lights without regularization to their former size; rescale shading inversely."""
     was, size = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
     loose = (problem.regularization.amax(dim=1) == 0) & (size > 0) & (was > 0)
     factor = torch.where(loose, (was / torch.where(size > 0, size, 1)).sqrt(), 1)[:, None, None]
@@ -294,7 +294,7 @@ def root_mean_square(
 def deviation_of(
     problem: Bilinear, residual: Float[Tensor, "patch view sample"]
 ) -> Float[Tensor, " patch"]:
-    """Estimate the standard deviation of each patch's residuals, outliers apart."""
+    """Estimate the standard deviation of each patch's residuals, robustly."""
     some = residual[:, :, :: problem.stride].flatten(1)
     seen = problem.weight[:, :, :: problem.stride].flatten(1) > 0
     count = problem.weight.sum(dim=(1, 2)).clamp_min(1)

@@ -1,4 +1,4 @@
-"""The stage that tells shape from shading, facet by facet."""
+"""The stage that factorizes patches into albedo, normals and light."""
 
 import math
 from collections.abc import Callable
@@ -39,10 +39,10 @@ from pimper_torch.records import (
 )
 from pimper_torch.stage import Stage
 
-# The pull on a light counts as if so many samples more were seen than there are.
+# Samples added to those of each view in the weight of the prior on its light: a choice.
 BORROWED_SAMPLES = 16.0
 
-# Free lights still need a hold where a view has next to no samples: this fraction of its data.
+# Minimum weight of the prior, as a fraction of a view's data: regularizes views with few samples.
 MIN_REGULARIZATION = 1e-6
 
 # The Gauss-Newton matrix of a patch's lights is summed over about this many samples.
@@ -67,8 +67,7 @@ AT_REST = 300, 1e-9
 # A surface is right to so many samples, where it casts shadows.
 SHADOW_SAMPLES = 2.0
 
-# Patches are factorized so many entries of J at a time, or one by one: what they need fits the
-# cache.
+# Entries of J that are factorized together: their working set fits the cache.
 PART_ENTRIES = 400_000
 
 # The spread of a patch's residuals is read off about this many samples.
@@ -285,11 +284,11 @@ class Factorize(Stage):
         blank = torch.zeros_like(normals[..., 0])
         black = blank[..., None].expand(-1, -1, -1, albedo.shape[1])
         return Photometry(
-            normals_patch=on_raster(chosen, rows.place, normals),
-            albedo=on_raster(albedo.mT, rows.place, black),
+            normals_patch=on_raster(chosen, rows.position, normals),
+            albedo=on_raster(albedo.mT, rows.position, black),
             lights_patch=lights,
-            valid=on_raster(valid, rows.place, nothing),
-            confidence=on_raster(found.confidence * valid, rows.place, blank),
+            valid=on_raster(valid, rows.position, nothing),
+            confidence=on_raster(found.confidence * valid, rows.position, blank),
             status=status,
             convergence=factors.convergence,
         )

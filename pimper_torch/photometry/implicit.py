@@ -34,8 +34,8 @@ from pimper_torch.photometry.quadratics import (
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record
 
-# Directions that nothing determines, such as Lorentz transformations of free lights, are held by
-# this fraction of the mean curvature: the answer moves along none of them.
+# Undetermined directions, such as Lorentz transformations of free lights, are regularized by this
+# fraction of the mean curvature: the solution moves along none of them.
 _RIDGE = 1e-10
 
 # Newton's method doubles the digits of a solution at every step, once it is near; before that its
@@ -160,10 +160,10 @@ def _newton_step(problem: Bilinear, hessian: Hessian) -> Step:
     if isinstance(problem.loss, Squares):
         return step
     with torch.no_grad():
-        told, slopes = _by_deviation(problem, hessian)
+        deviation_slope, slopes = _by_deviation(problem, hessian)
         aside = _solved(hessian, *slopes)
-        left = 1 - _change_of(told, hessian, aside)
-    return step.moved(_change_of(told, hessian, step) / left, aside)
+        left = 1 - _change_of(deviation_slope, hessian, aside)
+    return step.moved(_change_of(deviation_slope, hessian, step) / left, aside)
 
 
 def _solved(
@@ -190,25 +190,25 @@ def _by_deviation(
     with torch.enable_grad():
         at = residual.detach().requires_grad_()
         deviation = deviation_of(problem, at)
-        told = torch.zeros_like(at)
+        deviation_slope = torch.zeros_like(at)
         if deviation.requires_grad:
-            (told,) = torch.autograd.grad(deviation.sum(), at)
+            (deviation_slope,) = torch.autograd.grad(deviation.sum(), at)
     # w depends on r / d alone, so that d dw/dd = w - d(w r)/dr: no derivative of it is needed.
     deviation = deviation.detach()[:, None, None].clamp_min(1e-300)
     pulled = (hessian.pulled - hessian.bent * residual) / deviation
-    return told, (
+    return deviation_slope, (
         pulled @ hessian.shading.mT,
         coordinates(hessian.columns, hessian.lights.mT @ pulled),
     )
 
 
 def _change_of(
-    told: Float[Tensor, "patch view sample"], hessian: Hessian, step: Step
+    deviation_slope: Float[Tensor, "patch view sample"], hessian: Hessian, step: Step
 ) -> Float[Tensor, " patch"]:
     """Give how much a step changes the deviation."""
     shown = step.lights @ hessian.shading
     shown = shown + hessian.lights @ combination(hessian.columns, step.rotation)
-    return -(told * shown).sum(dim=(1, 2))
+    return -(deviation_slope * shown).sum(dim=(1, 2))
 
 
 @torch.no_grad()
@@ -278,8 +278,8 @@ def _slopes(
     residual = problem.radiance.double() - L @ N
     deviation = deviation_of(problem, residual)[:, None, None]
     pulled = problem.weight.double() * problem.loss.weights(residual, deviation) * residual
-    apart = L - problem.anchor.double()
-    on_lights = pulled @ N.mT - problem.regularization.double()[..., None] * apart
+    difference = L - problem.anchor.double()
+    on_lights = pulled @ N.mT - problem.regularization.double()[..., None] * difference
     ambient = L.mT @ pulled
     if problem.prior is not None:
         ambient = ambient - apply_packed(problem.prior.double(), N)

@@ -16,13 +16,13 @@ from pimper_torch.linalg.implicit import implicit_solution, newton_solution
 from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
 from pimper_torch.photometry.shown import Shown
 
-# A fit is done when a step lowers its cost by less than this fraction; and iterations and share
-# where gradients are asked for, from which Newton's method goes on.
+# A fit has converged when a step lowers its cost by less than this fraction; and the iterations
+# and fraction where gradients are required, from which Newton's method continues.
 _MIN_GAIN, _AT_REST = 1e-7, (300, 1e-13)
 
-# Fraction of the diagonal that is added to the normal equations where they precondition others:
-# that light and albedo share a factor makes them singular.
-_CLOSE = 1e-6
+# Fraction of the diagonal added to the normal equations as a preconditioner, a choice: the free
+# factor of light and albedo makes them singular.
+_PRECONDITIONER_DAMPING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,12 +45,12 @@ def fit_lights(model: LightModel, shown: Shown, iterations: int) -> LightFit:
         shown: What they are to explain.
         iterations: At most, where no gradients are asked for.
     """
-    limit, min_gain = _AT_REST if _asked(model, shown) else (iterations, _MIN_GAIN)
+    limit, min_gain = _AT_REST if _tracked(model, shown) else (iterations, _MIN_GAIN)
     with torch.no_grad():
         return _fit(model, shown, limit, min_gain)
 
 
-def _asked(model: LightModel, shown: Shown) -> bool:
+def _tracked(model: LightModel, shown: Shown) -> bool:
     parts = (shown.radiance, *model.known())
     return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
 
@@ -114,12 +114,12 @@ def _descend(
         weight = shown.weights(residual, scale)
         cost = shown.cost(residual, scale)
         slopes = albedo[:, None, None] * model.slopes(lights)
-        regularization = weight * residual
-        downhill = (regularization[..., None] * slopes).sum(dim=0)
-        # A parameter that would only be pushed over its bound stays out of the others' way.
-        held = model.admit(lights + downhill) == lights
-        normal = _normal_equations(shading, torch.where(held, 0, slopes), weight, damping)
-        steps = normal.solve(torch.where(held, 0, downhill), (regularization * shading).sum(dim=1))
+        weighted = weight * residual
+        downhill = (weighted[..., None] * slopes).sum(dim=0)
+        # Active bound: the gradient points out of the feasible set.
+        fixed = model.admit(lights + downhill) == lights
+        normal = _normal_equations(shading, torch.where(fixed, 0, slopes), weight, damping)
+        steps = normal.solve(torch.where(fixed, 0, downhill), (weighted * shading).sum(dim=1))
         moved = model.admit(lights + steps[0])
         under = model.shade(moved)
         changed = _best_albedo(shown, under, albedo + steps[1], weight, scale)
@@ -138,11 +138,11 @@ def _descend(
 def with_gradients(found: LightFit, shown: Shown) -> LightFit:
     """Give the fit gradients to photographs and geometry, if any are asked for.
 
-    By the implicit function, at the nearest stationary point. One number is free, as light and
-    albedo share a factor: the largest of the lights' keeps its value, and so does what a bound
-    holds or nothing tells.
+    By the implicit function, at the nearest stationary point. Light and albedo share a free
+    factor: the largest parameter of the lights is fixed, and so are parameters at a bound or
+    without data.
     """
-    if not _asked(found.model, shown):
+    if not _tracked(found.model, shown):
         return found
     model, count = found.model, found.lights.numel()
     start = torch.cat([found.lights.flatten(), found.albedo])
@@ -151,28 +151,28 @@ def with_gradients(found: LightFit, shown: Shown) -> LightFit:
         lights, albedo = at[:count].reshape(found.lights.shape), at[count:]
         shading = model.shade(lights)
         residual = shown.residual(albedo, shading)
-        regularization = shown.weights(residual, shown.scale(residual)) * residual
-        by_lights = torch.einsum("sv,s,svp->vp", regularization, albedo, model.slopes(lights))
-        return torch.cat([by_lights.flatten(), (regularization * shading).sum(dim=1)])
+        weighted = shown.weights(residual, shown.scale(residual)) * residual
+        by_lights = torch.einsum("sv,s,svp->vp", weighted, albedo, model.slopes(lights))
+        return torch.cat([by_lights.flatten(), (weighted * shading).sum(dim=1)])
 
     with torch.no_grad():
         shading = model.shade(found.lights)
         residual = shown.residual(found.albedo, shading)
         weight = shown.weights(residual, shown.scale(residual))
         by_lights = found.albedo[:, None, None] * model.slopes(found.lights)
-        normal = _normal_equations(shading, by_lights, weight, _CLOSE)
-        told = (weight * shading**2).sum(dim=1) > 0
-        held = ~torch.cat([model.free(found.lights).flatten(), told])
+        normal = _normal_equations(shading, by_lights, weight, _PRECONDITIONER_DAMPING)
+        observed = (weight * shading**2).sum(dim=1) > 0
+        fixed = ~torch.cat([model.free(found.lights).flatten(), observed])
         flat = found.lights.abs().flatten()
-        held[torch.where(held[:count], 0, flat).argmax()] = True
+        fixed[torch.where(fixed[:count], 0, flat).argmax()] = True
 
     def equations(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
-        return torch.where(held, start - at, slopes(at))
+        return torch.where(fixed, start - at, slopes(at))
 
     def precondition(side: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
-        inner = torch.where(held, 0, side)
+        inner = torch.where(fixed, 0, side)
         lights, albedo = normal.solve(inner[:count].reshape(found.lights.shape), inner[count:])
-        return -torch.where(held, side, torch.cat([lights.flatten(), albedo]))
+        return -torch.where(fixed, side, torch.cat([lights.flatten(), albedo]))
 
     solution = newton_solution(equations, start, precondition)
     answer = implicit_solution(equations, solution, precondition)
@@ -243,8 +243,8 @@ def _normal_equations(
     heavy = weight[..., None] * slopes
     blocks = heavy.permute(1, 2, 0) @ slopes.transpose(0, 1)
     diagonal = blocks.diagonal(dim1=1, dim2=2)
-    # A view without data keeps its light: a unit block, and nothing on the right. So does a
-    # parameter that nothing tells.
+    # A view without data keeps its light: a unit block and a zero right-hand side. So does a
+    # parameter without data.
     floor = 1e-9 * diagonal.sum(dim=1, keepdim=True)
     floor = torch.where(floor > 0, floor, 1)
     damped = blocks + torch.diag_embed(damping * diagonal + floor)

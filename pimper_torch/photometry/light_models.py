@@ -63,7 +63,7 @@ class PointLight:
         return self.normals, self.points
 
     def free(self, lights: Float[Tensor, "view 5"]) -> Bool[Tensor, "view 5"]:
-        """Mark parameters that no bound holds."""
+        """Mark parameters that are not at a bound."""
         inner = (lights[:, 4:] > 0) & (lights[:, 4:] < 1 / MIN_DISTANCE)
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:4]) > 0, inner], dim=1)
 

@@ -83,8 +83,8 @@ def light_of_mesh(
         visible.append(registered.valid[patch, :, row, column] & finite)
         to_world = templates.patch_from_world[patch, :3, :3].to(blend)
         normals.append((blend[patch, row, column, None] @ to_world)[:, 0])
-        places = templates.points_patch[patch, row, column, None]
-        points.append(transform(invert_rigid(templates.patch_from_world[patch]), places)[:, 0])
+        positions = templates.points_patch[patch, row, column, None]
+        points.append(transform(invert_rigid(templates.patch_from_world[patch]), positions)[:, 0])
     return fit_light_field(
         torch.cat(radiance),
         torch.cat(visible),
@@ -140,15 +140,15 @@ def fit_light_field(
     seen = seen[some]
     shown = Shown(radiance=torch.where(seen, radiance[some], 0).double(), seen=seen)
     known = normals[some].double()
-    places = torch.zeros_like(known) if points is None else points[some].double()
-    origin = places.mean(dim=0)
-    size = _extent(places - origin)
+    positions = torch.zeros_like(known) if points is None else points[some].double()
+    origin = positions.mean(dim=0)
+    size = _extent(positions - origin)
     soft = point_light = None
     if model != "point_light":
         soft = fit_lights(SoftLight(basis=harmonics(known)), shown, iterations)
     if model != "soft":
         point_light = fit_lights(
-            PointLight(normals=known, points=(places - origin) / size), shown, iterations
+            PointLight(normals=known, points=(positions - origin) / size), shown, iterations
         )
     lights = torch.zeros(views, 4).to(shown.radiance)
     point_lights, closeness = torch.zeros_like(lights[:, 1:]), torch.zeros_like(lights[:, 0])
@@ -158,10 +158,10 @@ def fit_light_field(
         assert soft is not None
         lights = with_gradients(soft, shown).lights
     else:
-        told = with_gradients(point_light, shown).lights
-        lights = torch.cat([told[:, :1], lights[:, 1:]], dim=1)
-        point_lights = told[:, 1:4]
-        closeness = torch.zeros_like(closeness) if points is None else told[:, 4] / size
+        solution = with_gradients(point_light, shown).lights
+        lights = torch.cat([solution[:, :1], lights[:, 1:]], dim=1)
+        point_lights = solution[:, 1:4]
+        closeness = torch.zeros_like(closeness) if points is None else solution[:, 4] / size
     factor = _typical(lights.square().sum(dim=1) + point_lights.square().sum(dim=1))
     return LightField(
         origin=origin.to(radiance),
@@ -171,10 +171,10 @@ def fit_light_field(
     )
 
 
-def _extent(places: Float[Tensor, "sample 3"]) -> Float[Tensor, ""]:
+def _extent(positions: Float[Tensor, "sample 3"]) -> Float[Tensor, ""]:
     """Give the mean distance of places from their centre, 1 if all are one."""
-    apart = places[(places != 0).any(dim=1)]
-    return apart.norm(dim=1).sum() / len(places) if len(apart) else places.new_ones(())
+    offsets = positions[(positions != 0).any(dim=1)]
+    return offsets.norm(dim=1).sum() / len(positions) if len(offsets) else positions.new_ones(())
 
 
 def _typical(square: Float[Tensor, " view"]) -> Float[Tensor, ""]:

@@ -26,7 +26,7 @@ def outer(vectors: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch p
 def diagonal(size: int) -> list[int]:
     """Tell where the diagonal of a matrix stands in its packed form."""
     rows, columns = _triangle(size)
-    return [place for place, pair in enumerate(zip(rows, columns, strict=True)) if len({*pair}) < 2]
+    return [slot for slot, pair in enumerate(zip(rows, columns, strict=True)) if len({*pair}) < 2]
 
 
 def unpacked(
@@ -35,9 +35,9 @@ def unpacked(
     """Write matrices out, one an item."""
     rows, columns = _triangle(size)
     index = torch.zeros(size, size, dtype=torch.long, device=packed.device)
-    place = torch.arange(len(rows), device=packed.device)
-    index[rows, columns] = place
-    index[columns, rows] = place
+    slot = torch.arange(len(rows), device=packed.device)
+    index[rows, columns] = slot
+    index[columns, rows] = slot
     return packed.mT[..., index]
 
 
@@ -48,8 +48,8 @@ def apply_packed(
     size = vectors.shape[-2]
     rows, columns = _triangle(size)
     total = [torch.zeros_like(vectors[..., 0, :] * packed[..., 0, :]) for _ in range(size)]
-    for place, (row, column) in enumerate(zip(rows, columns, strict=True)):
-        entry = packed[..., place, :]
+    for slot, (row, column) in enumerate(zip(rows, columns, strict=True)):
+        entry = packed[..., slot, :]
         total[row] = torch.addcmul(total[row], entry, vectors[..., column, :])
         if row != column:
             total[column] = torch.addcmul(total[column], entry, vectors[..., row, :])
@@ -78,8 +78,8 @@ def combination(
 ) -> Float[Tensor, "*batch size item"]:
     """Give ``B c`` for matrices ``B`` given by their columns."""
     total = torch.zeros_like(columns[0])
-    for place, column in enumerate(columns):
-        total = total + column * weights[..., place : place + 1, :]
+    for slot, column in enumerate(columns):
+        total = total + column * weights[..., slot : slot + 1, :]
     return total
 
 
@@ -88,12 +88,9 @@ def congruence(
 ) -> Float[Tensor, "*batch smaller item"]:
     """Give ``B^T A B``, packed, for matrices ``B`` given by their columns."""
     images = [apply_packed(packed, column) for column in columns]
-    rows, places = _triangle(len(columns))
+    rows, others = _triangle(len(columns))
     return torch.stack(
-        [
-            (columns[row] * images[place]).sum(dim=-2)
-            for row, place in zip(rows, places, strict=True)
-        ],
+        [(columns[row] * images[slot]).sum(dim=-2) for row, slot in zip(rows, others, strict=True)],
         dim=-2,
     )
 
@@ -116,8 +113,8 @@ class PackedCholesky:
     def __init__(self, packed: Float[Tensor, "*batch packed item"], size: int) -> None:
         rows, columns = _triangle(size)
         entries = {
-            (column, row): packed[..., place, :].double()
-            for place, (row, column) in enumerate(zip(rows, columns, strict=True))
+            (column, row): packed[..., slot, :].double()
+            for slot, (row, column) in enumerate(zip(rows, columns, strict=True))
         }
         trace = torch.stack([entries[i, i] for i in range(size)]).sum(dim=0)
         floor = (1e-12 * trace.detach()).clamp_min(torch.finfo(torch.float64).tiny ** 0.5)

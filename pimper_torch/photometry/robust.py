@@ -1,4 +1,4 @@
-"""Losses that make a least-squares fit indifferent to outliers."""
+"""Robust losses, and robust estimates of scale."""
 
 from dataclasses import dataclass
 
@@ -80,7 +80,7 @@ def median_spread(
 def spread(
     residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
 ) -> Float[Tensor, "*batch"]:
-    r"""Estimate the standard deviation of residuals, outliers apart, without a median's kinks.
+    r"""Estimate the standard deviation of residuals, robustly and differentiably.
 
     An M-estimate of scale, of which the median absolute value is the limit of high powers: the
     ``t`` with

@@ -14,14 +14,14 @@ class Rows(Record):
     """The samples inside the templates of some patches, in a row, padded to the longest.
 
     Attributes:
-        place: Where in the flattened raster each sample stands; padding points to samples
-            outside the template.
+        position: Index of each sample in the flattened raster; padding indexes samples outside
+            the template.
         radiance: Linear; zero where missing.
         seen: ``D``; false where radiance is not finite.
         normals: Of what the template carries, patch frame.
     """
 
-    place: Int[Tensor, "patch sample"]
+    position: Int[Tensor, "patch sample"]
     radiance: Float[Tensor, "patch view channel sample"]
     seen: Bool[Tensor, "patch view sample"]
     normals: Float[Tensor, "patch sample 3"]
@@ -33,28 +33,28 @@ def rows_of(
     """Put the samples inside each template in a row."""
     inside = templates.inside.flatten(1)
     longest = max(int(inside.sum(dim=1).max()), 1) if len(inside) else 1
-    place = torch.argsort((~inside).to(torch.uint8), dim=1, stable=True)[:, :longest]
-    within = inside.gather(1, place)
+    position = torch.argsort((~inside).to(torch.uint8), dim=1, stable=True)[:, :longest]
+    within = inside.gather(1, position)
     num_views, num_channels = registered.radiance.shape[1:3]
-    by_view = place[:, None].expand(-1, num_views, -1)
+    by_view = position[:, None].expand(-1, num_views, -1)
     by_channel = by_view[:, :, None].expand(-1, -1, num_channels, -1)
     radiance = registered.radiance.flatten(3).gather(3, by_channel)
     seen = registered.valid.flatten(2).gather(2, by_view) & within[:, None]
     # A sum is finite where all its terms are; short of the largest numbers there are.
     seen = seen & radiance.sum(dim=2).isfinite()
     return Rows(
-        place=place,
+        position=position,
         radiance=torch.where(seen[:, :, None], radiance, 0),
         seen=seen,
-        normals=normals.flatten(1, 2).gather(1, place[..., None].expand(-1, -1, 3)),
+        normals=normals.flatten(1, 2).gather(1, position[..., None].expand(-1, -1, 3)),
     )
 
 
 def on_raster(
     row: Float[Tensor, "patch sample *channel"] | Bool[Tensor, "patch sample"],
-    place: Int[Tensor, "patch sample"],
+    position: Int[Tensor, "patch sample"],
     background: Float[Tensor, "patch height width *channel"] | Bool[Tensor, "patch height width"],
 ) -> Float[Tensor, "patch height width *channel"] | Bool[Tensor, "patch height width"]:
     """Put a row back on its raster, over a background."""
-    index = place if row.ndim == 2 else place[..., None].expand_as(row)
+    index = position if row.ndim == 2 else position[..., None].expand_as(row)
     return background.flatten(1, 2).scatter(1, index, row).reshape(background.shape)

@@ -1,4 +1,4 @@
-"""Whether light told the shape of a patch, and what kept it from that."""
+"""Whether light determines the shape of a patch, and the cause if not."""
 
 from collections import Counter
 from collections.abc import Sequence
