@@ -112,7 +112,9 @@ class Remesh(Stage):
             inside = within(contours.hull, surface, patches.num_patches)
             if patches.coarse.support is not None:
                 occlusion = ambient_occlusion(mesh.vertices_world, mesh.faces).to(misfit)
-                inside &= ~contradicted(mesh.faces, patches.coarse.support, misfit, occlusion)
+                centers = mesh.vertices_world[mesh.faces].mean(dim=1).detach()
+                support = patches.coarse.support
+                inside &= ~contradicted(centers, mesh.faces, support, misfit, occlusion)
         return remesh(
             patches.coarse,
             surface,
