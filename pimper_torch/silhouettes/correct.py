@@ -78,13 +78,6 @@ class CorrectSilhouettes(Stage):
         )
 
 
-def change(before: Silhouettes, after: Silhouettes) -> float:
-    """Give one less the intersection over union of the silhouette that changed most."""
-    one, other = before.masks.flatten(1), after.masks.flatten(1)
-    either = (one | other).sum(dim=1)
-    return float(1 - ((one & other).sum(dim=1) / either.clamp_min(1)).where(either > 0, 1).amin())
-
-
 def projections(
     mesh: Mesh, cameras: Cameras, size_px: tuple[int, int]
 ) -> Bool[Tensor, "view height width"]:

@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from pimper_torch.records import Mesh, Silhouettes
-from pimper_torch.silhouettes.correct import CorrectSilhouettes, change, projections
+from pimper_torch.silhouettes.correct import CorrectSilhouettes, projections
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 from tests.silhouettes.conftest import CENTER, RADIUS
 
@@ -66,16 +66,6 @@ def test_a_cut_that_the_surface_does_not_confirm_is_not_taken(staged, ball):
         staged.scene, silhouettes, ball.replace(vertices_world=small)
     )
     assert torch.equal(corrected.inside, silhouettes.inside)
-    assert change(silhouettes, corrected) == 0
-
-
-def test_change_is_that_of_the_view_that_changed_most(staged):
-    masks = staged.truth.clone()
-    masks[3, :, :120] = False
-    expected = 1 - overlap(masks, staged.truth)[3]
-    assert change(found(staged.truth), found(masks)) == pytest.approx(float(expected), abs=1e-6)
-    nothing = found(torch.zeros_like(masks))
-    assert change(nothing, nothing) == 0
 
 
 @pytest.mark.parametrize("source", ["masks", "everything"])
