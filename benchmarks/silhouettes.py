@@ -1,4 +1,4 @@
-"""Compare silhouettes that are found with masks that are known.
+"""Compare silhouettes that are found, and corrected, with masks that are known.
 
 Run as ``python benchmarks/silhouettes.py PHOTOS=MASKS [PHOTOS=MASKS ...]``; prints a Markdown
 table, one row a folder of photographs. Masks go by the photographs' names; alpha channels serve.
@@ -16,12 +16,11 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFine, CoarseToFineConfig
 from pimper_torch.errors import PimperWarning
 from pimper_torch.io.photographs import load_views
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes, SparseScene
-from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.silhouettes.find import FindSilhouettes
 from pimper_torch.silhouettes.settings import SilhouetteConfig
 
 
@@ -34,30 +33,37 @@ def main() -> None:
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--overlays", type=Path)
     options = parser.parse_args()
-    say("| photographs | views | trusted | IoU mean | worst | CPU s a view |")
-    say("|---|--:|--:|--:|--:|--:|")
+    say("| photographs | views | reliable | found | worst | corrected | worst | CPU s a view |")
+    say("|---|--:|--:|--:|--:|--:|--:|--:|")
+    config = CoarseToFineConfig(silhouettes=SilhouetteConfig(size_px=options.size_px))
+    chain = CoarseToFine(config, cache=options.cache)
     for pair in options.folders:
         photos, _, masks = pair.partition("=")
-        views = load_views(photos, max_size_px=options.max_size_px)
-        scene = Reconstruct(cache=options.cache)(views)
+        scene = chain.placed(load_views(photos, max_size_px=options.max_size_px), None)
+        known = known_masks(masks, scene)
         began = time.process_time()
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as cautions:
             warnings.simplefilter("always", PimperWarning)
-            silhouettes = FindSilhouettes(SilhouetteConfig(size_px=options.size_px))(scene)
+            found = chain.silhouettes(scene)
+            silhouettes = chain.corrected(scene, found)
         seconds = (time.process_time() - began) / scene.views.num_views
-        if silhouettes is None:
-            say(f"| {photos} | {scene.views.num_views} | none: {told[-1].message} | | | |")
+        if silhouettes.source == "everything":
+            say(f"| {photos} | {scene.views.num_views} | none: {cautions[-1].message} | | | | | |")
             continue
-        overlap = [
-            float((found & known).sum() / (found | known).sum())
-            for found, known in zip(silhouettes.masks, known_masks(masks, scene), strict=True)
-        ] or [float("nan")]
+        before, after = overlaps(found, known), overlaps(silhouettes, known)
         say(
             f"| {photos} | {scene.views.num_views} | {int(silhouettes.reliable.sum())} "
-            f"| {sum(overlap) / len(overlap):.4f} | {min(overlap):.4f} | {seconds:.2f} |",
+            f"| {before.mean():.4f} | {before.min():.4f} | {after.mean():.4f} | {after.min():.4f} "
+            f"| {seconds:.2f} |",
         )
         if options.overlays:
             draw(silhouettes, scene, options.overlays / Path(photos).parent.name)
+
+
+def overlaps(silhouettes: Silhouettes, known: list[Tensor]) -> Tensor:
+    """Give the intersection over union of every view."""
+    pairs = zip(silhouettes.masks, known, strict=True)
+    return torch.stack([(mask & true).sum() / (mask | true).sum() for mask, true in pairs])
 
 
 def say(line: str) -> None:
