@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         SweptPatches,
         Views,
     )
+    from pimper_torch.records.stored import load_record, save_record
     from pimper_torch.sfm.cache import user_cache
     from pimper_torch.sfm.reconstruct import Reconstruct
     from pimper_torch.silhouettes.find import FindSilhouettes
@@ -110,12 +111,14 @@ __all__ = [
     "integrate_normal_map",
     "load_chain",
     "load_config",
+    "load_record",
     "load_views",
     "make_chain",
     "photometric_stereo",
     "plot_in_view",
     "plot_patch",
     "read_mesh",
+    "save_record",
     "scene_of",
     "user_cache",
     "write_result",
@@ -173,6 +176,10 @@ _HOMES = {
         "Surface",
         "SweptPatches",
         "Views",
+    ),
+    "pimper_torch.records.stored": (
+        "load_record",
+        "save_record",
     ),
     "pimper_torch.sfm.cache": ("user_cache",),
     "pimper_torch.sfm.reconstruct": ("Reconstruct",),
