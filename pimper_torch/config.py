@@ -112,13 +112,14 @@ def presets() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _preset_folder().glob("*.yaml")))
 
 
-def read_mapping(path: Path) -> dict[str, object]:
+def read_mapping(path: Path | str) -> dict[str, object]:
     """Read a YAML file of settings.
 
     Raises:
         ConfigError: The file cannot be read, is no YAML, gives a key twice, or holds
             something other than ``key: value`` settings.
     """
+    path = Path(path)
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceLoader)
     except (OSError, UnicodeDecodeError) as error:

@@ -5,6 +5,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -122,6 +123,16 @@ def test_whatever_is_imported_is_declared():
     declared = {MODULES.get(name, name.replace("-", "_")) for name in names}
     used = {module.split(".")[0] for path in files() for module in imports(path)}
     assert used - set(sys.stdlib_module_names) - {"pimper_torch"} <= declared
+
+
+@pytest.mark.parametrize(
+    "path",
+    [path for path in files() if path.name == "__init__.py"],
+    ids=lambda path: path.parent.name,
+)
+def test_whatever_a_room_exports_is_there(path):
+    module = import_module(".".join(path.parent.relative_to(PACKAGE.parent).parts))
+    assert set(getattr(module, "__all__", ())) <= set(dir(module))
 
 
 def loaded_by(statement: str) -> set[str]:

@@ -66,13 +66,14 @@ class Decoded(Record):
     bits: int
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path | str) -> Header:
     """Read size, orientation and focal length of an image file.
 
     Raises:
         InputError: Names a file that is no JPEG, PNG or TIFF, is damaged, or is too large
             to be a photograph.
     """
+    path = Path(path)
 
     def read(image: Image.Image) -> Header:
         exif = image.getexif()
@@ -93,7 +94,7 @@ def read_header(path: Path) -> Header:
     return _with_image(path, read)
 
 
-def decode(path: Path) -> Decoded:
+def decode(path: Path | str) -> Decoded:
     """Read an image file at full depth and turn it as EXIF says.
 
     Colour profiles are not applied.
@@ -101,6 +102,7 @@ def decode(path: Path) -> Decoded:
     Raises:
         InputError: As :func:`read_header`, and for samples that are not of 8 or 16 bits.
     """
+    path = Path(path)
     header = read_header(path)
     if header.deep:
         array = rotated(_read_deep(path), header.orientation)
@@ -123,7 +125,7 @@ def decode(path: Path) -> Decoded:
     )
 
 
-def write_deep_png(samples: np.ndarray, path: Path) -> None:
+def write_deep_png(samples: np.ndarray, path: Path | str) -> None:
     """Write 16-bit colour, ``height width 3``, which Pillow would cut to 8 bits."""
     kornia_rs.io.write_image_png_u16(str(path), samples, mode="rgb")
 

@@ -68,12 +68,13 @@ def read_estimate(path: Path | str) -> Estimate:
     )
 
 
-def read_cameras(folder: Path) -> tuple[tuple[str, ...], Cameras]:
+def read_cameras(folder: Path | str) -> tuple[tuple[str, ...], Cameras]:
     """Read the views of a COLMAP model as pinholes; a lens's distortion is left out.
 
     Raises:
         InputError: The folder holds no model that can be read.
     """
+    folder = Path(folder)
     model = read_model(folder)
     intrinsics = [pinhole_of(lens) for lens in model.lenses]
     sizes = [[lens.width, lens.height] for lens in model.lenses]

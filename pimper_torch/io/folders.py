@@ -10,7 +10,7 @@ from pimper_torch.errors import OutputError
 from pimper_torch.io.photographs import some
 
 
-def prepare_output(folder: Path, contents: Collection[str], overwrite: bool = False) -> None:
+def prepare_output(folder: Path | str, contents: Collection[str], overwrite: bool = False) -> None:
     """Check, before the work, that its result can be written; leaves no trace.
 
     Args:
@@ -22,6 +22,7 @@ def prepare_output(folder: Path, contents: Collection[str], overwrite: bool = Fa
     Raises:
         OutputError: The folder already holds something, is a file, or cannot be made.
     """
+    folder = Path(folder)
     if folder.is_symlink() and not folder.exists():
         raise OutputError(f"{folder}: is a link to nothing. Remove it, or write elsewhere.")
     if folder.exists() and not folder.is_dir():
@@ -56,7 +57,7 @@ def prepare_output(folder: Path, contents: Collection[str], overwrite: bool = Fa
 
 @contextmanager
 def written_whole(
-    folder: Path, contents: Collection[str], *, overwrite: bool = False
+    folder: Path | str, contents: Collection[str], *, overwrite: bool = False
 ) -> Iterator[Path]:
     """Give a folder to fill, which takes the place of ``folder`` when all went well.
 
@@ -73,6 +74,7 @@ def written_whole(
         OutputError: As :func:`prepare_output`, or the disk refuses in the centre; then
             nothing stays behind.
     """
+    folder = Path(folder)
     prepare_output(folder, contents, overwrite)
     try:
         with _staged(folder, contents) as staging:

@@ -27,11 +27,12 @@ _TOLD = ("confidence", "expected_error")
 _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
 
 
-def write_ply(mesh: Mesh, path: Path) -> None:
+def write_ply(mesh: Mesh, path: Path | str) -> None:
     """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, what is told of errors.
 
     These are the properties ``confidence`` and ``expected_error``, the latter in scene units.
     """
+    path = Path(path)
     columns = dict(zip("xyz", mesh.vertices_world.float().unbind(dim=1), strict=True))
     columns |= dict(zip(("nx", "ny", "nz"), _normals(mesh).float().unbind(dim=1), strict=True))
     if mesh.albedo is not None:
@@ -130,13 +131,14 @@ def read_mesh(path: Path | str) -> Mesh:
     return mesh
 
 
-def write_glb(mesh: Mesh, path: Path) -> None:
+def write_glb(mesh: Mesh, path: Path | str) -> None:
     """Write a binary glTF of the same frame, normals and colours as the PLY.
 
     glTF wants colours linear, so these are albedo itself; the material is matte and seen
     from both sides. glTF calls y up: viewers show the model as it lies in the world frame
     of structure from motion, whose up is arbitrary.
     """
+    path = Path(path)
     colors = None if mesh.albedo is None else (255 * _colors(mesh)).round().cpu().numpy()
     scene = trimesh.Scene(_trimesh(mesh, None if colors is None else colors.astype(np.uint8)))
     postprocess: Callable[[dict[str, Any]], None] = _make_matte

@@ -111,13 +111,14 @@ def load_views(
     )
 
 
-def list_images(folder: Path) -> list[Path]:
+def list_images(folder: Path | str) -> list[Path]:
     """List the image files of a folder in natural order: ``img2`` before ``img10``.
 
     Raises:
         InputError: No such folder, no images in it, two of one stem, or a link that leads
             out of the folder.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing"
         raise InputError(f"{folder}: found {found}; needed: a folder of images.")
@@ -228,8 +229,9 @@ def _is_dark(
     return dark
 
 
-def read_mask(path: Path, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
+def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
     """Read a drawn mask, true where it is brighter than half; shrunk as its photographs are."""
+    path = Path(path)
     drawn = decode(path).samples.amax(dim=0) >= OPAQUE
     if max_size_px == 0:
         return drawn

@@ -43,7 +43,7 @@ _Whites = Mapping[int, Float[Tensor, " channel"]]
 
 
 def read_pictures(
-    paths: Sequence[Path],
+    paths: Sequence[Path | str],
     headers: Sequence[Header],
     sizes_px: Sequence[tuple[int, int]],
     encoding: Encoding,
@@ -65,13 +65,14 @@ def read_pictures(
     response = response_of(encoding)
     width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
     channels = max(header.channels for header in headers)
-    images = torch.zeros(len(paths), channels, height, width)
+    files = [Path(path) for path in paths]
+    images = torch.zeros(len(files), channels, height, width)
     given = None if encoding.saturation == "auto" else encoding
-    opaque, tallies = _fill(images, paths, sizes_px, response, encoding, {}, tally=given is None)
+    opaque, tallies = _fill(images, files, sizes_px, response, encoding, {}, tally=given is None)
     whites = _found(tallies, response)
     if whites:
-        _tell(paths[0].parent, whites)
-        opaque, _ = _fill(images, paths, sizes_px, response, encoding, whites, tally=False)
+        _tell(files[0].parent, whites)
+        opaque, _ = _fill(images, files, sizes_px, response, encoding, whites, tally=False)
     return Pictures(images=images, opaque=opaque)
 
 

@@ -52,7 +52,7 @@ class ModelCache:
         folder: Made when the first model is kept.
     """
 
-    folder: Path
+    folder: Path | str
 
     def find(self, key: str) -> KeptModel | None:
         """Read a model; ``None`` where there is none, or a damaged one."""
@@ -71,7 +71,7 @@ class ModelCache:
         """
         contents = _packed(kept)
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            Path(self.folder).mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=self.folder) as folder:
                 whole = Path(folder) / "whole"
                 whole.write_bytes(hashlib.sha256(contents).digest() + contents)
@@ -83,7 +83,7 @@ class ModelCache:
             ) from error
 
     def _path(self, key: str) -> Path:
-        return self.folder / f"{key}.sfm"
+        return Path(self.folder) / f"{key}.sfm"
 
 
 def user_cache() -> Path:

@@ -11,7 +11,7 @@ def draw_calibration(
     root_mean_square: Sequence[float],
     robust: Sequence[float],
     unit: str,
-    path: Path,
+    path: Path | str,
 ) -> None:
     """Draw the calibration curve on logarithmic axes, and the diagonal that is right.
 

@@ -177,7 +177,7 @@ def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
 def draw_heatmap(
     error: Float[Tensor, "height width"],
     scale: ErrorScale,
-    path: Path,
+    path: Path | str,
     *,
     shading: Float[Tensor, "height width 3"] | None = None,
     title: str = "",
@@ -191,6 +191,7 @@ def draw_heatmap(
         shading: The surface in that view, see :func:`shading_in_view`.
         title: Above it.
     """
+    path = Path(path)
     picture = error_picture(error, scale, shading=shading)
     rows, columns = crop_to(~error.isnan())
     cropped = picture[rows, columns]
@@ -203,7 +204,7 @@ def draw_heatmap(
     figure.savefig(path, dpi=120, facecolor="white")
 
 
-def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path) -> None:
+def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) -> None:
     """Draw scenes by methods as PNG.
 
     Every scene has two rows of pictures: the photograph and each method's surface above, the
@@ -217,6 +218,7 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path) -> None:
     Raises:
         InputError: There are no rows.
     """
+    path = Path(path)
     if not rows:
         raise InputError("there is no scene to draw; needed: one or more.")
     names = tuple(dict.fromkeys(panels.method for row in rows for panels in row.methods))

@@ -47,7 +47,7 @@ class Panel:
     inside: Picture | None = None
 
 
-def draw_overview(result: Reconstruction, path: Path, panel_px: int = 560) -> None:
+def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = 560) -> None:
     """Draw the contact sheet of a run as PNG.
 
     Shown in the reference view, cropped to the object: the photograph, the facets over it

@@ -60,7 +60,7 @@ def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
     return render_scene(name, folder, config.scene, processes=config.processes)
 
 
-def prepare(folder: Path, config: BenchConfig, cache: Path | None = None) -> Inputs:
+def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) -> Inputs:
     """Read a rendered scene and find its cameras, from the files as a user would.
 
     Args:

@@ -56,7 +56,7 @@ def run_bench(
     *,
     observer: Observer | None = None,
     overwrite: bool = False,
-    cache: Path | None = None,
+    cache: Path | str | None = None,
 ) -> Table:
     """Run methods on scenes, and write the table, its figures and all surfaces to a folder.
 
@@ -133,7 +133,7 @@ def _scene(
     workspace: Path,
     staging: Path,
     observer: Observer,
-    cache: Path | None,
+    cache: Path | str | None,
 ) -> tuple[list[Row], list[SceneRow]]:
     """Run all methods on a scene; a scene without cameras has rows that say why."""
     name = Path(scene).stem

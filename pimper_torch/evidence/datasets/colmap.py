@@ -91,7 +91,7 @@ def read_colmap_scene(
 def write_colmap(
     views: Views,
     cameras: Cameras,
-    folder: Path,
+    folder: Path | str,
     *,
     points_world: Float[Tensor, "point 3"] | None = None,
 ) -> None:
@@ -110,6 +110,7 @@ def write_colmap(
         InputError: A camera has a skew, which COLMAP's pinhole cannot have.
         OutputError: The model cannot be written.
     """
+    folder = Path(folder)
     refuse_skew(cameras, views.names, "a COLMAP model")
     files = file_names(views.names)
     for index, file in enumerate(files):

@@ -109,7 +109,7 @@ def read_scale_mats(
 def write_idr(
     views: Views,
     cameras: Cameras,
-    folder: Path,
+    folder: Path | str,
     *,
     points_world: Float[Tensor, "point 3"] | None = None,
 ) -> None:
@@ -128,6 +128,7 @@ def write_idr(
     Raises:
         InputError: There is nothing to guess the sphere from.
     """
+    folder = Path(folder)
     digits = max(3, len(str(views.num_views - 1)))
     for index in range(views.num_views):
         write_picture(views, index, folder / "image" / f"{index:0{digits}d}.png")

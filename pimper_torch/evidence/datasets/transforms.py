@@ -87,7 +87,7 @@ def read_transforms(
 def write_transforms(
     views: Views,
     cameras: Cameras,
-    folder: Path,
+    folder: Path | str,
     *,
     points_world: Float[Tensor, "point 3"] | None = None,
 ) -> None:
@@ -104,6 +104,7 @@ def write_transforms(
     Raises:
         InputError: A camera has a skew, which the format cannot say.
     """
+    folder = Path(folder)
     refuse_skew(cameras, views.names, "transforms.json")
     files = file_names(views.names)
     world_from_cam = invert_rigid(cameras.cam_from_world.detach().cpu().double()).clone()

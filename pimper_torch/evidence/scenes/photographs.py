@@ -12,11 +12,12 @@ from torch import Tensor
 from pimper_torch.records import Views
 
 
-def save_photographs(views: Views, folder: Path) -> tuple[Path, ...]:
+def save_photographs(views: Views, folder: Path | str) -> tuple[Path, ...]:
     """Write views as 8-bit sRGB PNG files, named as the views are.
 
     Radiance over 1 saturates. The folder is made if it is not there.
     """
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for image, name, (width, height) in zip(
@@ -30,9 +31,10 @@ def save_photographs(views: Views, folder: Path) -> tuple[Path, ...]:
 
 
 def save_masks(
-    masks: Bool[Tensor, "view height width"], names: Sequence[str], folder: Path
+    masks: Bool[Tensor, "view height width"], names: Sequence[str], folder: Path | str
 ) -> tuple[Path, ...]:
     """Write one PNG file a view, white on the object, named as the views are."""
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for mask, name in zip(masks, names, strict=True):

@@ -1,0 +1,84 @@
+"""Whatever takes a path takes a string: mypy checks that the bodies treat it as one."""
+
+import importlib
+import inspect
+import pkgutil
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import pimper_torch
+
+# Rooms whose public functions people call; of the wings, what a room exports.
+ROOMS = ("chains", "config", "io", "records", "viz")
+EXPORTING = ("baselines", "datasets", "metrics", "scenes")
+
+
+def functions() -> Iterator[typing.Any]:
+    """List what users call: exported names, and the public functions of the rooms at the edge."""
+    yield from (getattr(pimper_torch, name) for name in pimper_torch.__all__)
+    for name in EXPORTING:
+        room = importlib.import_module(f"pimper_torch.evidence.{name}")
+        yield from (getattr(room, exported) for exported in room.__all__)
+    for name in ("sfm.cache", "evidence.bench.run", *modules()):
+        module = importlib.import_module(f"pimper_torch.{name}")
+        for found in vars(module).values():
+            if getattr(found, "__module__", None) == module.__name__:
+                yield found
+
+
+def modules() -> Iterator[str]:
+    for room in ROOMS:
+        module = importlib.import_module(f"pimper_torch.{room}")
+        yield room
+        for inner in pkgutil.iter_modules(getattr(module, "__path__", ())):
+            yield f"{room}.{inner.name}"
+
+
+def parameters(found: typing.Any) -> Iterator[tuple[str, typing.Any]]:
+    """Give annotated parameters of a function, or of a class's constructor and methods."""
+    names = vars(found) if inspect.isclass(found) else {"": found}
+    for name, one in names.items():
+        if inspect.isfunction(one) and (not name.startswith("_") or name == "__init__"):
+            # Figures are annotated in quotes: matplotlib is imported when one is drawn.
+            hints = inspect.get_annotations(inspect.unwrap(one))
+            yield from ((f"{found.__name__}.{name}({key})", hint) for key, hint in hints.items())
+
+
+def parts(hint: typing.Any) -> Iterator[typing.Any]:
+    yield hint
+    for part in typing.get_args(hint):
+        yield from parts(part)
+
+
+TAKING = {
+    name: hint
+    for found in functions()
+    if (inspect.isclass(found) or inspect.isfunction(found)) and not found.__name__.startswith("_")
+    # Settings are read from YAML and the command line, which turn strings into paths.
+    if not found.__name__.endswith(("Config", "Encoding"))
+    for name, hint in parameters(found)
+    if Path in parts(hint) and "(return)" not in name
+}
+
+
+@pytest.mark.parametrize("name", TAKING)
+def test_a_path_may_be_a_string(name):
+    assert str in parts(TAKING[name])
+
+
+def test_the_walk_finds_readers_writers_and_stages():
+    found = set(TAKING)
+    assert len(found) > 50
+    assert {
+        "load_views.(folder)",
+        "read_idr.(mesh)",
+        "write_result.(folder)",
+        "save_record.(path)",
+        "draw_overview.(path)",
+        "Chain.forward(sparse_model)",
+        "Reconstruct.__init__(cache)",
+        "ModelCache.__init__(folder)",
+    } <= found
