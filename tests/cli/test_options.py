@@ -8,6 +8,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import pytest
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.chains.presets import load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
@@ -174,7 +175,30 @@ def spelt(leaf):
     return [f"--{'.'.join([*stages, no + name])}" for no in ("", "no-")]
 
 
-def rivals(leaf):
+def effects(preset, capsys):
+    """Give what the help says of each option of a preset, without its default."""
+    with pytest.raises(SystemExit):
+        main(["reconstruct", "--preset", preset, "--help"])
+    lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
+    entries = re.split(r"^(--[a-z].*)$", "\n".join(lines), flags=re.MULTILINE)
+    names = (re.findall(r"--[a-z][\w.-]*", entry) for entry in entries[1::2])
+    texts = (
+        re.sub(r"\(default:.*|\(required.*|╰.*", "", each, flags=re.S) for each in entries[2::2]
+    )
+    return {name: text for each, text in zip(names, texts, strict=True) for name in each}
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_settings_are_80_at_most_and_the_reference_says_what_each_does(preset, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    settings = list(leaves(load_config(preset)))
+    assert 30 < len(settings) <= 80
+    said = effects(preset, capsys)
+    silent = [leaf.path for leaf in settings if len(said[spelt(leaf)[0]].split()) < 3]
+    assert not silent
+
+
+def other_values(leaf):
     """Give values that a setting may have in place of its default."""
     kind, value = leaf.kind, leaf.value
     if get_origin(kind) in (UnionType, Union):
@@ -218,7 +242,7 @@ def test_every_setting_of_every_stage_reaches_the_configuration(chain, tmp_path)
     while left:  # some settings exclude one another: those refused come in the next line
         config, line, refused = chain(), ["--preset", str(preset)], []
         for leaf in left:
-            for value in rivals(leaf):
+            for value in other_values(leaf):
                 try:
                     config = changed(config, leaf.path, value)
                 except ConfigError:

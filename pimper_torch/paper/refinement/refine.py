@@ -23,7 +23,6 @@ class RefineConfig:
     """How finely the patches are joined, and how much seams are smoothed.
 
     Attributes:
-            Time and memory fall with its square.
         smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
             ``1 / (r * spacing)^2``, the inverse square of a length. Where G is constant, a
             wave of length ``w`` keeps ``1 / (1 + (2 pi R / w)^2)`` of its height, with
