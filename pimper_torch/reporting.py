@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
-from pimper_torch.geometry.components import boundary_loops
+from pimper_torch.geometry.topology import boundary_loops
 from pimper_torch.patches.warp import missing_fraction
 from pimper_torch.progress import listening
 from pimper_torch.records import (

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pimper_torch.geometry.components import face_components
+from pimper_torch.geometry.topology import face_components
 from pimper_torch.records import Photometry, Support
 
 # Misfit above which surface is contradicted: in multiples of that of facets with points and like

@@ -7,10 +7,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import face_components
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Mesh
 

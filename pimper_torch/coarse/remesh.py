@@ -13,13 +13,8 @@ from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.components import vertex_fans
-from pimper_torch.geometry.surfaces import (
-    corners_of,
-    face_edges,
-    face_normals,
-    side_lengths,
-)
+from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.topology import corners_of, face_edges, vertex_fans
 from pimper_torch.geometry.visibility import ambient_occlusion
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
 from pimper_torch.silhouettes.contours import Contours

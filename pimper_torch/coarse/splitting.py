@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Record
 
 # Barycentric coordinates of a face's corners, and of the midpoints of the opposite edges.

@@ -18,7 +18,8 @@ from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import triangulation_angles
-from pimper_torch.geometry.surfaces import face_edges, face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.topology import face_counts, face_edges, half_edges
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 from pimper_torch.sfm.surfaces import simplified
 from pimper_torch.silhouettes.contours import Contours
@@ -134,9 +135,8 @@ def smoothed_normals(
 ) -> Float[Tensor, "vertex 3"]:
     """Average each vertex normal with the mean of those of its neighbours; unit."""
     normals = vertex_normals(vertices, faces)
-    source = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1)
-    target = faces[:, [1, 0, 2, 1, 0, 2]].reshape(-1)
-    total = torch.zeros_like(normals).index_add(0, target, normals[source])
+    ends = half_edges(faces)
+    total = torch.zeros_like(normals).index_add(0, ends.flatten(), normals[ends.flip(1).flatten()])
     return normalize(normals + normalize(total, dim=-1), dim=-1)
 
 
@@ -145,8 +145,8 @@ def two_faces_an_edge(
 ) -> Int[Tensor, "kept 3"]:
     """Drop the smallest face of edges with three or more until each has two at most."""
     while True:
-        edges, face_edge = face_edges(faces)
-        counts = torch.bincount(face_edge.flatten(), minlength=len(edges))
+        _, face_edge = face_edges(faces)
+        counts = face_counts(face_edge)
         crowded = (counts[face_edge] > 2).any(dim=1)
         if not bool(crowded.any()):
             return faces

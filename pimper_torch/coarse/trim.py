@@ -10,14 +10,9 @@ from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.matching import Level
-from pimper_torch.geometry.components import component_areas, face_components, graph_components
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import (
-    corners_of,
-    face_normals,
-    face_pairs,
-    side_lengths,
-)
+from pimper_torch.geometry.surfaces import component_areas, face_normals, side_lengths
+from pimper_torch.geometry.topology import corners_of, face_components, face_pairs, graph_components
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import num_workers, side_by_side
 from pimper_torch.records import Record

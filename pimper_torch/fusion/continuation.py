@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.components import vertex_components
-from pimper_torch.geometry.surfaces import boundary_vertices
+from pimper_torch.geometry.topology import boundary_vertices, vertex_components
 from pimper_torch.linalg.systems import solutions
 
 # The mean counts as much as this fraction of a neighbour at least, so that every vertex has a

@@ -33,7 +33,8 @@ from pimper_torch.fusion.terms import (
     upright_heights,
 )
 from pimper_torch.geometry.subdivision import Subdivision, subdivide, transferred
-from pimper_torch.geometry.surfaces import face_edges, vertex_normals
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.records import (
     Convergence,

@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import face_edges, face_normals
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Record
 
 # An edge has at most so many times the pieces that it would have if its facet were equilateral,

@@ -1,4 +1,4 @@
-"""Normals, slopes, areas and neighbourhoods of rasters and meshes."""
+"""Normals, slopes and areas of rasters and meshes."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -47,47 +47,17 @@ def vertex_normals(
     return normalize(total, dim=-1)
 
 
-def face_pairs(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "pair 2"], Int[Tensor, "pair 2"]]:
-    """Find which faces share an edge.
-
-    Returns:
-        For every edge with exactly two faces: the faces, and the edge's two vertices.
-    """
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
-    if len(edges) == 0:
-        return edges, edges
-    # One number an edge: sorting rows takes twenty times as long.
-    key, order = (edges[:, 0] * (edges.max() + 1) + edges[:, 1]).sort(stable=True)
-    new = torch.ones_like(key, dtype=torch.bool)
-    new[1:] = key[1:] != key[:-1]
-    start = new.nonzero()[:, 0]
-    counts = torch.diff(start, append=start.new_tensor([len(key)]))
-    first = start[counts == 2]
-    return torch.stack([order[first], order[first + 1]], dim=1) // 3, edges[order[first]]
-
-
-def face_edges(
+def component_areas(
+    vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
-) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "face 3"]]:
-    """Give every edge once, its lower vertex first, and which lies opposite to each corner."""
-    ends = faces[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2).sort(dim=1).values
-    if len(ends) == 0:
-        return ends, faces
-    # One number an edge: rows take far longer to compare.
-    size = ends.max() + 1
-    key, index = torch.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)
-    return torch.stack([key // size, key % size], dim=1), index.reshape(-1, 3)
-
-
-def boundary_vertices(
-    faces: Int[Tensor, "face 3"], num_vertices: int
-) -> Bool[Tensor, " {num_vertices}"]:
-    """Mark vertices on an edge that has one face, or more than two."""
-    edges, index = face_edges(faces)
-    border = torch.bincount(index.flatten(), minlength=len(edges)) != 2
-    marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
-    marked[edges[border].flatten()] = True
-    return marked
+    label: Int[Tensor, " face"],
+    counted: Bool[Tensor, " face"] | None = None,
+) -> Float[Tensor, " face"]:
+    """Sum the areas of all faces of each face's component, or of those that count; float64."""
+    area = face_normals(vertices, faces).norm(dim=-1).double() / 2
+    if counted is not None:
+        area = area * counted
+    return torch.zeros_like(area).index_add(0, label, area)[label]
 
 
 def barycentric_2d(
@@ -100,12 +70,3 @@ def barycentric_2d(
     beta = (ap[..., 0] * ac[..., 1] - ap[..., 1] * ac[..., 0]) / area
     gamma = (ab[..., 0] * ap[..., 1] - ab[..., 1] * ap[..., 0]) / area
     return torch.stack([1 - beta - gamma, beta, gamma], dim=-1)
-
-
-def corners_of(
-    faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, " face"], num_vertices: int
-) -> Bool[Tensor, " {num_vertices}"]:
-    """Mark the vertices of some faces."""
-    marked = torch.zeros(num_vertices, dtype=torch.bool, device=faces.device)
-    marked[faces[chosen].flatten()] = True
-    return marked

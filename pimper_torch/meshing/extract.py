@@ -9,7 +9,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.components import component_areas, face_components, vertex_fans
+from pimper_torch.geometry.surfaces import component_areas
+from pimper_torch.geometry.topology import face_components, vertex_fans
 from pimper_torch.meshing.faults import faults, overturned, stretched
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.records import Mesh, Surface

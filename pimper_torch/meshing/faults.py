@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.components import graph_components
-from pimper_torch.geometry.surfaces import face_normals, face_pairs, side_lengths
+from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.topology import face_pairs, graph_components
 
 # Angle between the normals of neighbouring faces above which they lie on each other. A choice: at
 # edges of a box or of thin bones it is a right angle, give or take the noise of small faces.

@@ -3,7 +3,7 @@
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.components import vertex_components
+from pimper_torch.geometry.topology import vertex_components
 
 
 def small_groups(

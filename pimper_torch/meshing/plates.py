@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import corners_of, face_edges
+from pimper_torch.geometry.topology import corners_of, face_edges
 from pimper_torch.linalg.systems import solutions
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.config import require
-from pimper_torch.geometry.components import vertex_components
-from pimper_torch.geometry.surfaces import boundary_vertices, corners_of, vertex_normals
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.topology import boundary_vertices, corners_of, vertex_components
 from pimper_torch.meshing.faults import faults
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.meshing.plates import least_bent

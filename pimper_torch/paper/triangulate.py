@@ -11,15 +11,11 @@ from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.surface import smoothed_normals
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
-from pimper_torch.geometry.surfaces import (
-    face_edges,
-    face_normals,
-    side_lengths,
-)
+from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.topology import face_components, face_edges
 from pimper_torch.paper.cloud import with_cloud
 from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.paper.filters import (

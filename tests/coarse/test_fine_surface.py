@@ -11,9 +11,9 @@ from pimper_torch.coarse.trim import ViewCounts
 from pimper_torch.errors import ConfigError, ReconstructionError
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import face_components, face_pairs
 from pimper_torch.records import Support
 from pimper_torch.silhouettes.contours import TraceContours
 from tests.coarse.ball import SETTINGS, photographed, silhouettes_of

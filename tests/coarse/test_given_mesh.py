@@ -6,8 +6,8 @@ from pimper_torch.coarse.given_mesh import oriented_outward
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import face_components
 from pimper_torch.records import Mesh
 from tests.coarse.ball import all_round
 

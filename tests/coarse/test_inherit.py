@@ -5,7 +5,8 @@ from torch.testing import assert_close
 
 from pimper_torch.coarse.inherit import MIN_WEIGHT, fitted_normals, with_points
 from pimper_torch.coarse.splitting import split_edges
-from pimper_torch.geometry.surfaces import barycentric_2d, face_edges, vertex_normals
+from pimper_torch.geometry.surfaces import barycentric_2d, vertex_normals
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
 
 

@@ -9,12 +9,8 @@ from pimper_torch.coarse.remesh import RemeshConfig, remesh, within
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.surfaces import (
-    barycentric_2d,
-    boundary_vertices,
-    face_normals,
-    vertex_normals,
-)
+from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
+from pimper_torch.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.paper.fill import delaunay
 from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
 from pimper_torch.silhouettes.hull import Hull
@@ -75,7 +71,7 @@ def dome(points):
 
 
 def edge_counts(faces):
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    edges = half_edges(faces).sort(dim=1).values
     return torch.unique(edges, dim=0, return_counts=True)[1]
 
 

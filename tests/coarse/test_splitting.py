@@ -4,7 +4,8 @@ from torch.testing import assert_close
 
 from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.surfaces import face_edges, face_normals
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import face_edges, half_edges
 
 
 def areas(vertices, faces):
@@ -12,7 +13,7 @@ def areas(vertices, faces):
 
 
 def faces_per_edge(faces):
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    edges = half_edges(faces).sort(dim=1).values
     return torch.unique(edges, dim=0, return_counts=True)[1]
 
 

@@ -13,9 +13,9 @@ from pimper_torch.coarse.surface import (
 from pimper_torch.errors import ConfigError, InputError, ReconstructionError
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.geometry.surfaces import face_normals, face_pairs, vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.topology import face_components, face_pairs
 from pimper_torch.records import Mesh, Silhouettes, Support
 from pimper_torch.silhouettes.contours import Contours
 from tests.coarse.ball import SETTINGS, photographed

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.fusion.continuation import about_mean, continued, enclosed
 from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.geometry.topology import face_edges
 
 WORLD = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
 

@@ -8,7 +8,7 @@ from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.expected_error import expected_error, regions
 from pimper_torch.fusion.terms import Terms
 from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.geometry.topology import face_edges
 
 # Standard errors from so many draws are off by 4 %; of all vertices, by three times that.
 DRAWS, CLOSE = 300, 0.13

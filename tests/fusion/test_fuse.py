@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from pimper_torch.coarse.remesh import Remesh
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, Silhouettes
 from pimper_torch.silhouettes.contours import Contours

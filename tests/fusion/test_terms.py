@@ -14,7 +14,7 @@ from pimper_torch.fusion.terms import (
     upright,
 )
 from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.surfaces import face_edges
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import ContourPoints, FacetPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -5,6 +5,7 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.subdivision import Subdivision, subdivide, transferred
 from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import half_edges
 
 
 def icosphere(subdivisions=1):
@@ -26,7 +27,7 @@ def ragged_fan(seed=41):
 
 
 def edge_counts(faces):
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    edges = half_edges(faces).sort(dim=1).values
     return torch.unique(edges, dim=0, return_counts=True)
 
 

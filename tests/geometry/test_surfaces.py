@@ -5,16 +5,13 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.surfaces import (
     barycentric_2d,
-    boundary_vertices,
-    face_edges,
     face_normals,
-    face_pairs,
     normals_from_slopes,
     slopes_from_normals,
     vertex_normals,
 )
 
-# Two triangles that fraction the edge 0-2, and a third on its own.
+# Two triangles that share the edge 0-2, and a third on its own.
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
 
 
@@ -78,56 +75,6 @@ def test_vertex_normals_of_a_ball_point_away_from_its_centre():
     vertices, faces = as_tensors(trimesh.creation.icosphere(subdivisions=4))
     found = vertex_normals(vertices, faces)
     assert (found * vertices).sum(dim=1).min() > 0.9999
-
-
-def test_neighbouring_faces_are_found_with_their_edge():
-    pairs, edges = face_pairs(FACES)
-    assert [sorted(pair) for pair in pairs.tolist()] == [[0, 1]]
-    assert edges.tolist() == [[0, 2]]
-
-
-def test_neighbours_agree_with_trimesh_on_a_closed_mesh():
-    mesh = trimesh.creation.icosphere(subdivisions=2)
-    pairs, edges = face_pairs(torch.tensor(mesh.faces))
-    found = {
-        (frozenset(pair), frozenset(edge))
-        for pair, edge in zip(pairs.tolist(), edges.tolist(), strict=True)
-    }
-    expected = {
-        (frozenset(pair), frozenset(edge))
-        for pair, edge in zip(
-            mesh.face_adjacency.tolist(), mesh.face_adjacency_edges.tolist(), strict=True
-        )
-    }
-    assert len(pairs) == len(expected)
-    assert found == expected
-
-
-def test_an_edge_of_three_faces_joins_nobody():
-    pairs, _ = face_pairs(torch.tensor([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
-    assert len(pairs) == 0
-
-
-def test_every_edge_is_listed_once_and_lies_opposite_to_its_corners():
-    mesh = trimesh.creation.icosphere(subdivisions=2)
-    faces = torch.from_numpy(mesh.faces)
-    edges, opposite = face_edges(faces)
-    assert len(torch.unique(edges, dim=0)) == len(edges)
-    assert len(mesh.vertices) - len(edges) + len(faces) == 2  # Euler's formula for a sphere
-    everything = torch.cat([edges[opposite], faces[:, :, None]], dim=2)
-    assert (everything.sort().values == faces.sort().values[:, None]).all()
-
-
-def test_the_boundary_is_where_an_edge_has_not_two_faces():
-    hexagon = torch.tensor([[0, k, k % 6 + 1] for k in range(1, 7)])  # a fan round vertex 0
-    marked = boundary_vertices(hexagon, 8)
-    assert marked.tolist() == [False, *[True] * 6, False]
-    closed = torch.tensor(trimesh.creation.icosphere(subdivisions=1).faces)
-    assert not boundary_vertices(closed, int(closed.max()) + 1).any()
-    fin = torch.cat([closed, torch.tensor([[*closed[0, :2], int(closed.max()) + 1]])])
-    assert boundary_vertices(fin, int(fin.max()) + 1).nonzero()[:, 0].tolist() == sorted(
-        [*closed[0, :2].tolist(), int(fin.max())]
-    )
 
 
 def test_barycentric_coordinates_rebuild_the_point_and_tell_the_side(generator):

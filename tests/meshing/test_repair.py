@@ -8,8 +8,13 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.metrics.closedness import closedness
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.components import boundary_loops, vertex_components
-from pimper_torch.geometry.surfaces import boundary_vertices, face_edges, vertex_normals
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.topology import (
+    boundary_loops,
+    boundary_vertices,
+    face_edges,
+    vertex_components,
+)
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.faults import faults, overturned
 from pimper_torch.meshing.plates import least_bent

@@ -4,7 +4,8 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError, ReconstructionError
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import face_normals, face_pairs
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import face_pairs, half_edges
 from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.paper.triangulate import (
     Triangulate,
@@ -30,7 +31,7 @@ def test_the_mesh_of_a_ball_faces_out_is_connected_and_lies_on_the_ball(dome_clo
 
 def test_the_mesh_has_no_hole(dome_cloud):
     faces = Triangulate()(dome_cloud).mesh.faces
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    edges = half_edges(faces).sort(dim=1).values
     unique, counts = torch.unique(edges, dim=0, return_counts=True)
     euler = len(torch.unique(faces)) - len(unique) + len(faces)
     assert counts.max() == 2

@@ -41,6 +41,7 @@ from pimper_torch.evidence.baselines.template import (
     surface_of,
 )
 from pimper_torch.geometry.height_fields import sample_raster
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.paper.fill import delaunay
 from pimper_torch.paper.integrate import integrate_normals
 from pimper_torch.patches.warp import WarpConfig
@@ -226,9 +227,8 @@ def relief_from(
 
 def edges_of(points: Float[Tensor, "point 3"]) -> Float[Tensor, "span 2 3"]:
     """Give the ends of the edges of a triangulation of the points' x and y."""
-    faces = delaunay(points[:, :2])
-    pairs = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
-    return points[torch.unique(pairs, dim=0)]
+    edges, _ = face_edges(delaunay(points[:, :2]))
+    return points[edges]
 
 
 def spans_between(

@@ -25,12 +25,8 @@ from torch.nn.functional import normalize
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
-from pimper_torch.geometry.surfaces import (
-    boundary_vertices,
-    face_normals,
-    side_lengths,
-    vertex_normals,
-)
+from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
+from pimper_torch.geometry.topology import boundary_vertices, face_counts, face_edges, half_edges
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 from pimper_torch.stage import Stage
@@ -210,11 +206,8 @@ def _rim_differences(subdivision: Subdivision, edge: Float[Tensor, ""]) -> Entri
 
 def _rim_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
     """List the edges that only one face has, in its direction."""
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    _, index, counts = torch.unique(
-        directed.sort(dim=1).values, dim=0, return_inverse=True, return_counts=True
-    )
-    return directed[counts[index] == 1]
+    _, index = face_edges(faces)
+    return half_edges(faces)[face_counts(index)[index.flatten()] == 1]
 
 
 def _holders(

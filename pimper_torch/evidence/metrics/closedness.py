@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.components import boundary_loops, face_components
-from pimper_torch.geometry.surfaces import face_edges, face_normals, face_pairs
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import boundary_loops, face_components, face_edges, face_pairs
 from pimper_torch.records import Mesh, Record
 
 

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.components import face_components
 from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
+from pimper_torch.geometry.topology import face_components
 from pimper_torch.records import Mesh, Record
 
 # Points that candidates for planes are judged by, and candidates for each plane.

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.height_fields import intersect_height_field
-from pimper_torch.geometry.surfaces import face_pairs
+from pimper_torch.geometry.topology import face_pairs
 from pimper_torch.records import PatchSet, Record
 from pimper_torch.records.patches import Depths, Templates
 

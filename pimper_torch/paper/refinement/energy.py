@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.geometry.subdivision import Subdivision
-from pimper_torch.geometry.surfaces import face_pairs
+from pimper_torch.geometry.topology import face_pairs
 from pimper_torch.paper.refinement.finite_elements import (
     Elements,
     cotangent_laplacian,

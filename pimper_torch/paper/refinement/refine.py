@@ -11,7 +11,8 @@ from pimper_torch.config import require
 from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.fusion.continuation import about_mean
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
-from pimper_torch.geometry.surfaces import face_edges, vertex_normals
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.linalg.systems import solutions
 from pimper_torch.paper.refinement.energy import assemble, facet_trends, plane_regularization
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.components import graph_components
+from pimper_torch.geometry.topology import graph_components
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

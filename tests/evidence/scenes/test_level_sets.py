@@ -10,10 +10,11 @@ from pimper_torch.evidence.scenes.level_sets import (
 from pimper_torch.evidence.scenes.meshes import lathe
 from pimper_torch.evidence.scenes.objects import jar_mesh, mug_mesh
 from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import half_edges
 
 
 def euler(mesh):
-    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    edges = half_edges(mesh.faces).sort(dim=1).values
     unique, counts = torch.unique(edges, dim=0, return_counts=True)
     assert (counts == 2).all()  # closed
     used = len(mesh.faces.unique())

@@ -17,6 +17,7 @@ from pimper_torch.evidence.scenes.sensor import SensorConfig
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.topology import half_edges
 from pimper_torch.records import Mesh
 
 QUIET = SensorConfig(supersample=1, read_noise=0.0, shot_noise=0.0)
@@ -213,7 +214,7 @@ def test_point_lights_wander_within_their_cone_and_differ(generator):
 def test_a_potato_is_closed_rests_on_the_table_and_depends_on_its_seed_only():
     first = potato(torch.Generator().manual_seed(70), subdivisions=3)
     assert_close(first.vertices_world[:, 2].min(), torch.tensor(0.0, dtype=torch.float64))
-    edges = first.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values
+    edges = half_edges(first.faces).sort(dim=1).values
     assert (torch.unique(edges, dim=0, return_counts=True)[1] == 2).all()
     centre = first.vertices_world.mean(dim=0)
     outward = ((first.vertices_world - centre) * first.normals_world).sum(dim=1)

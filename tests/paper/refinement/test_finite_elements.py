@@ -3,7 +3,7 @@ import torch
 from scipy.spatial import Delaunay
 from torch.testing import assert_close
 
-from pimper_torch.geometry.surfaces import boundary_vertices
+from pimper_torch.geometry.topology import boundary_vertices
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.systems import prepare

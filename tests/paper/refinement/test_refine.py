@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.fusion.blend import blend_patches, ray_directions, vertex_spacing
 from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.surfaces import boundary_vertices
+from pimper_torch.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.paper.refinement.refine import Refine, RefineConfig
 
 SPACING = 0.02
@@ -89,7 +89,7 @@ def test_the_union_is_continuous_across_a_step_between_patches(builder):
     depths = builder.patches(builder.coarse(plane, rings=1), plane)
     step = 4 * SPACING
     subdivision, _, points = united(shifted(depths, [0, 2], step))
-    edges = subdivision.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = half_edges(subdivision.faces)
     heights = points[:, 2] - plane(points[:, 0], points[:, 1])
     jump = (heights[edges[:, 0]] - heights[edges[:, 1]]).abs()
     assert heights.abs().max() > 0.9 * step
@@ -103,9 +103,7 @@ def test_steps_at_seams_are_smoothed_and_the_centre_of_facets_is_kept(builder):
     stepped = shifted(depths, [0, 2, 4], step)
     subdivision, _, points = united(stepped)
     surface = Refine(RefineConfig(smoothing_radius_samples=2.0))(stepped)
-    edges = torch.unique(
-        subdivision.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(dim=1).values, dim=0
-    )
+    edges = torch.unique(half_edges(subdivision.faces).sort(dim=1).values, dim=0)
 
     def steepest(vertices):
         height = vertices[:, 2] - plane(vertices[:, 0], vertices[:, 1])

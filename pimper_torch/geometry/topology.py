@@ -1,0 +1,154 @@
+"""Edges, connected components, borders and vertex fans of triangle meshes.
+
+Graphs are searched by scipy, on the CPU.
+"""
+
+import torch
+from jaxtyping import Bool, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+
+def half_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "half_edge 2"]:
+    """List the three edges of every face in its direction: opposite to corners 0, 1 and 2.
+
+    >>> half_edges(torch.tensor([[4, 5, 6]]))
+    tensor([[5, 6],
+            [6, 4],
+            [4, 5]])
+    """
+    return faces[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2)
+
+
+def face_edges(
+    faces: Int[Tensor, "face 3"],
+) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "face 3"]]:
+    """List every edge once, its lower vertex first, and which one is opposite to each corner."""
+    ends = half_edges(faces).sort(dim=1).values
+    if len(ends) == 0:
+        return ends, faces
+    # One key an edge: rows take far longer to compare.
+    size = ends.max() + 1
+    key, index = torch.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)
+    return torch.stack([key // size, key % size], dim=1), index.reshape(-1, 3)
+
+
+def face_pairs(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "pair 2"], Int[Tensor, "pair 2"]]:
+    """Find which faces share an edge.
+
+    Returns:
+        For every edge with exactly two faces: the faces, and the edge's two vertices.
+    """
+    edges, index = face_edges(faces)
+    counts = face_counts(index)
+    order = index.flatten().argsort(stable=True)
+    first = (counts.cumsum(dim=0) - counts)[counts == 2]
+    return torch.stack([order[first], order[first + 1]], dim=1) // 3, edges[counts == 2]
+
+
+def face_counts(face_edge: Int[Tensor, "face 3"]) -> Int[Tensor, " edge"]:
+    """Count the faces at every edge, from the edges of every face of :func:`face_edges`."""
+    return torch.bincount(face_edge.flatten())
+
+
+def boundary_vertices(
+    faces: Int[Tensor, "face 3"], num_vertices: int
+) -> Bool[Tensor, " {num_vertices}"]:
+    """Mark vertices on an edge that has one face, or more than two."""
+    edges, index = face_edges(faces)
+    return _marked(edges[face_counts(index) != 2], num_vertices)
+
+
+def corners_of(
+    faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, " face"], num_vertices: int
+) -> Bool[Tensor, " {num_vertices}"]:
+    """Mark the vertices of some faces."""
+    return _marked(faces[chosen], num_vertices)
+
+
+def _marked(vertices: Int[Tensor, "..."], num_vertices: int) -> Bool[Tensor, " {num_vertices}"]:
+    marked = torch.zeros(num_vertices, dtype=torch.bool, device=vertices.device)
+    marked[vertices.flatten()] = True
+    return marked
+
+
+def vertex_components(
+    faces: Int[Tensor, "face 3"], among: Bool[Tensor, " vertex"]
+) -> Int[Tensor, " vertex"]:
+    """Label vertices that edges connect through vertices ``among`` only.
+
+    Every other vertex is a component alone.
+    """
+    edges = half_edges(faces)
+    return graph_components(edges[among[edges].all(dim=1)], len(among))
+
+
+def face_components(faces: Int[Tensor, "face 3"]) -> Int[Tensor, " face"]:
+    """Label faces connected by edges with exactly two faces; a common vertex is not enough."""
+    pairs, _ = face_pairs(faces)
+    return graph_components(pairs, len(faces))
+
+
+def vertex_fans(
+    faces: Int[Tensor, "face 3"],
+) -> tuple[Int[Tensor, " fan"], Int[Tensor, "face 3"]]:
+    """Split non-manifold vertices: every fan of faces round one gets a vertex of its own.
+
+    Returns:
+        The old vertex each new one is a copy of, ascending, and the faces in new vertices.
+        Vertices without faces are gone; one in the centre of two fans, where the surface is not
+        manifold, has become two; faces that met at an edge of three or more are separate.
+
+    >>> bow_tie = torch.tensor([[0, 1, 2], [2, 3, 4]])
+    >>> vertex_fans(bow_tie)[0]
+    tensor([0, 1, 2, 2, 3, 4])
+    """
+    pairs, ends = face_pairs(faces)
+    corners = [
+        3 * pairs + (faces[pairs] == end[:, None, None]).long().argmax(dim=2)
+        for end in ends.unbind(dim=1)
+    ]
+    label = graph_components(torch.cat(corners), 3 * len(faces))
+    old = torch.empty_like(label[: int(label.max()) + 1]).scatter(0, label, faces.flatten())
+    order = old.argsort(stable=True)
+    rank = torch.empty_like(order).scatter(0, order, torch.arange(len(order)).to(order))
+    return old[order], rank[label].reshape(-1, 3)
+
+
+def boundary_loops(
+    faces: Int[Tensor, "face 3"],
+) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, " edge"]]:
+    """Group the edges of a surface's border: every hole, and every outer border, is one loop.
+
+    Holes that meet in a vertex are one, as the surface is not connected there. An edge of three
+    faces or more is border of them all.
+
+    Returns:
+        The border's edges, and the index of the loop each is part of.
+
+    >>> cone = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1]])
+    >>> boundary_loops(cone)
+    (tensor([[1, 2],
+            [1, 3],
+            [2, 3]]), tensor([0, 0, 0]))
+    """
+    edges, index = face_edges(faces)
+    open_edges = edges[face_counts(index) != 2]
+    if len(open_edges) == 0:
+        return open_edges, open_edges[:, 0]
+    on_border = _marked(open_edges, int(faces.max()) + 1)
+    source, separate = vertex_fans(faces[on_border[faces].any(dim=1)])
+    edges, index = face_edges(separate)
+    alone = face_counts(index) == 1
+    border = edges[alone & on_border[source[edges]].all(dim=1)]
+    label = graph_components(border, len(source))[border[:, 0]]
+    return source[border], torch.unique(label, return_inverse=True)[1]
+
+
+def graph_components(links: Int[Tensor, "link 2"], count: int) -> Int[Tensor, " node"]:
+    """Label the nodes of an undirected graph by connected component."""
+    one, other = links.cpu().numpy().T
+    graph = coo_array((one >= 0, (one, other)), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    return torch.from_numpy(label).to(links)
