@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
 
 _POINTS = 2048  # at once: 72 MB of angles between the rays of 66 views
@@ -29,9 +30,9 @@ def project(
     """
     points_cam = transform(cam_from_world, points_world)
     depth = points_cam[..., 2]
-    homogeneous = points_cam @ intrinsics.mT
+    scaled = points_cam @ intrinsics.mT
     safe = torch.where(depth.abs() > torch.finfo(depth.dtype).tiny, depth, 1)
-    return homogeneous[..., :2] / safe[..., None], depth
+    return scaled[..., :2] / safe[..., None], depth
 
 
 def rays_through(
@@ -44,8 +45,7 @@ def rays_through(
     Not unit: its length is chosen so that ``center + depth * ray`` is the point at that
     depth along the camera's z.
     """
-    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
-    rays_cam = torch.linalg.solve(intrinsics, homogeneous.mT).mT
+    rays_cam = torch.linalg.solve(intrinsics, homogeneous(pixels).mT).mT
     return rays_cam @ cam_from_world[..., :3, :3]
 
 

@@ -9,8 +9,8 @@ do not tell: a third of a carton's disagree with the right model, too, for its s
 
 from collections.abc import Sequence
 
-import torch
 from jaxtyping import Float
+from kornia.geometry.epipolar import essential_from_Rt, fundamental_from_essential
 from torch import Tensor
 
 from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
@@ -71,12 +71,11 @@ def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> fl
 
 def epipolar_geometry(model: SparseModel, views: PhotographPair) -> Float[Tensor, "3 3"]:
     """Give ``F`` of two views, with ``second^T F first = 0`` for undistorted pixels."""
-    first, second = views
-    moved = model.cam_from_world[second] @ torch.linalg.inv(model.cam_from_world[first])
-    shift = moved[:3, 3]
-    essential = torch.linalg.cross(shift[None].expand(3, 3), moved[:3, :3].mT, dim=1).mT
-    into, out = (torch.linalg.inv(pinhole_of(model.lenses[view])) for view in (first, second))
-    return out.mT @ essential @ into
+    poses = (model.cam_from_world[view] for view in views)
+    motion = (part for pose in poses for part in (pose[:3, :3], pose[:3, 3:]))
+    intrinsics = (pinhole_of(model.lenses[view]) for view in views)
+    geometry: Tensor = fundamental_from_essential(essential_from_Rt(*motion), *intrinsics)
+    return geometry
 
 
 def _undistorted(

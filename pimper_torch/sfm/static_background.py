@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
+from kornia.geometry.epipolar import normalize_points, sampson_epipolar_distance
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import homogeneous
@@ -23,8 +24,8 @@ _CLEARLY = 4.0
 # Of the moving matches. Simulated with 0.2 px of noise: 0.00 in rigid scenes; before a room at
 # rest 0.2 with the camera 2 degrees over the table's plane, 0.5 from 10, 0.8 from 25.
 _CONTRADICTION = 0.1
-# Of the fit: in simulation the fraction of violations changes by 0.01 at most after 5.
-_ITERATIONS = 5
+# Fits with other weights: in simulation the fraction of violations changes by 0.01 at most after 6.
+_ITERATIONS = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -147,25 +148,27 @@ def is_still(keypoints: Keypoints, pair: Pair, still_px: float) -> Bool[Tensor, 
 
 
 def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Float[Tensor, "3 3"]:
-    """Fit the epipolar geometry that explains still and moving matches best; float64.
+    """Fit the fundamental matrix that explains still and moving matches best; float64.
 
-    Both kinds weigh the same. Every translation explains the still ones, so that it is mostly
-    the moving ones that violate the result where no geometry explains both.
+    The eight-point algorithm, reweighted for Cauchy's loss of Sampson's distance. Both kinds weigh
+    the same. Every translation explains the still ones, so that it is mostly the moving ones that
+    violate the result where no geometry explains both.
 
     Args:
         still: Pixels in the first and in the second photograph.
         moving: The same.
-        max_error_px: Scale of the loss, which is Cauchy's.
+        max_error_px: Scale of the loss.
     """
-    first, second = (torch.cat(ends) for ends in zip(still, moving, strict=True))
+    first, second = (torch.cat(ends).double() for ends in zip(still, moving, strict=True))
     count = torch.tensor([len(still[0]), len(moving[0])])
-    even = (1 / count.double()).repeat_interleave(count)
-    geometry = fundamental_matrix(first, second, even)
+    weight = even = (1 / count.double()).repeat_interleave(count)
     for _ in range(_ITERATIONS):
+        geometry = fundamental_matrix(first, second, weight)
         error = sampson_errors(geometry, first, second)
-        slope = _slope(geometry, first, second)
-        weight = even / (slope * (1 + (error / max_error_px).square()))
-        geometry = fundamental_matrix(first, second, weight / weight.sum())
+        lines = torch.cat([homogeneous(first) @ geometry.mT, homogeneous(second) @ geometry], dim=1)
+        gradient = lines[:, [0, 1, 3, 4]].square().sum(dim=1)  # of the algebraic residual
+        tiny = torch.finfo(gradient.dtype).tiny
+        weight = even / (gradient.clamp_min(tiny) * (1 + (error / max_error_px).square()))
     return geometry
 
 
@@ -176,6 +179,10 @@ def fundamental_matrix(
 ) -> Float[Tensor, "3 3"]:
     """Fit ``F``, with ``second^T F first = 0``, by weighted least squares; float64.
 
+    kornia's ``find_fundamental`` weighs the normalization of the pixels, too: reweighted, still and
+    moving matches that contradict one another then violate the fit as little as 2 %, here 26 % at
+    least (30 turntables of two photographs).
+
     Args:
         first: Pixels, 8 or more.
         second: Of the same points.
@@ -183,13 +190,13 @@ def fundamental_matrix(
 
     Source: Hartley, In Defense of the Eight-Point Algorithm, PAMI 19(6), 1997.
     """
-    one, two = _normalizing(first), _normalizing(second)
-    x, y = homogeneous(first.double()) @ one.mT, homogeneous(second.double()) @ two.mT
-    rows = (y[:, :, None] * x[:, None, :]).reshape(-1, 9)
+    x, from_first = (part[0] for part in normalize_points(first.double()[None]))
+    y, from_second = (part[0] for part in normalize_points(second.double()[None]))
+    rows = (homogeneous(y)[:, :, None] * homogeneous(x)[:, None, :]).flatten(1)
     least = torch.linalg.eigh(rows.mT @ (weight[:, None] * rows)).eigenvectors[:, 0]
     u, s, v = torch.linalg.svd(least.reshape(3, 3))
-    singular = u @ torch.diag(s * s.new_tensor([1.0, 1.0, 0.0])) @ v
-    return two.mT @ singular @ one
+    s[2] = 0
+    return from_second.mT @ (u * s) @ v @ from_first
 
 
 def sampson_errors(
@@ -198,20 +205,9 @@ def sampson_errors(
     second: Float[Tensor, "match 2"],
 ) -> Float[Tensor, " match"]:
     """Give the first-order distance of matches from an epipolar geometry, in pixels."""
-    ends, starts = homogeneous(second.double()), homogeneous(first.double())
-    residual = (ends * (starts @ geometry.mT)).sum(dim=1)
-    return residual.abs() / _slope(geometry, first, second).sqrt()
-
-
-def _slope(
-    geometry: Float[Tensor, "3 3"],
-    first: Float[Tensor, "match 2"],
-    second: Float[Tensor, "match 2"],
-) -> Float[Tensor, " match"]:
-    """Give the squared gradient of the residual in the four coordinates of a match."""
-    line, back = homogeneous(first.double()) @ geometry.mT, homogeneous(second.double()) @ geometry
-    slope = line[:, :2].square().sum(dim=1) + back[:, :2].square().sum(dim=1)
-    return slope.clamp_min(torch.finfo(slope.dtype).tiny)
+    ends = first.double(), second.double()
+    errors: Tensor = sampson_epipolar_distance(*ends, geometry, squared=False)
+    return errors
 
 
 def _pixels(keypoints: Keypoints, pair: Pair) -> Ends:
@@ -222,14 +218,3 @@ def _pixels(keypoints: Keypoints, pair: Pair) -> Ends:
 def _count(votes: list[Int[Tensor, " _"]], pair: Pair, weight: int) -> None:
     for view, features in zip((pair.first, pair.second), pair.matches.unbind(dim=1), strict=True):
         votes[view] = votes[view].index_add(0, features, torch.full_like(features, weight))
-
-
-def _normalizing(pixels: Float[Tensor, "match 2"]) -> Float[Tensor, "3 3"]:
-    """Shift the mean to 0 and scale the mean distance from it to the square root of 2."""
-    mean = pixels.double().mean(dim=0)
-    spread = (pixels.double() - mean).norm(dim=1).mean().clamp_min(1e-12)
-    scale = 2**0.5 / float(spread)
-    return pixels.new_tensor(
-        [[scale, 0, -scale * mean[0]], [0, scale, -scale * mean[1]], [0, 0, 1]],
-        dtype=torch.float64,
-    )
