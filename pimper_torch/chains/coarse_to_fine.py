@@ -132,7 +132,7 @@ class CoarseToFine(Chain):
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
         placed = self.placed(views, sparse_model)
-        silhouettes = self.corrected(placed, self.silhouettes(placed))
+        silhouettes = self.corrected(placed, self.silhouettes(placed), mesh)
         scene = masked(placed, silhouettes)
         cameras = scene.cameras
         contours = self.contours(silhouettes, cameras)
@@ -168,15 +168,18 @@ class CoarseToFine(Chain):
                 surface=surface,
             )
 
-    def corrected(self, placed: SparseScene, silhouettes: Silhouettes) -> Silhouettes:
+    def corrected(
+        self, placed: SparseScene, silhouettes: Silhouettes, mesh: Mesh | None = None
+    ) -> Silhouettes:
         """Correct silhouettes that were found by a draft of the surface that they lead to.
 
         Args:
             placed: Photographs, not masked, with cameras and cloud.
             silhouettes: Of all views.
+            mesh: A surface in the scene's frame, in the place of a draft.
         """
         if silhouettes.source != "found":
             return silhouettes
         scene = masked(placed, silhouettes)
-        draft = self.draft(scene, self.contours(silhouettes, scene.cameras), None)
+        draft = self.draft(scene, self.contours(silhouettes, scene.cameras), mesh)
         return self.correct(placed, silhouettes, draft.mesh)
