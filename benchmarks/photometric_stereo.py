@@ -22,10 +22,10 @@ from torch.nn.functional import normalize
 
 from pimper_torch.errors import PimperError
 from pimper_torch.evidence.datasets.one_viewpoint import read_uw_ps, read_yale_b
-from pimper_torch.evidence.scenes import Body, SensorConfig, render_bodies
-from pimper_torch.evidence.scenes.bodies import Texture
+from pimper_torch.evidence.scenes import SceneObject, SensorConfig, render_objects
 from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.evidence.scenes.lights import Lights
+from pimper_torch.evidence.scenes.scene_object import Texture
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.harmonics import harmonics
@@ -319,8 +319,12 @@ def rendered(
         flash=torch.zeros_like(strength),
     )
     texture = patches(generator) if one_strength else lambda points: 0.7 + 0 * points
-    scene = render_bodies(
-        [Body(mesh=mesh, texture=texture)], cameras, lights, generator, SensorConfig(supersample=1)
+    scene = render_objects(
+        [SceneObject(mesh=mesh, texture=texture)],
+        cameras,
+        lights,
+        generator,
+        SensorConfig(supersample=1),
     )
     assert scene.foreground is not None
     return Scene(

@@ -167,7 +167,7 @@ def figures(scene: SparseScene, reference: Path | None, truth: Capture | None) -
         if found is not None:
             against = [
                 f"{found.mean_focal_percent:.2f}",
-                f"{found.mean_place_percent:.3f}",
+                f"{found.mean_position_percent:.3f}",
                 f"{found.mean_bend_percent:.4f}",
             ]
     return [

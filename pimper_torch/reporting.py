@@ -84,7 +84,7 @@ _recording: ContextVar[_Recording | None] = ContextVar("recording", default=None
 def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]]:
     """Time the direct submodules of ``chain`` while the ``with`` block calls them.
 
-    Threads that fraction ``chain`` have reports of their own.
+    Threads that share ``chain`` have reports of their own.
 
     Yields:
         The list that a report is appended to whenever a submodule has run.

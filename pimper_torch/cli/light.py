@@ -69,8 +69,8 @@ class _Source:
     """A module's statements by what they define, and what was made of them so far."""
 
     def __init__(self, name: str) -> None:
-        place = _PACKAGE.parent.joinpath(*name.split("."))
-        path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+        base = _PACKAGE.parent.joinpath(*name.split("."))
+        path = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
         # Under another name: were it the package's own, it would be taken for the module.
         self.name = name
         self.made = types.ModuleType(f"{name} (light)")

@@ -26,7 +26,7 @@ usage: pimper reconstruct PHOTOS -o OUT [options]
        pimper gamma PHOTOS [options]
        pimper --version
 
-Photographs from many places under many unknown lights, to a dense surface with normals,
+Photographs from many viewpoints under many unknown lights, to a dense surface with normals,
 albedo and light.
 
   reconstruct   a folder of photographs

@@ -179,8 +179,8 @@ def bundled_photographs() -> Path:
 
 
 def _preset(arguments: Sequence[str]) -> str:
-    for place, argument in enumerate(arguments):
+    for index, argument in enumerate(arguments):
         name, equals, value = argument.partition("=")
         if name == "--preset":
-            return value if equals else "".join(arguments[place + 1 : place + 2]) or "default"
+            return value if equals else "".join(arguments[index + 1 : index + 2]) or "default"
     return CommonOptions().preset

@@ -274,7 +274,7 @@ class _Lists:
 
 
 def _facets_around(faces: Int[Tensor, "facet 3"]) -> _Lists:
-    """List, for each facet, itself and the facets that fraction a corner with it, in order."""
+    """List, for each facet, itself and the facets that share a corner with it, in order."""
     own = torch.arange(len(faces), device=faces.device)[:, None].expand_as(faces).flatten()
     corner = faces.flatten()
     place, facet = _Lists.of(corner, own, int(corner.max()) + 1).take(corner)

@@ -42,16 +42,16 @@ def prepare_output(folder: Path | str, contents: Collection[str], overwrite: boo
             f"{folder}: holds {some(foreign)}, which is no part of a result, so it is not "
             "overwritten. Write elsewhere."
         )
-    place = folder.resolve().parent
-    while not place.exists():
-        place = place.parent
-    trial = place / f".{folder.name}.trial-{secrets.token_hex(4)}"
+    target = folder.resolve().parent
+    while not target.exists():
+        target = target.parent
+    trial = target / f".{folder.name}.trial-{secrets.token_hex(4)}"
     try:
         trial.mkdir()
         trial.rmdir()
     except OSError as error:
         raise OutputError(
-            f"{folder}: cannot be written, for {place} refuses ({error.strerror}). Write elsewhere."
+            f"{folder}: cannot be written, as {target} refuses ({error.strerror}). Write elsewhere."
         ) from error
 
 
@@ -71,7 +71,7 @@ def written_whole(
         overwrite: Replace a former result.
 
     Raises:
-        OutputError: As :func:`prepare_output`, or the disk refuses in the centre; then
+        OutputError: As :func:`prepare_output`, or the disk refuses on the way; then
             nothing stays behind.
     """
     folder = Path(folder)
@@ -88,14 +88,14 @@ def written_whole(
 
 @contextmanager
 def _staged(folder: Path, contents: Collection[str]) -> Iterator[Path]:
-    place = folder.resolve()
-    made = _make_parents(place.parent)
+    target = folder.resolve()
+    made = _make_parents(target.parent)
     token = secrets.token_hex(4)
-    staging, former = (place.parent / f".{place.name}.{kind}-{token}" for kind in ("new", "old"))
+    staging, former = (target.parent / f".{target.name}.{kind}-{token}" for kind in ("new", "old"))
     try:
         staging.mkdir()
         yield staging
-        _move(staging, place, former, contents)
+        _move(staging, target, former, contents)
     except BaseException:
         shutil.rmtree(staging, ignore_errors=True)
         for parent in made:
@@ -104,27 +104,27 @@ def _staged(folder: Path, contents: Collection[str]) -> Iterator[Path]:
     shutil.rmtree(former, ignore_errors=True)
 
 
-def _move(staging: Path, place: Path, former: Path, contents: Collection[str]) -> None:
-    """Put the new result in its place, and what was there to ``former``."""
-    if not place.exists():
-        staging.rename(place)
+def _move(staging: Path, target: Path, former: Path, contents: Collection[str]) -> None:
+    """Rename the new result to ``target``, and what was there to ``former``."""
+    if not target.exists():
+        staging.rename(target)
         return
     try:
-        place.rename(former)
+        target.rename(former)
     except OSError:
         # The folder is a mount point, as OUT in a container is: fill it file by file.
-        _pour(staging, place, contents)
+        _pour(staging, target, contents)
         return
     try:
-        staging.rename(place)
+        staging.rename(target)
     except BaseException:
-        former.rename(place)
+        former.rename(target)
         raise
 
 
-def _pour(staging: Path, place: Path, contents: Collection[str]) -> None:
+def _pour(staging: Path, target: Path, contents: Collection[str]) -> None:
     for name in contents:
-        old = place / name
+        old = target / name
         if old.is_dir():
             shutil.rmtree(old)
         else:

@@ -70,7 +70,7 @@ def write_ply(mesh: Mesh, path: Path | str) -> None:
 
 
 def written_channels(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
-    """Give what a file says of vertices beside place and normal, in units of what it may be off.
+    """Give what a file says of vertices beside position and normal, in units of what it may be off.
 
     For :func:`pimper_torch.meshing.simplify.simplify`: sRGB colour may be off by 8 levels of 255,
     confidence by 0.1, expected error by a tenth of itself.

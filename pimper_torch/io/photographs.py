@@ -43,7 +43,7 @@ def load_views(
     is told, or at which values pile up, or full scale. Photographs of unlike sizes are padded.
 
     Masks are images of the photographs' sizes, zero off the object (JPEG: below half). Where all
-    of them together are bright along the border and dark in the centre, they are turned round,
+    of them together are bright along the border and dark in the middle, they are turned round,
     and a warning says so.
     Without a folder of masks, alpha channels that are somewhere transparent are the masks,
     and a photograph without one shows the object everywhere.
@@ -162,7 +162,7 @@ def _check_count(folder: Path, paths: list[Path]) -> None:
     if len(paths) < MIN_PHOTOGRAPHS:
         raise InputError(
             f"{folder}: found {len(paths)} ({some([path.name for path in paths])}); needed: at "
-            f"least {MIN_PHOTOGRAPHS} photographs, better 10 or more, each from another place "
+            f"least {MIN_PHOTOGRAPHS} photographs, better 10 or more, each from another viewpoint "
             "under another light."
         )
 

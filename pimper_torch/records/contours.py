@@ -18,7 +18,7 @@ class ContourRays(Record):
         rays_world: Directions, as long as the ray goes while its depth grows by 1.
         normals_world: Outward unit normal of the surface where it touches the ray: across the
             ray and the silhouette's tangent.
-        sigma_px: Standard deviation of the silhouette's place, across it.
+        sigma_px: Standard deviation of the silhouette's position, across it.
     """
 
     view: Int[Tensor, " ray"]
@@ -30,7 +30,7 @@ class ContourRays(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ContourPoints(Record):
-    """Places where the surface touches contour rays.
+    """Points where the surface touches contour rays.
 
     Attributes:
         points_world: Where.

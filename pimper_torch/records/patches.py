@@ -59,7 +59,7 @@ class Templates(Record):
 
     @property
     def points_patch(self) -> Float[Tensor, "patch height width 3"]:
-        """The samples' places in the patch frame."""
+        """The samples' positions in the patch frame."""
         height, width = self.depth.shape[-2:]
         columns = torch.arange(width, device=self.depth.device, dtype=self.depth.dtype)
         rows = torch.arange(height, device=self.depth.device, dtype=self.depth.dtype)
@@ -80,10 +80,10 @@ class OverPatches(Record):
         return self._templates.num_patches
 
     def __getitem__(self: AnyPatches, facet: int) -> AnyPatches:
-        for place, bucket in enumerate(self._templates.buckets):
+        for index, bucket in enumerate(self._templates.buckets):
             row = (bucket.facet == facet).nonzero()[:, 0]
             if len(row):
-                return self._part(place, row[:1])
+                return self._part(index, row[:1])
         raise IndexError(f"no patch stands on facet {facet}; there are {len(self)} patches")
 
     def __iter__(self: AnyPatches) -> Iterator[AnyPatches]:
@@ -95,9 +95,9 @@ class OverPatches(Record):
         found: PatchSet = self.patches  # type: ignore[attr-defined]
         return found
 
-    def _part(self: AnyPatches, place: int, row: Tensor) -> AnyPatches:
-        patches = self._templates._part(place, row)
-        bucket = self.buckets[place].take(row)  # type: ignore[attr-defined]
+    def _part(self: AnyPatches, index: int, row: Tensor) -> AnyPatches:
+        patches = self._templates._part(index, row)
+        bucket = self.buckets[index].take(row)  # type: ignore[attr-defined]
         return self.replace(patches=patches, buckets=(bucket,))
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
@@ -108,13 +108,13 @@ class OverPatches(Record):
         if len(buckets) != len(templates):
             needed = f"one for each of {len(templates)} buckets of templates, in their order"
             yield "buckets", f"are {len(buckets)}", needed
-        for place, (bucket, own) in enumerate(zip(buckets, templates, strict=False)):
+        for index, (bucket, own) in enumerate(zip(buckets, templates, strict=False)):
             shape = bucket.raster
             if shape != tuple(own.inside.shape):
                 needed = f"{tuple(own.inside.shape)}, as its templates"
-                yield f"buckets[{place}]", f"has patches, height, width {shape}", needed
+                yield f"buckets[{index}]", f"has patches, height, width {shape}", needed
             for name, found, needed in bucket.faults():
-                yield f"buckets[{place}].{name}", found, needed
+                yield f"buckets[{index}].{name}", found, needed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -141,8 +141,8 @@ class PatchSet(OverPatches):
     def _templates(self) -> "PatchSet":
         return self
 
-    def _part(self, place: int, row: Tensor) -> "PatchSet":
-        return self.replace(buckets=(self.buckets[place].take(row),))
+    def _part(self, index: int, row: Tensor) -> "PatchSet":
+        return self.replace(buckets=(self.buckets[index].take(row),))
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List templates of facets that are none, and of no size."""
@@ -150,9 +150,9 @@ class PatchSet(OverPatches):
         if not self.buckets:
             yield "buckets", "are none", "a bucket of templates at least"
         count = len(self.coarse.mesh.faces)
-        for place, bucket in enumerate(self.buckets):
+        for index, bucket in enumerate(self.buckets):
             for name, found, needed in bucket.faults_of(count):
-                yield f"buckets[{place}].{name}", found, needed
+                yield f"buckets[{index}].{name}", found, needed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -295,12 +295,12 @@ class PhotometricPatches(OverPatches):
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List normals of another floating-point type than the templates, too."""
         yield from super(PhotometricPatches, self).faults()
-        for place, (bucket, own) in enumerate(
+        for index, (bucket, own) in enumerate(
             zip(self.buckets, self.patches.buckets, strict=False)
         ):
             found, needed = bucket.normals_patch.dtype, own.depth.dtype
             if found != needed:
-                name = f"buckets[{place}].normals_patch"
+                name = f"buckets[{index}].normals_patch"
                 yield name, f"is of {found}", f"{needed}, as its templates"
 
 
@@ -319,9 +319,9 @@ class OverPhotometry(OverPatches):
         """The decomposition underneath."""
         return self.photometric.patches
 
-    def _part(self: AnyPatches, place: int, row: Tensor) -> AnyPatches:
-        photometric = self.photometric._part(place, row)  # type: ignore[attr-defined]
-        bucket = self.buckets[place].take(row)  # type: ignore[attr-defined]
+    def _part(self: AnyPatches, index: int, row: Tensor) -> AnyPatches:
+        photometric = self.photometric._part(index, row)  # type: ignore[attr-defined]
+        bucket = self.buckets[index].take(row)  # type: ignore[attr-defined]
         return self.replace(photometric=photometric, buckets=(bucket,))
 
 

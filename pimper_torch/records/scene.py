@@ -137,7 +137,7 @@ class FacetPoints(Record):
 
     Attributes:
         points_world: Where they were triangulated.
-        covariance_world: Of each place, scene units squared.
+        covariance_world: Of each position, scene units squared.
         facet: The facet each point lies on, as the reference view sees it.
     """
 

@@ -28,7 +28,7 @@ class Truth(Record):
         highlight: True where a highlight adds noticeably to the matte part.
         lights_world: First-order light ``l`` at the object, radiance = albedo * l . (1, n),
             up to one scale for all views.
-        point_lights_world: Places of point lights.
+        point_lights_world: Positions of point lights.
     """
 
     mesh: Mesh | None = None
@@ -48,15 +48,15 @@ class Truth(Record):
 class Capture(Record):
     """Photographs of a data set with all that came along.
 
-    Views that fraction a number in ``position`` were taken by the same camera from the same
-    place; views that fraction one in ``light`` under the same light.
+    Views of one index in ``position`` were taken by the same camera from the same position;
+    views of one index in ``light`` under the same light.
 
     Attributes:
         views: The photographs, linear radiance. Names are unique.
         cameras: That took them, world frame and unit of the data set; ``None`` if unknown.
         truth: In the same frame.
-        position: Number of the camera's place.
-        light: Number of the light.
+        position: Index of the camera's position.
+        light: Index of the light.
     """
 
     views: Views

@@ -59,7 +59,7 @@ def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
     assert [view["name"] for view in lights["views"]] == ["a.png", "b.png", "c.png"]
 
 
-def test_the_ply_holds_places_normals_colours_and_confidence(reconstruction, tmp_path):
+def test_the_ply_holds_positions_normals_colours_and_confidence(reconstruction, tmp_path):
     mesh = reconstruction.mesh
     write_ply(mesh, tmp_path / "mesh.ply")
     read = trimesh.load(tmp_path / "mesh.ply", process=False)
@@ -312,7 +312,7 @@ def test_a_folder_with_other_things_is_never_overwritten(tmp_path):
         prepare_output(tmp_path / "out", RESULT_NAMES)
 
 
-def test_a_place_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch):
+def test_a_position_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file: is a file"):
         prepare_output(tmp_path / "file", RESULT_NAMES)

@@ -34,7 +34,7 @@ def photographs(scene, chosen):
     """Take some of a scene's photographs as a camera of 8 bits does."""
     taken = []
     for view in chosen:
-        stage = Stage(scene.bodies_in(view))
+        stage = Stage(scene.objects_in(view))
         frame = render_frame(
             stage, scene.cameras, scene.lights, view, scene.noise(view), scene.config.sensor
         )

@@ -110,7 +110,7 @@ def _observations(scene: SparseScene) -> tuple[list[str], list[str]]:
     )
     observed = scene.observed.cpu()
     identifier = torch.cumsum(observed.any(dim=1), dim=0)  # from 1, without the unseen
-    place = torch.cumsum(observed, dim=0) - 1  # in the view's line
+    index = torch.cumsum(observed, dim=0) - 1  # in the view's line
     views = [
         " ".join(
             f"{_numbers(pixels[view, point].tolist())} {int(identifier[point])}"
@@ -123,7 +123,7 @@ def _observations(scene: SparseScene) -> tuple[list[str], list[str]]:
     lines = []
     for point in torch.nonzero(observed.any(dim=1))[:, 0].tolist():
         track = " ".join(
-            f"{view + 1} {int(place[point, view])}"
+            f"{view + 1} {int(index[point, view])}"
             for view in torch.nonzero(observed[point])[:, 0].tolist()
         )
         where = _numbers(points[point].tolist())

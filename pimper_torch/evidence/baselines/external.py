@@ -25,16 +25,16 @@ class Program:
         name: As it is called on the command line.
         variable: Environment variable that may name it, or the folder it lies in.
         source: Where to get it.
-        places: Folders that its installer uses and that are seldom on the PATH.
+        folders: Folders that its installer uses and that are seldom on the PATH.
     """
 
     name: str
     variable: str
     source: str
-    places: tuple[Path, ...] = ()
+    folders: tuple[Path, ...] = ()
 
     def find(self, given: Path | None = None) -> Path:
-        """Find the executable: as given, as the variable says, on the PATH, in its places.
+        """Find the executable: as given, as the variable says, on the PATH, in its folders.
 
         Args:
             given: The executable itself, or the folder it lies in. If set, nowhere else is
@@ -56,8 +56,8 @@ class Program:
         on_path = shutil.which(self.name)
         if on_path is not None:
             return Path(on_path).absolute()
-        for place in self.places:
-            found = _executable(place / self.name)
+        for folder in self.folders:
+            found = _executable(folder / self.name)
             if found is not None:
                 return found
         raise MissingProgramError(

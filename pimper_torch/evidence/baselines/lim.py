@@ -240,8 +240,8 @@ def spans_between(
     """Read the factors along the edges, template frame."""
     start, end = edges.unbind(dim=1)
     along = (torch.arange(PLACES, device=edges.device).to(edges) + 0.5) / PLACES
-    places = start[:, None] + along[:, None] * (end - start)[:, None]
-    where = places.reshape(1, -1, 3)[..., :2]
+    positions = start[:, None] + along[:, None] * (end - start)[:, None]
+    where = positions.reshape(1, -1, 3)[..., :2]
     raster = (template.origin[None], template.spacing[None])
     inside = on_template(often, template.inside)
     layers = on_template(factors.vectors.mT, template.inside)
@@ -249,8 +249,8 @@ def spans_between(
     known = sample_raster(inside[None, None].to(layers), where, *raster)[0, 0] > 0.5
     return Spans(
         step=end - start,
-        vectors=found[0].mT.reshape(places.shape),
-        valid=known.reshape(places.shape[:2]),
+        vectors=found[0].mT.reshape(positions.shape),
+        valid=known.reshape(positions.shape[:2]),
     )
 
 
@@ -269,8 +269,8 @@ def facing(factors: Rank3, often: Bool[Tensor, " sample"]) -> Rank3:
 
 def transferred(found: Round, template: Template) -> Template:
     """Carry a relief over to the raster of the next round, which has the same frame."""
-    places = template.points(template.depth).reshape(-1, 3)
-    depth = look_up(found.template, found.depth, places).reshape(template.depth.shape)
+    positions = template.points(template.depth).reshape(-1, 3)
+    depth = look_up(found.template, found.depth, positions).reshape(template.depth.shape)
     normals = relief_normals(depth, template) * template.inside[..., None]
     return template.replace(depth=depth, normals=normals)
 

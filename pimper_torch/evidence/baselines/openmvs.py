@@ -30,7 +30,7 @@ def _program(name: str) -> Program:
         name=name,
         variable="PIMPER_OPENMVS",
         source="https://github.com/cdcseacave/openMVS",
-        places=(Path("/usr/local/bin/OpenMVS"), Path("/usr/bin/OpenMVS")),
+        folders=(Path("/usr/local/bin/OpenMVS"), Path("/usr/bin/OpenMVS")),
     )
 
 
@@ -50,7 +50,7 @@ class OpenMvsConfig:
     """OpenMVS's settings under its defaults.
 
     Attributes:
-        folder: With its programs; else PIMPER_OPENMVS, the PATH or its usual place say.
+        folder: With its programs; else PIMPER_OPENMVS, the PATH or its usual folder say.
         resolution_level: How often the photographs are halved for the depth maps.
         min_resolution_px: Photographs whose longer side would be less are halved less often.
         refine: Refine the mesh by the photographs at the end; takes long.

@@ -106,13 +106,13 @@ class Spans(Record):
 
     Attributes:
         step: From one point to the other: x, y and z.
-        vectors: Of the factorization, at places evenly spread between them.
+        vectors: Of the factorization, at positions evenly spread between them.
         valid: Which of these mean something.
     """
 
     step: Float[Tensor, "span 3"]
-    vectors: Float[Tensor, "span place 3"]
-    valid: Bool[Tensor, "span place"]
+    vectors: Float[Tensor, "span sample 3"]
+    valid: Bool[Tensor, "span sample"]
 
 
 def ambiguity_between_points(
@@ -166,8 +166,8 @@ def matrix_between_lights(
 
 def _descended(
     matrix: Float[Tensor, "3 3"],
-    b: Float[Tensor, "span place 3"],
-    fraction: Float[Tensor, "span place"],
+    b: Float[Tensor, "span sample 3"],
+    fraction: Float[Tensor, "span sample"],
     step: Float[Tensor, "span 3"],
     known: Bool[Tensor, " span"],
     iterations: int,
@@ -194,14 +194,14 @@ def _descended(
 
 def _residual(
     matrix: Float[Tensor, "3 3"],
-    b: Float[Tensor, "span place 3"],
-    fraction: Float[Tensor, "span place"],
+    b: Float[Tensor, "span sample 3"],
+    fraction: Float[Tensor, "span sample"],
     step: Float[Tensor, "span 3"],
     known: Bool[Tensor, " span"],
 ) -> tuple[Float[Tensor, " span"], Float[Tensor, "span 9"]]:
     """Give what the slopes miss the points' depths by, and its derivative by A."""
     rotated = b @ matrix.mT
-    # A place without a vector has no slope; its share is 0, but it must stay finite.
+    # A sample without a vector has no slope; its share is 0, but it must stay finite.
     steepest = -(rotated.norm(dim=-1) / STEEPEST).clamp_min(1e-12)
     limited = rotated[..., 2] > steepest
     z = torch.where(limited, steepest, rotated[..., 2])

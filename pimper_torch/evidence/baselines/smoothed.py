@@ -1,7 +1,7 @@
 r"""Rival: the coarse mesh itself, smoothed; no photometry at all.
 
 The surface of least bending through the coarse mesh's vertices: with the flat facets as the
-domain, the places S minimise
+domain, the positions S minimise
 
 .. math:: \int |\Delta S|^2 + e \oint |S''|^2 + \frac{w}{e^2} \sum_v |S(v) - V_v|^2
 
@@ -110,7 +110,7 @@ class Smoothed(Stage):
 def thin_plate(
     subdivision: Subdivision, mesh: Mesh, weights: Float[Tensor, " corner"]
 ) -> Float[Tensor, "vertex 3"]:
-    """Give the subdivided mesh's vertices their places on the surface of least bending.
+    """Give the subdivided mesh's vertices their positions on the surface of least bending.
 
     Args:
         subdivision: Of the coarse mesh.

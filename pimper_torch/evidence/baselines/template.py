@@ -57,7 +57,7 @@ class Template(Record):
     inside: Bool[Tensor, "height width"]
 
     def points(self, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
-        """Give the samples' places at some depth, template frame."""
+        """Give the samples' positions at some depth, template frame."""
         height, width = depth.shape
         xy = self.origin + self.spacing * (pixel_centers(width, height, like=depth) - 0.5)
         return torch.cat([xy, depth[..., None]], dim=-1)
@@ -304,11 +304,11 @@ def raster_faces(
     # y points down and z away: right before down would face away from the viewer.
     faces = []
     for three in ((0, 2, 1), (1, 2, 3)):
-        places = [corners[place] for place in three]
-        deep = torch.stack([depth[place] for place in places])
-        whole = torch.stack([inside[place] for place in places]).all(dim=0)
+        positions = [corners[position] for position in three]
+        deep = torch.stack([depth[position] for position in positions])
+        whole = torch.stack([inside[position] for position in positions]).all(dim=0)
         keep = whole & (deep.amax(dim=0) - deep.amin(dim=0) <= cliff)
-        faces.append(torch.stack([number[place][keep] for place in places], dim=1))
+        faces.append(torch.stack([number[position][keep] for position in positions], dim=1))
     return torch.cat(faces)
 
 

@@ -94,7 +94,7 @@ class ReadOptions:
         response: As photographs.response of `pimper reconstruct`; the layout's own unless given.
         saturation: As photographs.saturation of `pimper reconstruct`.
         black: As photographs.black of `pimper reconstruct`.
-        light_seed: Keep one light at each place, chosen by this seed.
+        light_seed: Keep one light at each position, chosen by this seed.
         max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
             leaves them.
     """
@@ -295,7 +295,7 @@ def describe(capture: Capture, job: Job) -> str:
     """Tell what was read and where it is now."""
     sizes = {f"{width} x {height}" for width, height in capture.views.sizes_px.tolist()}
     size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
-    count, places, lights = (
+    count, positions, lights = (
         len(set(numbers.tolist()))
         for numbers in (torch.arange(capture.views.num_views), capture.position, capture.light)
     )
@@ -310,7 +310,7 @@ def describe(capture: Capture, job: Job) -> str:
         if getattr(capture.truth, name) is not None
     ]
     return (
-        f"{_count(count, 'photograph')} of {size} from {_count(places, 'place')}, {light}, "
+        f"{_count(count, 'photograph')} of {size} from {_count(positions, 'position')}, {light}, "
         f"{'with' if capture.views.masks is not None else 'without'} masks; truth: "
         f"{', '.join(known) or 'none'}.\n{job.out} has them as {job.target}."
     )

@@ -35,8 +35,8 @@ from pimper_torch.viz.calibration import draw_calibration
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
 
-# The place of the camera in the names of the DTU and DiLiGenT-MV sets.
-_PLACE = re.compile(r"(?:rect|view)_(\d+)")
+# The position of the camera in the names of the DTU and DiLiGenT-MV sets.
+_POSITION = re.compile(r"(?:rect|view)_(\d+)")
 # Photographs of the DTU set are not compared with anything; small ones save a gigabyte.
 _THUMBNAIL_PX = 200
 # Columns that the explanation of a figure needs to stand beside it.
@@ -60,7 +60,7 @@ class EvaluateOptions:
             result's reference view unless given.
         thresholds_percent: For precision, recall and F-score, in per cent of the diagonal of
             the true object's bounding box.
-        seen_from: Completeness is given once more over the truth that this many places of the
+        seen_from: Completeness is given once more over the truth that this many positions of the
             camera see.
         samples: Points drawn on each surface.
         seed: Of every draw.
@@ -204,52 +204,54 @@ def read_truth(job: Job, estimate: Estimate, config: EvaluateConfig) -> TruthRea
     Raises:
         InputError: TRUTH is not laid out as it was said to be, or ``--scan`` is missing.
     """
-    layout, place = job.options.truth_layout, job.truth
+    layout, truth = job.options.truth_layout, job.truth
     if layout == "auto":
-        layout = "rendered" if (place / "truth").is_dir() else "mesh"
-        if layout == "mesh" and place.is_dir():
+        layout = "rendered" if (truth / "truth").is_dir() else "mesh"
+        if layout == "mesh" and truth.is_dir():
             raise InputError(
-                f"{place}: a folder without truth/ in it; needed: a folder that `pimper render` "
+                f"{truth}: a folder without truth/ in it; needed: a folder that `pimper render` "
                 "wrote, a mesh file, or the layout of a data set (--truth-layout)."
             )
     if layout == "mesh":
-        return TruthRead(capture=mesh_capture(place))
+        return TruthRead(capture=mesh_capture(truth))
     if layout == "rendered":
-        bare = read_rendered(place, maps=False, photographs=False)
+        bare = read_rendered(truth, maps=False, photographs=False)
         chosen = chosen_views(estimate, bare, config)
-        return TruthRead(capture=bare, maps=read_rendered(place, views=chosen, photographs=False))
+        return TruthRead(capture=bare, maps=read_rendered(truth, views=chosen, photographs=False))
     if layout == "diligent-mv":
-        return TruthRead(capture=named_as(read_diligent_mv(place, lights=[1]), estimate))
+        return TruthRead(capture=named_as(read_diligent_mv(truth, lights=[1]), estimate))
     scan = job.options.scan
     if scan is None:
-        raise InputError(f"{place}: holds many scans; needed: --scan with the number of one.")
-    capture = read_dtu_mvs(place, scan, lights=[0], max_size_px=_THUMBNAIL_PX)
+        raise InputError(f"{truth}: holds many scans; needed: --scan with the number of one.")
+    capture = read_dtu_mvs(truth, scan, lights=[0], max_size_px=_THUMBNAIL_PX)
     return TruthRead(
         capture=named_as(capture, estimate),
-        protocol=read_dtu_protocol(place, scan) if (place / "ObsMask").is_dir() else None,
+        protocol=read_dtu_protocol(truth, scan) if (truth / "ObsMask").is_dir() else None,
     )
 
 
 def named_as(capture: Capture, estimate: Estimate) -> Capture:
-    """Call views as the estimate calls those from the same place, under whatever light.
+    """Call views as the estimate calls those from the same position, under whatever light.
 
-    Names of these sets hold the place (``rect_007_3_r5000.png``, ``view_07/012.png``), and a
-    result may be made from any light of each. A place that the estimate has under several
+    Names of these sets hold the position (``rect_007_3_r5000.png``, ``view_07/012.png``), and a
+    result may be made from any light of each. A position that the estimate has under several
     lights, or not at all, keeps its name.
     """
-    places = [_place_in(name) for name in estimate.names]
+    positions = [_position_in(name) for name in estimate.names]
     known = {
-        place: name
-        for place, name in zip(places, estimate.names, strict=True)
-        if place is not None and places.count(place) == 1
+        position: name
+        for position, name in zip(positions, estimate.names, strict=True)
+        if position is not None and positions.count(position) == 1
     }
-    theirs = [(_place_in(name), name) for name in capture.views.names]
-    names = tuple(name if place is None else known.get(place, name) for place, name in theirs)
+    theirs = [(_position_in(name), name) for name in capture.views.names]
+    names = tuple(
+        name if position is None else known.get(position, name) for position, name in theirs
+    )
     return capture.replace(views=capture.views.replace(names=names))
 
 
-def _place_in(name: str) -> int | None:
-    match = _PLACE.search(name)
+def _position_in(name: str) -> int | None:
+    match = _POSITION.search(name)
     return int(match[1]) if match else None
 
 

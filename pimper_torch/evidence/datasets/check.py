@@ -278,8 +278,8 @@ def _sound(cameras: Cameras) -> list[Finding]:
 
 def _subject(capture: Capture, cameras: Cameras) -> _Subject:
     first: dict[int, int] = {}
-    for view, place in enumerate(capture.position.tolist()):
-        first.setdefault(place, view)
+    for view, position in enumerate(capture.position.tolist()):
+        first.setdefault(position, view)
     chosen = _spread(list(first.values()))
     views, truth = capture.views.take(chosen), _taken(capture.truth, chosen)
     masks = views.masks if views.masks is not None else truth.foreground

@@ -22,7 +22,7 @@ from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct import Reconstruct
 
 _KIND = "a COLMAP model with its photographs"
-_PLACES = (".", "sparse/0", "sparse", "model", "0")
+_SUBFOLDERS = (".", "sparse/0", "sparse", "model", "0")
 
 
 def read_colmap(
@@ -136,14 +136,12 @@ def _photographs(
     folder: Path, images: Path | str | None, masks: Path | str | None
 ) -> tuple[Path, list[PosedPhotograph]]:
     """Find the model, and the files of its photographs."""
-    places = [folder / place for place in _PLACES]
+    folders = [folder / name for name in _SUBFOLDERS]
     endings = (".bin", ".txt")
-    found = [
-        place for place in places if any((place / f"cameras{end}").is_file() for end in endings)
-    ]
+    found = [one for one in folders if any((one / f"cameras{end}").is_file() for end in endings)]
     expect(bool(found), folder, _KIND, "cameras.bin or cameras.txt here or in sparse/0")
     around = [found[0], found[0].parent, found[0].parent.parent, folder]
-    picture_folder = Path(images) if images else first_of([place / "images" for place in around])
+    picture_folder = Path(images) if images else first_of([one / "images" for one in around])
     expect(
         picture_folder is not None and picture_folder.is_dir(),
         folder,

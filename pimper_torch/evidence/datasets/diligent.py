@@ -110,7 +110,7 @@ def read_diligent(
         positions=None,
         lights=lights,
         light_seed=light_seed,
-        place=root,
+        path=root,
         kind=KIND,
     )
     intensity = files.intensities[kept]

@@ -75,31 +75,31 @@ def read_diligent_mv(
     layout and axes as its benchmark page and public loaders (PS-NeRF, SuperNormal) have them.
     """
     root = Path(folder)
-    places = _view_folders(root)
-    point_lights = {place: point_light_files(path, KIND) for place, path in places.items()}
+    folders = _view_folders(root)
+    point_lights = {position: point_light_files(path, KIND) for position, path in folders.items()}
     table = [
-        (place, point_light)
-        for place, files in point_lights.items()
+        (position, point_light)
+        for position, files in point_lights.items()
         for point_light in range(1, len(files.paths) + 1)
     ]
     chosen = choose_photographs(
-        [place for place, _ in table],
+        [position for position, _ in table],
         [point_light for _, point_light in table],
         positions=positions,
         lights=lights,
         light_seed=light_seed,
-        place=root,
+        path=root,
         kind=KIND,
     )
     kept = [table[index] for index in chosen]
-    order = sorted({place for place, _ in kept})
+    order = sorted({position for position, _ in kept})
     K, pose = decompose_projections(
         read_toolbox_projections(root / "Calib_Results.mat", order, KIND)
     )
-    index = torch.tensor([order.index(place) for place, _ in kept])
-    paths = [point_lights[place].paths[point_light - 1] for place, point_light in kept]
+    index = torch.tensor([order.index(position) for position, _ in kept])
+    paths = [point_lights[position].paths[point_light - 1] for position, point_light in kept]
     intensity = torch.stack(
-        [point_lights[place].intensities[point_light - 1] for place, point_light in kept]
+        [point_lights[position].intensities[point_light - 1] for position, point_light in kept]
     )
     views = read_photographs(
         paths,
@@ -113,14 +113,14 @@ def read_diligent_mv(
     header = read_header(paths[0])
     K = scale_intrinsics(intrinsics_from_indices(K), width / header.width, height / header.height)
     directions = torch.stack(
-        [point_lights[place].directions[point_light - 1] for place, point_light in kept]
+        [point_lights[position].directions[point_light - 1] for position, point_light in kept]
     )
     world_from_cam = pose[:, :3, :3].mT
     directions_world = (world_from_cam[index] @ (directions * FLIP)[..., None])[..., 0]
     strength = torch.ones(len(kept)) if divide_by_intensity else intensity.mean(dim=1)
     normals = [
-        _rotated(read_normals(places[place], KIND), world_from_cam[row], width, height)
-        for row, place in enumerate(order)
+        _rotated(read_normals(folders[position], KIND), world_from_cam[row], width, height)
+        for row, position in enumerate(order)
     ]
     return Capture(
         views=views,
@@ -135,7 +135,7 @@ def read_diligent_mv(
             foreground=views.masks,
             lights_world=directed_lights(directions_world, strength),
         ),
-        position=torch.tensor([place for place, _ in kept]),
+        position=torch.tensor([position for position, _ in kept]),
         light=torch.tensor([point_light for _, point_light in kept]),
     )
 

@@ -1,4 +1,4 @@
-"""What the two DTU sets share: one camera, one calibrated size, several point lights a place."""
+"""What the two DTU sets share: one camera, one calibrated size, several point lights a position."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,22 +17,22 @@ CALIBRATED_WIDTH = 1600  # of 1600 x 1200; copies of half the size exist
 
 def dtu_capture(
     paths: Sequence[Path],
-    places: Sequence[int],
+    positions: Sequence[int],
     point_lights: Sequence[int],
-    cameras: tuple[Float[Tensor, "place 3 3"], Float[Tensor, "place 4 4"]],
+    cameras: tuple[Float[Tensor, "position 3 3"], Float[Tensor, "position 4 4"]],
     truth: Truth,
     *,
     encoding: Encoding,
     max_size_px: int,
 ) -> Capture:
-    """Read photographs and give each the camera of its place.
+    """Read photographs and give each the camera of its position.
 
     Args:
         paths: Of the photographs.
-        places: Of each.
+        positions: Of each.
         point_lights: Of each.
         cameras: Intrinsics, whose pixels count from the centre of the first one, and poses of
-            the different places in ascending order.
+            the different positions in ascending order.
         truth: Of the scene.
         encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
@@ -40,8 +40,8 @@ def dtu_capture(
     Raises:
         InputError: A photograph cannot be read, or their sizes differ.
     """
-    order = sorted(set(places))
-    index = torch.tensor([order.index(place) for place in places])
+    order = sorted(set(positions))
+    index = torch.tensor([order.index(position) for position in positions])
     views = read_photographs(
         paths, [path.name for path in paths], encoding=encoding, max_size_px=max_size_px
     )
@@ -56,6 +56,6 @@ def dtu_capture(
             sizes_px=views.sizes_px,
         ),
         truth=truth,
-        position=torch.tensor(places),
+        position=torch.tensor(positions),
         light=torch.tensor(point_lights),
     )

@@ -35,10 +35,10 @@ def read_dtu_mvs(
 ) -> Capture:
     """Read a scan of the DTU multi-view stereo set.
 
-    49 or 64 places of a camera on a robot's arm, under seven lights each. ``folder`` is what
+    49 or 64 positions of a camera on a robot's arm, under seven lights each. ``folder`` is what
     the set's page calls ``MVS Data``::
 
-        Rectified/scan1/rect_001_0_r5000.png ... rect_064_6_r5000.png     place, light
+        Rectified/scan1/rect_001_0_r5000.png ... rect_064_6_r5000.png     position, light
         Rectified/scan1/rect_001_max.png ...                              brightest of them
         Calibration/cal18/pos_001.txt ...                                 3x4 projections
         Points/stl/stl001_total.ply                                       scan, in mm
@@ -53,10 +53,10 @@ def read_dtu_mvs(
     Args:
         folder: With ``Rectified``.
         scan: Number of the scan.
-        positions: Read these places only, from 1.
+        positions: Read these positions only, from 1.
         lights: Read these lights only, 0 to 6, or :data:`ALL_LIGHTS` for ``max``; ``None``
             reads 0 to 6.
-        light_seed: Read one light a place, chosen by this seed; ``None`` reads all. Decided
+        light_seed: Read one light a position, chosen by this seed; ``None`` reads all. Decided
             before anything is decoded.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         encoding: Response, saturation and black level of the files.
@@ -79,20 +79,20 @@ def read_dtu_mvs(
         named = [entry for entry in named if entry[1] != ALL_LIGHTS]
     expect(bool(named), photographs, KIND, "photographs such as rect_001_0_r5000.png")
     chosen = choose_photographs(
-        [place for place, _, _ in named],
+        [position for position, _, _ in named],
         [point_light for _, point_light, _ in named],
         positions=positions,
         lights=lights,
         light_seed=light_seed,
-        place=photographs,
+        path=photographs,
         kind=KIND,
     )
-    places, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
+    kept_positions, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
     return dtu_capture(
         paths,
-        places,
+        kept_positions,
         point_lights,
-        _read_cameras(root, sorted(set(places))),
+        _read_cameras(root, sorted(set(kept_positions))),
         Truth(points_world=_scan(root, scan)),
         encoding=encoding,
         max_size_px=max_size_px,
@@ -144,7 +144,7 @@ def _scan(root: Path, scan: int) -> Float[Tensor, "point 3"] | None:
 def _read_cameras(
     root: Path, positions: Sequence[int]
 ) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]:
-    """Read the cameras of places, from the set's own files or else from MVSNet's."""
+    """Read the cameras of positions, from the set's own files or else from MVSNet's."""
     official, other = root / "Calibration" / "cal18", root / "Cameras"
     if official.is_dir():
         paths = [official / f"pos_{position:03d}.txt" for position in positions]

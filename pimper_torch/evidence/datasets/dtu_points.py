@@ -1,4 +1,4 @@
-"""DTU robot image data, the point feature set: 60 scenes, 119 places, 19 point lights."""
+"""DTU robot image data, the point feature set: 60 scenes, 119 positions, 19 point lights."""
 
 import re
 from collections.abc import Sequence
@@ -34,10 +34,10 @@ def read_dtu_points(
 ) -> Capture:
     """Read a scene of the DTU point feature set.
 
-    A robot carried the camera to 119 places, and at each of them 19 LEDs were lit one after
+    A robot carried the camera to 119 positions, and at each of them 19 LEDs were lit one after
     the other. ``folder`` holds what the set's page offers, unpacked::
 
-        SET001/Img001_01.bmp ... Img119_19.bmp     place, LED; 1600 x 1200 or 800 x 600
+        SET001/Img001_01.bmp ... Img119_19.bmp     position, LED; 1600 x 1200 or 800 x 600
         Calib_Results_11.mat                       also as calibrationFile.mat
         CleanRecon_2009_11_16/Clean_Reconstruction_01.mat    also under reconstructions/
 
@@ -51,9 +51,9 @@ def read_dtu_points(
     Args:
         folder: With ``SET001`` and so on.
         scan: Number of the scene, from 1.
-        positions: Read these places only, from 1.
+        positions: Read these positions only, from 1.
         lights: Read these LEDs only, from 1.
-        light_seed: Read one LED a place, chosen by this seed, each place another than the one
+        light_seed: Read one LED a position, chosen by this seed, each position another than the one
             before; ``None`` reads all. Decided before anything is decoded.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         encoding: Response, saturation and black level of the files.
@@ -73,24 +73,24 @@ def read_dtu_points(
         for path in photographs.iterdir()
         if (match := _NAME.fullmatch(path.name))
     )
-    expect(bool(named), photographs, KIND, "photographs such as Img001_01.bmp (place, LED)")
+    expect(bool(named), photographs, KIND, "photographs such as Img001_01.bmp (position, LED)")
     chosen = choose_photographs(
-        [place for place, _, _ in named],
+        [position for position, _, _ in named],
         [point_light for _, point_light, _ in named],
         positions=positions,
         lights=lights,
         light_seed=light_seed,
-        place=photographs,
+        path=photographs,
         kind=KIND,
     )
-    places, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
+    kept_positions, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
     calibration = first_of([root / name for name in _CALIBRATIONS])
     expect(calibration is not None, root, KIND, f"the calibration {' or '.join(_CALIBRATIONS)}")
     assert calibration is not None
-    projections = read_toolbox_projections(calibration, sorted(set(places)), KIND)
+    projections = read_toolbox_projections(calibration, sorted(set(kept_positions)), KIND)
     return dtu_capture(
         paths,
-        places,
+        kept_positions,
         point_lights,
         decompose_projections(projections),
         Truth(points_world=_scan(root, scan)),
@@ -102,7 +102,7 @@ def read_dtu_points(
 def _scan(root: Path, scan: int) -> Float[Tensor, "point 3"] | None:
     """Read the structured-light points, of which there is a near and a far half."""
     name = f"Clean_Reconstruction_{scan:02d}.mat"
-    path = first_of([root / place / name for place in _SCANS])
+    path = first_of([root / folder / name for folder in _SCANS])
     if path is None:
         return None
     halves = ("pts3D_near", "pts3D_far")

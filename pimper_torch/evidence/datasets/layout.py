@@ -13,12 +13,12 @@ from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import some
 
 
-def expect(ok: bool, place: Path, kind: str, needed: str, found: str | None = None) -> None:
+def expect(ok: bool, path: Path, kind: str, needed: str, found: str | None = None) -> None:
     """Refuse a folder or file that does not have the layout of a data set.
 
     Args:
         ok: Whether it does.
-        place: The folder or file looked at.
+        path: The folder or file looked at.
         kind: The data set, as its users call it.
         needed: What should be there.
         found: What is there instead; by default what the folder holds.
@@ -29,19 +29,19 @@ def expect(ok: bool, place: Path, kind: str, needed: str, found: str | None = No
     if ok:
         return
     if found is None:
-        found = contents(place)
+        found = contents(path)
     raise InputError(
-        f"{place}: not the layout of {kind}. Needed: {needed}. Found: {found}. Point to the folder "
+        f"{path}: not the layout of {kind}. Needed: {needed}. Found: {found}. Point to the folder "
         "that holds it, or choose the reader of another layout."
     )
 
 
-def contents(place: Path) -> str:
+def contents(path: Path) -> str:
     """Tell what a folder holds, for a message."""
-    if place.is_dir():
-        names = sorted(path.name for path in place.iterdir())
+    if path.is_dir():
+        names = sorted(inner.name for inner in path.iterdir())
         return some(names) if names else "an empty folder"
-    return "a file" if place.exists() else "nothing there"
+    return "a file" if path.exists() else "nothing there"
 
 
 def inside(folder: Path, name: str, kind: str) -> Path:
@@ -103,7 +103,7 @@ def read_json(path: Path, kind: str) -> dict[str, object]:
     return dict(found)
 
 
-def objects(value: object, what: str, place: Path, kind: str) -> list[dict[str, object]]:
+def objects(value: object, what: str, path: Path, kind: str) -> list[dict[str, object]]:
     """Check that a value of a file is a list of objects, and give it.
 
     Raises:
@@ -112,7 +112,7 @@ def objects(value: object, what: str, place: Path, kind: str) -> list[dict[str, 
     entries = list(value) if isinstance(value, list) else []
     expect(
         bool(entries) and all(isinstance(entry, dict) for entry in entries),
-        place,
+        path,
         kind,
         f"a list of objects as {what}",
         _shown(value),
@@ -121,7 +121,7 @@ def objects(value: object, what: str, place: Path, kind: str) -> list[dict[str, 
 
 
 def numbers(
-    value: object, count: int, what: str, place: Path, kind: str
+    value: object, count: int, what: str, path: Path, kind: str
 ) -> Float[Tensor, " number"]:
     """Check that a value of a file is so many numbers, and give them in float64.
 
@@ -129,7 +129,7 @@ def numbers(
         value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.
         count: How many are needed.
         what: Their name in the file.
-        place: The file.
+        path: The file.
         kind: The data set, as its users call it.
 
     Raises:
@@ -142,7 +142,7 @@ def numbers(
         array = np.full(1, np.nan)
     expect(
         len(array) == count and bool(np.isfinite(array).all()),
-        place,
+        path,
         kind,
         f"{count} finite number{'s' if count > 1 else ''} as {what}",
         _shown(value),

@@ -40,7 +40,7 @@ def read_llff(
 
     A row of the file has 17 numbers: a 3x5 matrix, row by row, and the nearest and farthest
     depth. The matrix's columns are, in the world frame, the camera's directions *down, right
-    and back*, its place, and (height, width, focal length). So
+    and back*, its position, and (height, width, focal length). So
     ``world_from_cam = [column 1, column 0, -column 2, column 3]`` for our right, down,
     forward. (LLFF's README, "Using your own poses without running COLMAP", and its
     ``poses/pose_utils.py``.)

@@ -41,7 +41,7 @@ def read_meshroom(
 
     As AliceVision reads its own file (``sfmDataIO/jsonIO.cpp``):
 
-    - ``rotation`` is ``cam_from_world``, column by column; ``center`` is the camera's place;
+    - ``rotation`` is ``cam_from_world``, column by column; ``center`` is the camera's position;
       the camera's axes are ours.
     - Before version 1.2 of the file ``pxFocalLength`` is one number, in 1.2.0 and 1.2.1 two;
       from 1.2.2 on ``focalLength`` is in mm of a sensor ``sensorWidth`` wide, and
@@ -68,9 +68,9 @@ def read_meshroom(
         InputError: The file says something else or describes a lens or rig that cannot be
             read, or a photograph is missing or damaged.
     """
-    place = Path(folder)
-    path = place if place.is_file() else first_of([place / name for name in _FILES])
-    expect(path is not None, place, _KIND, f"a file {' or '.join(_FILES[:2])}")
+    given = Path(folder)
+    path = given if given.is_file() else first_of([given / name for name in _FILES])
+    expect(path is not None, given, _KIND, f"a file {' or '.join(_FILES[:2])}")
     assert path is not None
     whole = read_json(path, _KIND)
     version = tuple(int(part) for part in numbers(whole.get("version"), 3, "version", path, _KIND))
@@ -144,9 +144,9 @@ def _lens(entry: Mapping[str, object], version: tuple[int, ...], camera: int, pa
     expect(bool((focal > 0).all()), path, _KIND, "a positive focal length", f"{focal.tolist()}")
     center = value("principalPoint", 2)
     center = pixels_from_indices(center if version < (1, 2, 1) else center + size / 2)
-    place = (float(focal[0]), float(focal[1]), float(center[0]), float(center[1]))
+    pinhole = (float(focal[0]), float(focal[1]), float(center[0]), float(center[1]))
     model, params = _distortion(entry, path)
-    return Lens(camera=camera, model=model, params=(*place, *params), width=width, height=height)
+    return Lens(camera=camera, model=model, params=(*pinhole, *params), width=width, height=height)
 
 
 def _focal(

@@ -127,12 +127,12 @@ def parse_without_entities(path: Path, kind: str) -> ElementTree.Element:
         ) from error
 
 
-def _xml_file(place: Path) -> Path:
-    if place.is_file():
-        return place
-    expect(place.is_dir(), place, _KIND, "its file or folder")
-    found = sorted(place.glob("*.xml"))
-    expect(len(found) == 1, place, _KIND, "one .xml file")
+def _xml_file(given: Path) -> Path:
+    if given.is_file():
+        return given
+    expect(given.is_dir(), given, _KIND, "its file or folder")
+    found = sorted(given.glob("*.xml"))
+    expect(len(found) == 1, given, _KIND, "one .xml file")
     return found[0]
 
 
@@ -232,7 +232,7 @@ def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, f
     f, b1, b2 = value("f"), value("b1"), value("b2")
     k1, k2, k3, k4 = (value(tag) for tag in ("k1", "k2", "k3", "k4"))
     p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))
-    place = (f + b1, f, width / 2 + value("cx"), height / 2 + value("cy"))
+    pinhole = (f + b1, f, width / 2 + value("cx"), height / 2 + value("cy"))
     kind = calibration.get("type") or sensor.get("type") or "frame"
     model, params = "PINHOLE", tuple[float, ...]()
     if kind == "fisheye":
@@ -252,7 +252,7 @@ def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, f
         f"a {kind} camera with {_nonzero(calibration)}; export undistorted photographs with their "
         "cameras, or align anew without the others",
     )
-    lens = Lens(camera=number, model=model, params=(*place, *params), width=width, height=height)
+    lens = Lens(camera=number, model=model, params=(*pinhole, *params), width=width, height=height)
     return lens, b2
 
 

@@ -72,12 +72,12 @@ def read_middlebury(
     )
 
 
-def _parameter_file(place: Path) -> Path:
-    if place.is_file():
-        return place
-    expect(place.is_dir(), place, _KIND, "the folder of the set")
-    found = sorted(place.glob("*_par.txt"))
-    expect(len(found) == 1, place, _KIND, "one file named *_par.txt")
+def _parameter_file(given: Path) -> Path:
+    if given.is_file():
+        return given
+    expect(given.is_dir(), given, _KIND, "the folder of the set")
+    found = sorted(given.glob("*_par.txt"))
+    expect(len(found) == 1, given, _KIND, "one file named *_par.txt")
     return found[0]
 
 

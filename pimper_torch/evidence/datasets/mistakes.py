@@ -131,7 +131,7 @@ _POSES = (
     CameraMistake(
         name="world_axes_flipped",
         meaning="y and z of the world run the other way for the cameras than for the truth",
-        remedy="negate y and z of the mesh or points, or the centre columns of cam_from_world",
+        remedy="negate y and z of the mesh or points, or columns 2 and 3 of cam_from_world",
         undo=_with_pose(lambda pose: pose @ _axes(1, -1, -1, pose)),
     ),
 )

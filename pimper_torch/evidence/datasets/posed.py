@@ -51,7 +51,7 @@ class PosedPhotograph(Record):
 
 def assemble(
     photographs: Sequence[PosedPhotograph],
-    place: Path,
+    path: Path,
     kind: str,
     *,
     names: Sequence[str] | None = None,
@@ -67,7 +67,7 @@ def assemble(
 
     Args:
         photographs: All that the data set has.
-        place: Its file or folder, for messages.
+        path: Its file or folder, for messages.
         kind: Its name, for messages.
         names: Keep these, in this order; ``None`` for all.
         mesh: File of the true surface, in the data set's frame.
@@ -85,7 +85,7 @@ def assemble(
     """
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
-    chosen = _select(photographs, names, place, kind)
+    chosen = _select(photographs, names, path, kind)
     views = read_views(chosen, encoding=encoding, max_size_px=max_size_px)
     lenses = fitted_lenses(chosen, views)
     undistorted, _ = undistort(views, lenses)
@@ -218,7 +218,7 @@ def rigid_or_refuse(
     rotation: Float[Tensor, "3 3"],
     translation: Float[Tensor, "3"],
     what: str,
-    place: Path,
+    path: Path,
     kind: str,
 ) -> Float[Tensor, "4 4"]:
     """Put a file's rotation and translation together, the rotation made exact.
@@ -232,7 +232,7 @@ def rigid_or_refuse(
     mirrored = bool(torch.linalg.det(nearest) < 0)
     expect(
         off <= _MAX_FROM_ROTATION and not mirrored,
-        place,
+        path,
         kind,
         f"a rotation in {what}",
         "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation",
@@ -289,22 +289,22 @@ def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]
 
 
 def _select(
-    photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, place: Path, kind: str
+    photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, path: Path, kind: str
 ) -> list[PosedPhotograph]:
     by_name = {one.name: one for one in photographs}
     repeated = sorted({one.name for one in photographs if by_name[one.name] is not one})
-    expect(not repeated, place, kind, "photographs of unlike names", f"several {some(repeated)}")
-    expect(bool(photographs), place, kind, "photographs with cameras", "none")
+    expect(not repeated, path, kind, "photographs of unlike names", f"several {some(repeated)}")
+    expect(bool(photographs), path, kind, "photographs with cameras", "none")
     wanted = list(by_name) if names is None else list(names)
     unknown = [name for name in wanted if name not in by_name]
     if unknown or not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
-            f"{place}: asked for {some(unknown or wanted) or 'no photographs'}; needed: some of "
+            f"{path}: asked for {some(unknown or wanted) or 'no photographs'}; needed: some of "
             f"its {len(by_name)} photographs, each once: {some(list(by_name))}."
         )
     chosen = [by_name[name] for name in wanted]
     missing = [one.image.name for one in chosen if not one.image.is_file()]
-    expect(not missing, place, kind, "the files of its photographs", f"no {some(missing)}")
+    expect(not missing, path, kind, "the files of its photographs", f"no {some(missing)}")
     return chosen
 
 

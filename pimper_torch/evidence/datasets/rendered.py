@@ -45,7 +45,7 @@ def read_rendered(
             that take no memory, and there are no masks.
 
     Returns:
-        Cameras and lights in float64. Every view has a place and a light of its own.
+        Cameras and lights in float64. Every view has a position and a light of its own.
 
     Raises:
         InputError: Not such a folder, or something in it is missing or damaged.
@@ -210,7 +210,7 @@ def _read_lights(
         point_lights.shape == (len(names), 3) and lights.shape == (len(names), 4),
         path,
         _KIND,
-        f"a place and four harmonics for each of {len(names)} views",
+        f"a position and four harmonics for each of {len(names)} views",
         f"{tuple(point_lights.shape)} and {tuple(lights.shape)}",
     )
     return point_lights[list(chosen)], lights[list(chosen)]

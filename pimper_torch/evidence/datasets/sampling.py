@@ -18,7 +18,7 @@ def one_light_per_position(
 ) -> Int[Tensor, " chosen"]:
     """Choose one photograph at every position, each under another light than its neighbour.
 
-    The setting of this package: every photograph has its own place and its own light. The
+    The setting of this package: every photograph has its own position and its own light. The
     positions are gone through in the order of their numbers. Each takes, by chance, one of
     the lights that were taken least so far, and not the light of the position before it if
     there is another. Where every position offers the same lights, no light is taken more
@@ -40,8 +40,8 @@ def one_light_per_position(
     taken: dict[int, int] = {}
     chosen: list[int] = []
     last: int | None = None
-    for place in sorted(set(position.tolist())):
-        (photographs,) = torch.nonzero(position == place, as_tuple=True)
+    for camera in sorted(set(position.tolist())):
+        (photographs,) = torch.nonzero(position == camera, as_tuple=True)
         offered = sorted((int(light[index]), int(index)) for index in photographs)
         others = [pair for pair in offered if pair[0] != last] or offered
         least = min(taken.get(point_light, 0) for point_light, _ in others)
@@ -60,7 +60,7 @@ def choose_photographs(
     positions: Sequence[int] | None,
     lights: Sequence[int] | None,
     light_seed: int | None,
-    place: Path,
+    path: Path,
     kind: str,
 ) -> list[int]:
     """Decide which photographs of a set are read, before any is decoded.
@@ -71,7 +71,7 @@ def choose_photographs(
         positions: Keep these only; ``None`` keeps all.
         lights: Keep these only; ``None`` keeps all.
         light_seed: Keep one light a position, chosen by this seed; ``None`` keeps all.
-        place: The set's folder, for messages.
+        path: The set's folder, for messages.
         kind: The set's name, for messages.
 
     Returns:
@@ -80,15 +80,15 @@ def choose_photographs(
     Raises:
         InputError: A position or light that was asked for is not there.
     """
-    _refuse_absent(position, positions, "positions", place, kind)
-    _refuse_absent(light, lights, "lights", place, kind)
+    _refuse_absent(position, positions, "positions", path, kind)
+    _refuse_absent(light, lights, "lights", path, kind)
     kept = [
         index
         for index, (where, point_light) in enumerate(zip(position, light, strict=True))
         if (positions is None or where in positions) and (lights is None or point_light in lights)
     ]
     kept.sort(key=lambda index: (position[index], light[index]))
-    expect(bool(kept), place, kind, "photographs of these positions under these lights", "none")
+    expect(bool(kept), path, kind, "photographs of these positions under these lights", "none")
     if light_seed is None:
         return kept
     drawn = one_light_per_position(
@@ -100,12 +100,12 @@ def choose_photographs(
 
 
 def _refuse_absent(
-    there: Sequence[int], wanted: Sequence[int] | None, what: str, place: Path, kind: str
+    there: Sequence[int], wanted: Sequence[int] | None, what: str, path: Path, kind: str
 ) -> None:
     absent = sorted(set(wanted or ()) - set(there))
     expect(
         not absent,
-        place,
+        path,
         kind,
         f"photographs of {what} {some([str(number) for number in absent])}",
         f"{what} {some([str(number) for number in sorted(set(there))], at_most=25)}",

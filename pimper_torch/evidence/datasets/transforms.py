@@ -68,9 +68,9 @@ def read_transforms(
     Raises:
         InputError: The file says something else, or a photograph is missing or damaged.
     """
-    place = Path(folder)
-    path = place if place.is_file() else first_of([place / name for name in _FILES])
-    expect(path is not None, place, _KIND, f"a file {' or '.join(_FILES)}")
+    given = Path(folder)
+    path = given if given.is_file() else first_of([given / name for name in _FILES])
+    expect(path is not None, given, _KIND, f"a file {' or '.join(_FILES)}")
     assert path is not None
     whole = read_json(path, _KIND)
     frames = objects(whole.get("frames"), "frames", path, _KIND)
@@ -214,7 +214,7 @@ def _lens(said: Mapping[str, object], image: Path, name: str, path: Path) -> Len
         "neither, or no positive one",
     )
     fx, fy = focal or focal_y, focal_y or focal
-    place = (fx, fy, value("cx", width / 2), value("cy", height / 2))
+    pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = str(said.get("camera_model") or "OPENCV")
     kind, params = "PINHOLE", tuple[float, ...]()
@@ -226,7 +226,7 @@ def _lens(said: Mapping[str, object], image: Path, name: str, path: Path) -> Len
         if any((k1, k2, k3, p1, p2)):
             kind, params = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return Lens(
-        camera=1, model=kind, params=(*place, *params), width=round(width), height=round(height)
+        camera=1, model=kind, params=(*pinhole, *params), width=round(width), height=round(height)
     )
 
 

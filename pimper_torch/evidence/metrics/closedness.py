@@ -61,7 +61,7 @@ def closedness(mesh: Mesh, *, fold_deg: float = 90.0) -> Closedness:
     """Look for what keeps a mesh from being closed.
 
     Args:
-        mesh: Any; vertices without faces do not count. Vertices that lie in one place without
+        mesh: Any; vertices without faces do not count. Vertices that lie at one point without
             being one are a border.
         fold_deg: Angle between the normals of neighbouring faces, above which it is folded
             there. Faces without area have none.

@@ -85,9 +85,9 @@ class SurfaceComparison(Record):
         surroundings_fraction: Fraction of the estimate that lies nearer to the truth's
             surroundings than to the object, and is left out of the accuracy.
         whole: With the completeness of the whole truth.
-        seen: With that of the truth seen from at least ``seen_from`` places; ``None`` if
+        seen: With that of the truth seen from at least ``seen_from`` positions; ``None`` if
             nobody knows which it is, or none is.
-        seen_from: How many places of the camera.
+        seen_from: How many positions of the camera.
         seen_fraction: Fraction of the truth that is seen so; ``None`` if nobody knows.
         calibration: Of the estimate's expected error, over its samples that count for the
             accuracy; ``None`` if it tells none.
@@ -112,10 +112,10 @@ class TrueSurface:
 
     Args:
         capture: With the true mesh or points, and its cameras for what is seen.
-        seen_from: How many places of the camera must see a true point that is counted as
+        seen_from: How many positions of the camera must see a true point that is counted as
             seen; see :func:`pimper_torch.evidence.metrics.visible.count_seeing`.
         samples: On each surface.
-        seed: Of their places.
+        seed: Of their positions.
 
     Raises:
         InputError: There is no true surface, or it has no extent.

@@ -45,7 +45,7 @@ class EvaluateConfig:
         alignment: ``none``, ``cameras``, ``icp``, or ``auto``: cameras where both sides have
             two, else none.
         views: Names of the views that normals, albedo and the relative error are compared
-            in; if empty, the estimate's reference view, or the centre one if it has none.
+            in; if empty, the estimate's reference view, or the middle one if it has none.
         thresholds_percent: Of the diagonal of the true object's bounding box, for precision,
             recall and F-score.
         seen_from: Places of the camera that must see a true point which is counted as seen.
@@ -150,7 +150,7 @@ def prepared_surface(capture: Capture, config: EvaluateConfig) -> TrueSurface | 
 
 
 def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -> tuple[int, ...]:
-    """Give the places of the views to compare in.
+    """Give the indices of the views to compare in.
 
     Raises:
         InputError: A view that was asked for is not in the truth.
@@ -160,13 +160,13 @@ def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -
         found: dict[int, None] = {}
         for asked in config.views:
             try:
-                _, place = pair_views([asked], names)
+                _, index = pair_views([asked], names)
             except InputError as error:
                 raise InputError(
                     f"there is no view {asked!r} in the truth; it has {', '.join(names[:5])}"
                     f"{', ...' if len(names) > 5 else ''}. Choose one of these."
                 ) from error
-            found[int(place[0])] = None
+            found[int(index[0])] = None
         return tuple(found)
     if estimate.reference is not None:
         try:

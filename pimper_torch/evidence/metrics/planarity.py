@@ -93,13 +93,13 @@ def planar_faces(
 ) -> tuple[PlanarFace, ...]:
     """Find the flat sides of a mesh, the largest first.
 
-    Sequential consensus: of planes through random places of what is left (as many as area has
+    Sequential consensus: of planes through random positions of what is left (as many as area has
     it, along its smoothed normal) the one with most area near it is refitted by least squares,
     and its largest connected part taken.
 
     Args:
         mesh: Orientation outward.
-        generator: On the CPU; for the places.
+        generator: On the CPU; for the positions.
         band: How far a side may lie off its plane, as a fraction of the mesh's diagonal. What is
             farther belongs to no side, nor to its flatness.
         max_angle_deg: How far its smoothed normals may turn away.
@@ -170,15 +170,15 @@ def dihedrals(
     """
     vertices, faces = mesh.vertices_world.detach().cpu().double(), mesh.faces.cpu()
     far = reach * float((vertices.amax(dim=0) - vertices.amin(dim=0)).norm())
-    places = [vertices[torch.unique(faces[side.faces])].numpy() for side in sides]
-    trees = [cKDTree(some) for some in places]
+    positions = [vertices[torch.unique(faces[side.faces])].numpy() for side in sides]
+    trees = [cKDTree(some) for some in positions]
     found = []
     for one, first in enumerate(sides):
         for other in range(one + 1, len(sides)):
             second = sides[other]
             rotation = math.degrees(math.acos(float((first.normal @ second.normal).clamp(-1, 1))))
-            distance, _ = trees[other].query(places[one], distance_upper_bound=far)
-            border = places[one][np.isfinite(distance)]
+            distance, _ = trees[other].query(positions[one], distance_upper_bound=far)
+            border = positions[one][np.isfinite(distance)]
             if len(border) < 2 or rotation < min_rotation_deg:
                 continue
             along = normalize(torch.linalg.cross(first.normal, second.normal), dim=0).numpy()

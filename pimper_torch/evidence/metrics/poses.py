@@ -29,14 +29,14 @@ class CameraFigures(Record):
         missing: How many of them the estimate has no camera for.
         mean_rotation_deg: Angle between the cameras.
         median_rotation_deg: The same.
-        mean_center: Distance between the cameras' places, scene units of the truth.
+        mean_center: Distance between the cameras' positions, scene units of the truth.
         median_center: The same.
         mean_center_percent: Of each true camera's distance from the object's centre; NaN
             where nobody knows the object.
         mean_center_percent_of_diagonal: Of the object's bounding box; NaN the same.
         mean_focal_percent: Of the focal length, absolute; images of unlike size are taken
             for resized ones.
-        mean_place_percent: How far off the object's points are put when each is where our
+        mean_position_percent: How far off the object's points are put when each is where our
             cameras' rays through its true pixels meet, of the diagonal: no surface made with
             these cameras is nearer, but by chance. NaN where nobody knows the object.
         mean_bend_percent: The same once the points themselves were brought together: what
@@ -52,7 +52,7 @@ class CameraFigures(Record):
     mean_center_percent: float
     mean_center_percent_of_diagonal: float
     mean_focal_percent: float
-    mean_place_percent: float = math.nan
+    mean_position_percent: float = math.nan
     mean_bend_percent: float = math.nan
 
 
@@ -89,12 +89,12 @@ def compare_cameras(
     if centre is not None:
         away = (centers_true - centre.to(centers_true)).norm(dim=1)
     focal = _focal(ours) / _focal(truth) - 1
-    place, bend = math.nan, math.nan
+    position, bend = math.nan, math.nan
     if points_true is not None and diagonal:
-        found, right = _places(ours, truth, points_true.double().cpu())
+        found, right = _positions(ours, truth, points_true.double().cpu())
         if len(found) >= _FEWEST_PLACES:
             fitted = similarity_between_points(found, right)
-            place, bend = (
+            position, bend = (
                 float(100 * (transform(transferred, found) - right).norm(dim=1).mean() / diagonal)
                 for transferred in (truth_from_ours, fitted)
             )
@@ -108,14 +108,14 @@ def compare_cameras(
         mean_center_percent=float((100 * offset / away).mean()),
         mean_center_percent_of_diagonal=float(100 * offset.mean() / (diagonal or torch.nan)),
         mean_focal_percent=float(100 * focal.abs().mean()),
-        mean_place_percent=place,
+        mean_position_percent=position,
         mean_bend_percent=bend,
     )
 
 
-def _places(
+def _positions(
     ours: Cameras, truth: Cameras, points_true: Float[Tensor, "point 3"]
-) -> tuple[Float[Tensor, "place 3"], Float[Tensor, "place 3"]]:
+) -> tuple[Float[Tensor, "position 3"], Float[Tensor, "position 3"]]:
     """Give where our cameras put points that the true ones have in their images, and these."""
     pixels, depth = project(
         points_true, truth.cam_from_world.double().cpu(), truth.intrinsics.double().cpu()

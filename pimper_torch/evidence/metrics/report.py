@@ -91,7 +91,9 @@ def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
     if surface.whole is not None:
         yield from _two_sided_rows(surface.whole, "", "the whole truth")
     if surface.seen is not None and surface.seen_fraction is not None:
-        part = f"the {_fraction(surface.seen_fraction)} of it seen from {surface.seen_from} places"
+        part = (
+            f"the {_fraction(surface.seen_fraction)} of it seen from {surface.seen_from} positions"
+        )
         yield from _two_sided_rows(surface.seen, " (seen)", part)
     if surface.calibration is not None:
         yield from _calibration_rows(surface.calibration, surface.diagonal)
@@ -210,10 +212,10 @@ def _camera_rows(cameras: CameraFigures) -> Iterator[Row]:
         value=f"{_number(cameras.mean_focal_percent)} %",
         meaning="mean of the absolute differences of the focal length",
     )
-    if not math.isnan(cameras.mean_place_percent):
+    if not math.isnan(cameras.mean_position_percent):
         yield Row(
-            name="places",
-            value=f"{cameras.mean_place_percent:.4f} %; {cameras.mean_bend_percent:.4f} %",
+            name="positions",
+            value=f"{cameras.mean_position_percent:.4f} %; {cameras.mean_bend_percent:.4f} %",
             meaning="of the diagonal, that exact rays put points off: after the similarity on "
             "cameras; after the best one",
         )

@@ -87,5 +87,5 @@ def _drawn(
     ends: Float[Tensor, " face"], count: int, generator: torch.Generator
 ) -> Int[Tensor, " sample"]:
     jitter = torch.rand(count, generator=generator, dtype=torch.float64)
-    places = (torch.arange(count) + jitter) / count * ends[-1]
-    return torch.searchsorted(ends, places, right=True).clamp_max(len(ends) - 1)
+    positions = (torch.arange(count) + jitter) / count * ends[-1]
+    return torch.searchsorted(ends, positions, right=True).clamp_max(len(ends) - 1)

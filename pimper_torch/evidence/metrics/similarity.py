@@ -32,13 +32,13 @@ def pair_views(
     Raises:
         InputError: No name is in both.
     """
-    place = {name: index for index, name in enumerate(names_true)}
+    index_of = {name: index for index, name in enumerate(names_true)}
     by_stem, by_stem_true = _stems(names), _stems(names_true)
     pairs: list[tuple[int, int]] = []
     for index, name in enumerate(names):
         stem = PurePath(name).stem
-        if name in place:
-            pairs.append((index, place[name]))
+        if name in index_of:
+            pairs.append((index, index_of[name]))
         elif by_stem.get(stem) == index and by_stem_true.get(stem) is not None:
             pairs.append((index, by_stem_true[stem]))
     if not pairs:
@@ -51,7 +51,7 @@ def pair_views(
 
 
 def _stems(names: Sequence[str]) -> dict[str, int]:
-    """Give the place of every stem that one name alone has."""
+    """Give the index of every stem that one name alone has."""
     stems = [PurePath(name).stem for name in names]
     counts = Counter(stems)
     return {stem: index for index, stem in enumerate(stems) if counts[stem] == 1}
@@ -135,7 +135,7 @@ def _similarity(
     if _spread(source) == 0 or _spread(target) == 0:
         raise InputError(
             f"the {len(source)} points or camera centres to align by coincide, so that nothing "
-            "tells the scale; needed: two different places at least."
+            "tells the scale; needed: two different positions at least."
         )
     rotation = nearest_rotation(correlation)
     scale = (rotation * _outer(target, source)).sum() / _spread(source)

@@ -14,7 +14,7 @@ def without_surroundings(met: Meeting, truth: Truth) -> Meeting:
 
     Where a surface has a hole on the object and goes on over the table, a ray through the
     hole meets the table: no error of the object's shape, but a part of it that is not there.
-    Such a place lies behind the true one on its ray, and nearer to the true surroundings than
+    Such a point lies behind the true one on its ray, and nearer to the true surroundings than
     to the true object.
 
     Args:

@@ -28,33 +28,33 @@ def thin(
 
     Source: Jensen et al., CVPR 2014, supplementary code.
     """
-    places = points.detach().cpu().double()
-    order = torch.randperm(len(places), generator=generator)
+    positions = points.detach().cpu().double()
+    order = torch.randperm(len(positions), generator=generator)
     kept = order[:0]
     while len(order):
         # As large as what is kept, so that few trees are built.
         batch, order = order.tensor_split([max(_BATCH, len(kept))])
         if len(kept):
-            nearest, _ = cKDTree(places[kept].numpy()).query(
-                places[batch].numpy(), distance_upper_bound=np.nextafter(distance, np.inf)
+            nearest, _ = cKDTree(positions[kept].numpy()).query(
+                positions[batch].numpy(), distance_upper_bound=np.nextafter(distance, np.inf)
             )
             batch = batch[torch.from_numpy(nearest > distance)]
-        kept = torch.cat([kept, batch[_settled(places[batch], distance)]])
+        kept = torch.cat([kept, batch[_settled(positions[batch], distance)]])
     return kept
 
 
-def _settled(places: Float[Tensor, "point 3"], distance: float) -> Bool[Tensor, " point"]:
+def _settled(positions: Float[Tensor, "point 3"], distance: float) -> Bool[Tensor, " point"]:
     """Keep each point, first to last, that no kept one before it is near.
 
     A round keeps the points that no undecided point before them is near, and drops the
     neighbours of what it kept; what is kept is the same as one by one.
     """
-    undecided = np.ones(len(places), dtype=bool)
-    kept = np.zeros(len(places), dtype=bool)
-    pairs = cKDTree(places.numpy()).query_pairs(distance, output_type="ndarray")
+    undecided = np.ones(len(positions), dtype=bool)
+    kept = np.zeros(len(positions), dtype=bool)
+    pairs = cKDTree(positions.numpy()).query_pairs(distance, output_type="ndarray")
     first, second = np.sort(pairs, axis=1).T
     while undecided.any():
-        preceded = np.zeros(len(places), dtype=bool)
+        preceded = np.zeros(len(positions), dtype=bool)
         preceded[second] = True
         chosen = undecided & ~preceded
         kept |= chosen

@@ -1,4 +1,4 @@
-"""How many places of a camera see each point of the true surface."""
+"""How many positions of a camera see each point of the true surface."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,11 +17,11 @@ _HIDDEN_BEHIND = 1e-3
 def count_seeing(
     samples: SurfaceSamples, capture: Capture, diagonal: float
 ) -> Int[Tensor, " sample"] | None:
-    """Count the places of the camera that each true point is seen from.
+    """Count the positions of the camera that each true point is seen from.
 
     A view sees a point that lies inside its picture and behind nothing else: by ray casting
     the true mesh with its surroundings and the face's front towards the camera, or, for a
-    cloud, by the true depth maps. Views taken from one place (``capture.position``) count
+    cloud, by the true depth maps. Views taken from one position (``capture.position``) count
     once, however many lights they were taken under.
 
     Args:
@@ -43,9 +43,9 @@ def count_seeing(
     elif truth.depth is None:
         return None
     count = torch.zeros(len(samples.points), dtype=torch.long)
-    for place in torch.unique(capture.position):
+    for position in torch.unique(capture.position):
         seen = torch.zeros(len(count), dtype=torch.bool)
-        views = (capture.position == place).nonzero()[:, 0].tolist()
+        views = (capture.position == position).nonzero()[:, 0].tolist()
         # A ray caster sees the same in all of them; depth maps may have other holes.
         for view in views[:1] if caster is not None else views:
             if caster is not None:

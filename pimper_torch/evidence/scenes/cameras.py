@@ -120,10 +120,10 @@ def handheld_directions(
     """Walk once round the object for each of three heights, as steadily as a hand is.
 
     Args:
-        num_views: Shared out between the rounds: the first third goes at the centre height,
+        num_views: Shared out between the rounds: the first third goes at the middle height,
             then higher, then lower.
         generator: Of the irregularities.
-        elevation_deg: Of the round in the centre; the others are 18 degrees higher and 14
+        elevation_deg: Of the middle round; the others are 18 degrees higher and 14
             lower, none below 8 and above 75.
     """
     third = torch.arange(num_views) * 3 // num_views

@@ -2,13 +2,13 @@
 
 import torch
 
-from pimper_torch.evidence.scenes.bodies import Body
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.meshes import potato, table
 from pimper_torch.evidence.scenes.noise import random_speckle
-from pimper_torch.evidence.scenes.render import render_bodies
+from pimper_torch.evidence.scenes.render import render_objects
 from pimper_torch.evidence.scenes.rendered import RenderedScene
+from pimper_torch.evidence.scenes.scene_object import SceneObject
 from pimper_torch.evidence.scenes.sensor import SensorConfig
 
 
@@ -41,14 +41,14 @@ def potato_on_table(
         sensor: ``None`` is the default one.
     """
     generator = torch.Generator().manual_seed(seed)
-    bodies = (
-        Body(
+    objects = (
+        SceneObject(
             mesh=potato(generator),
             texture=random_speckle(generator, contrast=contrast),
             specular=gloss,
             roughness=0.35,
         ),
-        Body(
+        SceneObject(
             mesh=table(),
             texture=random_speckle(
                 generator, cells=(0.53, 0.23, 0.097, 0.043, 0.019), contrast=contrast
@@ -77,4 +77,4 @@ def potato_on_table(
         target=centre,
         toward=(0.0, -0.6, 0.8),
     )
-    return render_bodies(bodies, cameras, lights, generator, sensor)
+    return render_objects(objects, cameras, lights, generator, sensor)

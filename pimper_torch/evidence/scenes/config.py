@@ -23,7 +23,7 @@ class SceneConfig:
         sway_deg: How far the camera goes up and down along the arc.
         fill: Fraction of the picture that the object takes, along the tighter side.
         fixed_point_light: The point light stands still beside the camera, as where the object
-            turns; only with the turntable. Else it goes to another place for every photograph.
+            turns; only with the turntable. Else it goes to another position for every photograph.
         fixed_room: A patterned floor and wall behind the object, which stand still before the
             camera; only with the turntable. Else there is nothing beyond the table.
         fixed_table: The table stands still before the camera, too, and the object alone turns;

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.bodies import Texture
 from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.scene_object import Texture
 from pimper_torch.geometry.directions import even_directions
 
 _WINDOWS = 6

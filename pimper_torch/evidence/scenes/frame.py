@@ -62,7 +62,7 @@ def render_frame(
     rays over its area instead.
 
     Args:
-        stage: The bodies.
+        stage: The objects.
         cameras: All of them.
         lights: All of them.
         view: Which to take.
@@ -84,13 +84,13 @@ def render_frame(
         if fine:
             radiance = radiance.index_copy(0, uneven, torch.cat(fine))
     image = expose(radiance.reshape(height, width, -1).movedim(-1, 0), generator, sensor)
-    body = torch.cat([one.spots.body for one in seen]).reshape(height, width)
+    object_index = torch.cat([one.spots.object_index for one in seen]).reshape(height, width)
     return Frame(
         image=image,
         depth=torch.cat([one.spots.hits.distance for one in seen]).reshape(height, width),
         normals_world=torch.cat([one.spots.normals for one in seen]).reshape(height, width, 3),
         albedo=torch.cat([one.spots.albedo for one in seen]).reshape(height, width, -1),
-        foreground=(body >= 0) & ~stage.outside[body],
+        foreground=(object_index >= 0) & ~stage.outside[object_index],
         lit=torch.cat([one.lit for one in seen]).reshape(height, width),
         highlight=torch.cat([one.highlight for one in seen]).reshape(height, width),
     )
@@ -126,11 +126,11 @@ class _Look:
             self._indirect = interreflection.light(stage, self._point_light)
 
     def at(self, pixels: Float[Tensor, "pixel 2"]) -> _Seen:
-        """Look through places in the image."""
+        """Look through positions in the image."""
         rays = rays_through(pixels, self._cam_from_world, self._intrinsics).float()
         spots = self._stage.trace(self._eye, rays)
         shaded = self._stage.shade(spots, self._eye, self._point_light, self._indirect)
-        hit = (spots.body >= 0)[:, None]
+        hit = (spots.object_index >= 0)[:, None]
         beyond = self._point_light.surroundings(rays)
         radiance = self._exposure * torch.where(hit, shaded.matte + shaded.mirrored, beyond)
         mirrored = self._exposure * shaded.mirrored.mean(dim=-1)

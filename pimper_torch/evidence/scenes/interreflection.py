@@ -22,7 +22,7 @@ class Interreflection:
     """Diffuse transfer between the faces and vertices of a stage.
 
     Args:
-        stage: The bodies; they do not move.
+        stage: The objects; they do not move.
         bounces: How many surfaces light may touch before the one that is seen.
         num_rays: From each vertex; the more, the less its light differs from its neighbours'
             by chance.

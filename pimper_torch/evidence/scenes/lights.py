@@ -26,24 +26,24 @@ class PointLight(Record):
     environment: Environment | None = None
 
     def surroundings(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Give the radiance that arrives from where there is no body; 0 without environment."""
+        """Give the radiance that arrives from where there is no object; 0 without environment."""
         if self.environment is None:
             return torch.zeros_like(directions)
         return self.ambient * self.environment(directions)
 
     def arriving(
-        self, points: Float[Tensor, "*batch 3"], place: Float[Tensor, " 3"], irradiance: float
+        self, points: Float[Tensor, "*batch 3"], position: Float[Tensor, " 3"], irradiance: float
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
         """Give the direction to a light, and the irradiance across it, at points.
 
         Args:
             points: World.
-            place: Of the light.
+            position: Of the light.
             irradiance: Of the light at the target.
         """
-        toward = place - points
+        toward = position - points
         distance = toward.norm(dim=-1)
-        falloff = ((place - self.target).norm() / distance) ** 2
+        falloff = ((position - self.target).norm() / distance) ** 2
         return toward / distance[..., None], irradiance * falloff
 
 
@@ -60,7 +60,7 @@ class Lights(Record):
         irradiance: Of the point lights at the target.
         ambient: Radiance of a white point in shadow.
         target_world: Where irradiance is stated.
-        flash: Irradiance at the target of a second light in the camera's own place, one a
+        flash: Irradiance at the target of a second light in the camera's own position, one a
             view, without shadows.
         environments: The picture that the ambient light comes from, one a view. Matte surfaces
             get its mean; mirrors and the background show it.
@@ -113,7 +113,7 @@ def wandering_lights(
     target: tuple[float, float, float] = (0.0, 0.0, 0.0),
     toward: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Lights:
-    """Carry a point light to another place for every photograph; float64.
+    """Carry a point light to another position for every photograph; float64.
 
     Args:
         num_views: How many photographs.
@@ -174,7 +174,7 @@ def lights_round(
         far: The point light is so far away that its light comes from one direction and does not
             fall off.
         sweep_deg: How far round the object the point light goes.
-        elevations_deg: Lowest and highest place of the point light over the table's plane.
+        elevations_deg: Lowest and highest position of the point light over the table's plane.
     """
     count = len(azimuths)
     square = _even_square(count, generator)

@@ -44,7 +44,7 @@ def table(half_side: float = 4.0, cells: int = 1) -> Mesh:
 
     Args:
         half_side: Scene units.
-        cells: Along each side; light between bodies is known at their corners.
+        cells: Along each side; light between objects is known at their corners.
     """
     side = torch.linspace(-half_side, half_side, cells + 1, dtype=torch.float64)
     y, x = torch.meshgrid(side, side, indexing="ij")
@@ -101,18 +101,18 @@ def moved(
 
 
 def push_clear(
-    mesh: Mesh, others: Sequence[Mesh], place: tuple[float, float], step: float = 0.02
+    mesh: Mesh, others: Sequence[Mesh], position: tuple[float, float], step: float = 0.02
 ) -> Mesh:
-    """Shift a solid to a place on the table, and on away from the centre until it is free.
+    """Shift a solid to a position on the table, and on away from the centre until it is free.
 
     Args:
         mesh: Closed.
         others: Closed solids that it must not cut.
-        place: Where it would best be; not the centre.
+        position: Where it would best be; not the centre.
         step: Scene units.
     """
     own, rest = _Solid(mesh), [_Solid(one) for one in others]
-    x, y = place
+    x, y = position
     shift = own.points.new_tensor([x, y, 0.0])
     onward = step * shift / shift.norm()
     while any(one.holds(own.points + shift) or own.holds(one.points - shift) for one in rest):

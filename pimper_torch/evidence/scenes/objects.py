@@ -11,7 +11,6 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from pimper_torch.evidence.scenes.bodies import Body
 from pimper_torch.evidence.scenes.level_sets import (
     mesh_level_set,
     rounded_cylinder,
@@ -20,10 +19,11 @@ from pimper_torch.evidence.scenes.level_sets import (
 )
 from pimper_torch.evidence.scenes.meshes import icosphere, lathe, moved, potato, push_clear, table
 from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.scene_object import SceneObject
 from pimper_torch.evidence.scenes.textures import CylinderRegion, Marked, Painted
 from pimper_torch.records import Mesh
 
-Recipe = Callable[[torch.Generator], tuple[Body, ...]]
+Recipe = Callable[[torch.Generator], tuple[SceneObject, ...]]
 
 _MUG_RADIUS, _MUG_HEIGHT, _MUG_WALL = 0.85, 1.95, 0.09
 # Of the jar: foot, belly, shoulder, neck, the lid's rim, its dome and knob.
@@ -66,17 +66,17 @@ _BALL_TINTS = (
     (0.9, 0.75, 1.0),
     (1.0, 0.85, 0.8),
 )
-_POTATOES = (  # place before they are pushed apart, size, turn
+_POTATOES = (  # position before they are pushed apart, size, turn
     ((-0.50, -0.05), 0.62, 25.0),
     ((0.50, -0.15), 0.52, -50.0),
     ((0.12, 0.55), 0.66, 80.0),
     ((0.02, -0.70), 0.36, 10.0),
 )
 
-_PAIR = (((-0.15, 0.85), 0.75), ((0.0, -0.6), 0.6))  # place and size, behind and in front
+_PAIR = (((-0.15, 0.85), 0.75), ((0.0, -0.6), 0.6))  # position and size, behind and in front
 
 
-def mug(generator: torch.Generator) -> tuple[Body, ...]:
+def mug(generator: torch.Generator) -> tuple[SceneObject, ...]:
     """Throw a glazed mug with a handle and a bold pattern outside."""
     decor = random_speckle(
         generator,
@@ -93,7 +93,7 @@ def mug(generator: torch.Generator) -> tuple[Body, ...]:
     outside = CylinderRegion(radii=(_MUG_RADIUS - _MUG_WALL / 2, float("inf")))
     texture = Painted(ground=plain, paint=decor, where=outside)
     mesh = moved(mug_mesh(), rotation_deg=-25.0)
-    return (Body(mesh=mesh, texture=texture, specular=0.045, roughness=0.22),)
+    return (SceneObject(mesh=mesh, texture=texture, specular=0.045, roughness=0.22),)
 
 
 def mug_mesh(cell: float = 0.016) -> Mesh:
@@ -111,7 +111,7 @@ def mug_mesh(cell: float = 0.016) -> Mesh:
     )
 
 
-def jar(generator: torch.Generator) -> tuple[Body, ...]:
+def jar(generator: torch.Generator) -> tuple[SceneObject, ...]:
     """Turn a glazed jar with a lid, nearly of one colour, a pale label and few blemishes."""
     glaze = random_speckle(
         generator,
@@ -142,7 +142,7 @@ def jar(generator: torch.Generator) -> tuple[Body, ...]:
     )
     front = CylinderRegion(radii=(0.7, 1.0), heights=(0.62, 1.08), azimuths_deg=(-34.0, 34.0))
     texture = Marked(ground=Painted(ground=glaze, paint=label, where=front), marks=blemishes)
-    return (Body(mesh=jar_mesh(), texture=texture, specular=0.05, roughness=0.3),)
+    return (SceneObject(mesh=jar_mesh(), texture=texture, specular=0.05, roughness=0.3),)
 
 
 def jar_mesh(levels: int = 280, around: int = 224) -> Mesh:
@@ -163,10 +163,10 @@ def jar_mesh(levels: int = 280, around: int = 224) -> Mesh:
     return lathe(torch.cat([centre_of_foot, wall[:-1], top]), around)
 
 
-def balls(generator: torch.Generator) -> tuple[Body, ...]:
+def balls(generator: torch.Generator) -> tuple[SceneObject, ...]:
     """Pile up matte, textured balls that shadow one another."""
     vertices, faces = icosphere(6)
-    bodies = []
+    made = []
     for (center, radius), tint in zip(_BALLS, _BALL_TINTS, strict=True):
         texture = random_speckle(
             generator,
@@ -181,13 +181,13 @@ def balls(generator: torch.Generator) -> tuple[Body, ...]:
             faces=faces,
             normals_world=vertices,
         )
-        bodies.append(Body(mesh=moved(placed, shift=(-0.1, -0.4, 0.0)), texture=texture))
-    return tuple(bodies)
+        made.append(SceneObject(mesh=moved(placed, shift=(-0.1, -0.4, 0.0)), texture=texture))
+    return tuple(made)
 
 
-def potatoes(generator: torch.Generator) -> tuple[Body, ...]:
+def potatoes(generator: torch.Generator) -> tuple[SceneObject, ...]:
     """Heap matte, bumpy potatoes with weak texture and a few eyes."""
-    bodies: list[Body] = []
+    made: list[SceneObject] = []
     for (x, y), size, rotation_deg in _POTATOES:
         grown = potato(generator, bumps=0.009)
         skin = random_speckle(
@@ -209,12 +209,12 @@ def potatoes(generator: torch.Generator) -> tuple[Body, ...]:
             colour=0.0,
         )
         mesh = moved(grown, scale=size, rotation_deg=rotation_deg)
-        mesh = push_clear(mesh, [body.mesh for body in bodies], (x, y))
-        bodies.append(Body(mesh=mesh, texture=Marked(ground=skin, marks=eyes)))
-    return tuple(bodies)
+        mesh = push_clear(mesh, [one.mesh for one in made], (x, y))
+        made.append(SceneObject(mesh=mesh, texture=Marked(ground=skin, marks=eyes)))
+    return tuple(made)
 
 
-def pair(generator: torch.Generator) -> tuple[Body, ...]:
+def pair(generator: torch.Generator) -> tuple[SceneObject, ...]:
     """Stand two objects apart, one in front of the other, which it hides in part."""
     clay = random_speckle(
         generator,
@@ -229,12 +229,12 @@ def pair(generator: torch.Generator) -> tuple[Body, ...]:
     tall = moved(jar_mesh(), scale=back_size, shift=(*back, 0.0))
     low = moved(potato(generator), scale=front_size, rotation_deg=20.0, shift=(*front, 0.0))
     return (
-        Body(mesh=tall, texture=clay, specular=0.04, roughness=0.3),
-        Body(mesh=low, texture=skin),
+        SceneObject(mesh=tall, texture=clay, specular=0.04, roughness=0.3),
+        SceneObject(mesh=low, texture=skin),
     )
 
 
-def cloth(generator: torch.Generator, half_side: float = 4.0) -> Body:
+def cloth(generator: torch.Generator, half_side: float = 4.0) -> SceneObject:
     """Lay a matte cloth of modest texture on the table."""
     weave = random_speckle(
         generator,
@@ -245,10 +245,10 @@ def cloth(generator: torch.Generator, half_side: float = 4.0) -> Body:
         colour=0.15,
         tint=(0.86, 0.92, 1.0),
     )
-    return Body(mesh=table(half_side, cells=64), texture=weave, surroundings=True)
+    return SceneObject(mesh=table(half_side, cells=64), texture=weave, surroundings=True)
 
 
-def patterned_cloth(generator: torch.Generator, half_side: float = 4.0) -> Body:
+def patterned_cloth(generator: torch.Generator, half_side: float = 4.0) -> SceneObject:
     """Lay a matte cloth of strong contrast on the table, with features of every size."""
     print_ = random_speckle(
         generator,
@@ -257,10 +257,10 @@ def patterned_cloth(generator: torch.Generator, half_side: float = 4.0) -> Body:
         brightest=0.75,
         contrast=2.0,
     )
-    return Body(mesh=table(half_side, cells=64), texture=print_, surroundings=True)
+    return SceneObject(mesh=table(half_side, cells=64), texture=print_, surroundings=True)
 
 
-TABLES: dict[str, Callable[[torch.Generator], Body]] = {
+TABLES: dict[str, Callable[[torch.Generator], SceneObject]] = {
     "cloth": cloth,
     "patterned": patterned_cloth,
 }

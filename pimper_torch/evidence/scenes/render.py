@@ -1,7 +1,7 @@
 """Photographs computed from geometry, light and texture, with the truth beside them.
 
 :func:`render_shape` obeys first-order lighting exactly, so that what a stage gets wrong is
-the stage's own fault. :func:`render_bodies` does not: near light, cast and attached
+the stage's own fault. :func:`render_objects` does not: near light, cast and attached
 shadows, highlights, noise and saturation are what photographs have.
 """
 
@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.evidence.scenes.bodies import Body, Texture
 from pimper_torch.evidence.scenes.frame import render_frame
 from pimper_torch.evidence.scenes.interreflection import Interreflection
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.rendered import RenderedScene
+from pimper_torch.evidence.scenes.scene_object import SceneObject, Texture
 from pimper_torch.evidence.scenes.sensor import SensorConfig
 from pimper_torch.evidence.scenes.shapes import Shape
 from pimper_torch.evidence.scenes.stage import Stage
@@ -63,8 +63,8 @@ def render_shape(
     )
 
 
-def render_bodies(
-    bodies: Sequence[Body],
+def render_objects(
+    objects: Sequence[SceneObject],
     cameras: Cameras,
     lights: Lights,
     generator: torch.Generator,
@@ -74,19 +74,19 @@ def render_bodies(
 ) -> RenderedScene:
     """Ray trace meshes under point lights, all photographs in memory; float32.
 
-    Light falls off with the square of the distance and is stopped by every body; highlights
+    Light falls off with the square of the distance and is stopped by every object; highlights
     are those of :mod:`pimper_torch.evidence.scenes.shading`.
 
     Args:
-        bodies: Those that are no surroundings are the foreground.
+        objects: Those that are no surroundings are the foreground.
         cameras: Of one image size.
         lights: One a view.
         generator: Of the sensor's noise.
         sensor: ``None`` is the default one.
-        bounces: Of light between the bodies.
+        bounces: Of light between the objects.
     """
     sensor = SensorConfig() if sensor is None else sensor
-    stage = Stage(bodies)
+    stage = Stage(objects)
     between = Interreflection(stage, bounces) if bounces else None
     frames = [
         render_frame(stage, cameras, lights, view, generator, sensor, between)

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.evidence.scenes.bodies import Body
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.meshes import lathe, moved, table
 from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.scene_object import SceneObject
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.records import Mesh
 
@@ -45,9 +45,9 @@ def fixed_light(light_room: Lights, world_from_room: Float[Tensor, "view 4 4"]) 
         world_from_room: One a photograph.
     """
     count = len(world_from_room)
-    places = light_room.positions_world.expand(count, 3)
+    positions = light_room.positions_world.expand(count, 3)
     return Lights(
-        positions_world=transform(world_from_room, places[:, None])[:, 0],
+        positions_world=transform(world_from_room, positions[:, None])[:, 0],
         irradiance=light_room.irradiance.expand(count),
         ambient=light_room.ambient.expand(count),
         target_world=transform(world_from_room[0], light_room.target_world[None])[0],
@@ -55,16 +55,16 @@ def fixed_light(light_room: Lights, world_from_room: Float[Tensor, "view 4 4"]) 
     )
 
 
-def turntable(cloth: Body, radius: float) -> Body:
+def turntable(cloth: SceneObject, radius: float) -> SceneObject:
     """Cut a round plate from a cloth, its top in the plane ``z = 0``, about the z axis."""
     rings = radius * torch.linspace(0.995, 0, 24, dtype=torch.float64)
     top = torch.stack([rings, torch.zeros_like(rings)], dim=1)
     side = top.new_tensor([[0.0, -_THICKNESS], [radius, -_THICKNESS], [radius, -0.005 * radius]])
     mesh = lathe(torch.cat([side, top]))
-    return Body(mesh=mesh, texture=cloth.texture, surroundings=True)
+    return SceneObject(mesh=mesh, texture=cloth.texture, surroundings=True)
 
 
-def room(generator: torch.Generator) -> tuple[Body, ...]:
+def room(generator: torch.Generator) -> tuple[SceneObject, ...]:
     """Build a patterned floor below the turntable and a patterned wall behind it, both matte."""
     floor = moved(table(_HALF_SIDE, cells=64), shift=(0.0, 0.0, -_THICKNESS))
     upright = floor.vertices_world.new_tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -83,6 +83,6 @@ def room(generator: torch.Generator) -> tuple[Body, ...]:
         generator, cells=(1.1, 0.43, 0.17, 0.071), darkest=0.2, brightest=0.7, tint=(0.8, 0.9, 1.0)
     )
     return (
-        Body(mesh=floor, texture=boards, surroundings=True),
-        Body(mesh=wall, texture=paper, surroundings=True),
+        SceneObject(mesh=floor, texture=boards, surroundings=True),
+        SceneObject(mesh=wall, texture=paper, surroundings=True),
     )

@@ -1,4 +1,4 @@
-"""A whole scene, ready to be photographed: bodies, cameras and point lights."""
+"""A whole scene, ready to be photographed: objects, cameras and point lights."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,12 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.bodies import (
-    Body,
-    albedo_at_vertices,
-    normals_at_vertices,
-    transferred,
-)
 from pimper_torch.evidence.scenes.cameras import (
     UP,
     aim_to_fit,
@@ -33,6 +27,12 @@ from pimper_torch.evidence.scenes.meshes import join
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.objects import RECIPES, TABLES
 from pimper_torch.evidence.scenes.room import fixed_light, room, rotated_about, turntable
+from pimper_torch.evidence.scenes.scene_object import (
+    SceneObject,
+    albedo_at_vertices,
+    normals_at_vertices,
+    transferred,
+)
 from pimper_torch.evidence.scenes.textures import Uniform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.io.meshes import read_mesh
@@ -51,27 +51,27 @@ class Scene:
     Attributes:
         name: Of the object, or the path of its mesh.
         config: How it is photographed.
-        bodies: At rest in the world: the object's first, then its table, if that turns along.
+        objects: At rest in the world: the object's first, then its table, if that turns along.
         cameras: One a photograph; float64.
         lights: One a photograph.
-        fixed: Bodies that are at rest before the camera while the object turns, in the frame of
+        fixed: Objects that are at rest before the camera while the object turns, in the frame of
             :mod:`pimper_torch.evidence.scenes.room`.
         world_from_room: Where that frame is in each photograph.
     """
 
     name: str
     config: SceneConfig
-    bodies: tuple[Body, ...]
+    objects: tuple[SceneObject, ...]
     cameras: Cameras
     lights: Lights
-    fixed: tuple[Body, ...]
+    fixed: tuple[SceneObject, ...]
     world_from_room: Float[Tensor, "view 4 4"]
 
-    def bodies_in(self, view: int) -> tuple[Body, ...]:
-        """Give all bodies where one photograph has them."""
+    def objects_in(self, view: int) -> tuple[SceneObject, ...]:
+        """Give all objects where one photograph has them."""
         return (
-            *self.bodies,
-            *(transferred(body, self.world_from_room[view]) for body in self.fixed),
+            *self.objects,
+            *(transferred(item, self.world_from_room[view]) for item in self.fixed),
         )
 
     @property
@@ -82,12 +82,12 @@ class Scene:
     @property
     def object_mesh(self) -> Mesh:
         """The object alone, with albedo and normals at the vertices."""
-        return _dressed([body for body in self.bodies if not body.surroundings])
+        return _dressed([item for item in self.objects if not item.surroundings])
 
     @property
     def surroundings_mesh(self) -> Mesh | None:
         """The table, if it turns with the object."""
-        around = [body for body in self.bodies if body.surroundings]
+        around = [item for item in self.objects if item.surroundings]
         return _dressed(around) if around else None
 
     def noise(self, view: int) -> torch.Generator:
@@ -115,9 +115,9 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     """
     generator = torch.Generator().manual_seed(config.seed)
     recipe = RECIPES.get(str(name_or_path))
-    bodies = recipe(generator) if recipe else (_read_body(name_or_path, config, generator),)
-    bodies = tuple(_finished(body, config) for body in bodies)
-    points = join(*(body.mesh for body in bodies)).vertices_world
+    objects = recipe(generator) if recipe else (_read_object(name_or_path, config, generator),)
+    objects = tuple(_finished(item, config) for item in objects)
+    points = join(*(item.mesh for item in objects)).vertices_world
     lowest, highest = points.amin(dim=0), points.amax(dim=0)
     toward = _toward(config, generator)
     focal_px = _FOCAL * config.width
@@ -140,7 +140,7 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     return Scene(
         name=str(name_or_path),
         config=config,
-        bodies=(*bodies, *turning),
+        objects=(*objects, *turning),
         cameras=pinholes(poses, focal_px, config.width, config.height),
         lights=lights.replace(environments=environments),
         fixed=fixed,
@@ -189,7 +189,7 @@ def _environments(
 
 def _surroundings(
     config: SceneConfig, generator: torch.Generator, axis: Float[Tensor, " 3"], radius: float
-) -> tuple[tuple[Body, ...], tuple[Body, ...]]:
+) -> tuple[tuple[SceneObject, ...], tuple[SceneObject, ...]]:
     """Give what turns with the object, in the world, and what is fixed, in the room."""
     table = TABLES[config.table](generator)
     if not (config.fixed_room or config.fixed_table):
@@ -214,24 +214,24 @@ def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "v
     )
 
 
-def _finished(body: Body, config: SceneConfig) -> Body:
-    specular = body.specular if config.specular is None else config.specular
-    roughness = body.roughness if config.roughness is None else config.roughness
+def _finished(item: SceneObject, config: SceneConfig) -> SceneObject:
+    specular = item.specular if config.specular is None else config.specular
+    roughness = item.roughness if config.roughness is None else config.roughness
     conductor = CONDUCTORS.get(config.conductor)
     albedo = (0.0, 0.0, 0.0) if conductor else config.albedo
-    made = Body(
-        mesh=body.mesh,
-        texture=body.texture if albedo is None else Uniform(albedo=albedo),
+    made = SceneObject(
+        mesh=item.mesh,
+        texture=item.texture if albedo is None else Uniform(albedo=albedo),
         specular=specular,
         roughness=roughness,
         conductor=conductor,
     )
-    origin = body.mesh.vertices_world.new_zeros(3)
+    origin = item.mesh.vertices_world.new_zeros(3)
     rotation = torch.deg2rad(origin.new_tensor([config.rotation_deg]))
     return transferred(made, rotated_about(origin, rotation)[0]) if config.rotation_deg else made
 
 
-def _read_body(path: str | Path, config: SceneConfig, generator: torch.Generator) -> Body:
+def _read_object(path: str | Path, config: SceneConfig, generator: torch.Generator) -> SceneObject:
     if not Path(path).exists() and isinstance(path, str) and Path(path).suffix == "":
         raise InputError(
             f"there is no scene {path!r} and no such file. Scenes: {', '.join(RECIPES)}; or give "
@@ -242,8 +242,8 @@ def _read_body(path: str | Path, config: SceneConfig, generator: torch.Generator
         raise InputError(f"{path}: holds points without faces; needed: a triangle mesh.")
     mesh = _placed(mesh, config.up, path)
     if mesh.albedo is not None:
-        return Body(mesh=mesh, roughness=0.3)
-    return Body(mesh=mesh, texture=random_speckle(generator, contrast=1.5), roughness=0.3)
+        return SceneObject(mesh=mesh, roughness=0.3)
+    return SceneObject(mesh=mesh, texture=random_speckle(generator, contrast=1.5), roughness=0.3)
 
 
 def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
@@ -254,18 +254,18 @@ def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
     lowest, highest = vertices.amin(dim=0), vertices.amax(dim=0)
     longest = float((highest - lowest).amax())
     if longest <= 0 or not math.isfinite(longest):
-        raise InputError(f"{path}: all its vertices are in one place; needed: a surface.")
+        raise InputError(f"{path}: all its vertices are at one point; needed: a surface.")
     foot = torch.stack([*((lowest + highest) / 2)[:2], lowest[2]])
     vertices = (vertices - foot) * (OBJECT_SIZE / longest)
     # OBJ knows normals of corners; read one a vertex, those of flat faces contradict the shape.
     # Averaged from the faces instead, over vertices that a seam of the texture doubles, too.
-    places, own = torch.unique(vertices, dim=0, return_inverse=True)
-    normals = vertex_normals(places, own[mesh.faces])[own]
+    positions, own = torch.unique(vertices, dim=0, return_inverse=True)
+    normals = vertex_normals(positions, own[mesh.faces])[own]
     return mesh.replace(vertices_world=vertices, normals_world=normals)
 
 
-def _dressed(bodies: list[Body]) -> Mesh:
-    return join(*(body.mesh for body in bodies)).replace(
-        normals_world=torch.cat([normals_at_vertices(body) for body in bodies]),
-        albedo=torch.cat([albedo_at_vertices(body) for body in bodies]),
+def _dressed(objects: list[SceneObject]) -> Mesh:
+    return join(*(item.mesh for item in objects)).replace(
+        normals_world=torch.cat([normals_at_vertices(item) for item in objects]),
+        albedo=torch.cat([albedo_at_vertices(item) for item in objects]),
     )

@@ -38,7 +38,7 @@ def sparse_scene(
         outlier_fraction: Fraction of the points that are moved along their first ray by up to
             half their depth, keeping their short, wrong tracks.
         in_views: Pick points in the maps of these views; ``None`` is all of them, so that
-            some points lie on sides that the centre view does not see.
+            some points lie on sides that the middle view does not see.
         dtype: Of photographs, cameras and points; the default is what structure from
             motion gives.
     """

@@ -1,4 +1,4 @@
-"""Bodies, ready to be looked at and lit: every ray is cast here."""
+"""Objects, ready to be looked at and lit: every ray is cast here."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,9 +8,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.bodies import Body, albedo_at_vertices, normals_at_vertices
 from pimper_torch.evidence.scenes.lights import PointLight
 from pimper_torch.evidence.scenes.meshes import join
+from pimper_torch.evidence.scenes.scene_object import (
+    SceneObject,
+    albedo_at_vertices,
+    normals_at_vertices,
+)
 from pimper_torch.evidence.scenes.shading import reflect
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import Record
@@ -23,21 +27,21 @@ _MIRRORS = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Spots(Record):
-    """What rays meet; depth is infinite, normal and albedo zero, body -1 for a miss.
+    """What rays meet; depth is infinite, normal and albedo zero, index -1 for a miss.
 
     Attributes:
-        hits: Faces and places in them.
+        hits: Faces and positions in them.
         points: World.
         normals: Unit, interpolated over the face.
         albedo: Linear.
-        body: Number of the body.
+        object_index: Of the object.
     """
 
     hits: Hits
     points: Float[Tensor, "ray 3"]
     normals: Float[Tensor, "ray 3"]
     albedo: Float[Tensor, "ray channel"]
-    body: Int[Tensor, " ray"]
+    object_index: Int[Tensor, " ray"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -56,26 +60,26 @@ class Shaded(Record):
 
 
 class Stage:
-    """Bodies in one ray caster; float32.
+    """Objects in one ray caster; float32.
 
     Args:
-        bodies: Their faces, in this order, are those of ``mesh``.
+        objects: Their faces, in this order, are those of ``mesh``.
     """
 
-    def __init__(self, bodies: Sequence[Body]) -> None:
-        self.bodies = tuple(bodies)
-        self.mesh = join(*(body.mesh for body in bodies))
+    def __init__(self, objects: Sequence[SceneObject]) -> None:
+        self.objects = tuple(objects)
+        self.mesh = join(*(one.mesh for one in objects))
         vertices = self.mesh.vertices_world
         self._caster = RayCaster(vertices, self.mesh.faces)
-        self._normals = torch.cat([normals_at_vertices(body) for body in bodies])
-        counts = torch.tensor([len(body.mesh.faces) for body in bodies])
+        self._normals = torch.cat([normals_at_vertices(one) for one in objects])
+        counts = torch.tensor([len(one.mesh.faces) for one in objects])
         self._ends = torch.cumsum(counts, dim=0)
         self._starts = self._ends - counts
         # A conductor's fraction of mirrored light is Fresnel's own; 1 leaves the lobe alone.
-        self._specular = torch.tensor([1.0 if body.conductor else body.specular for body in bodies])
-        self._metal = torch.tensor([body.conductor is not None for body in bodies])
-        self._roughness = torch.tensor([body.roughness for body in bodies])
-        self.outside = torch.tensor([body.surroundings for body in bodies])
+        self._specular = torch.tensor([1.0 if one.conductor else one.specular for one in objects])
+        self._metal = torch.tensor([one.conductor is not None for one in objects])
+        self._roughness = torch.tensor([one.roughness for one in objects])
+        self.outside = torch.tensor([one.surroundings for one in objects])
         extent = vertices.amax(dim=0) - vertices.amin(dim=0)
         self.clearance = _CLEARANCE * float(extent.norm())
 
@@ -84,17 +88,17 @@ class Stage:
         return self._caster.cast(origins, along)
 
     def trace(self, eye: Float[Tensor, "*origin 3"], rays: Float[Tensor, "ray 3"]) -> Spots:
-        """Look along rays from one place, or from one each, and see what is there."""
+        """Look along rays from one position, or from one each, and see what is there."""
         hits = self._caster.cast(eye, rays)
         hit = hits.face >= 0
         points = eye + torch.where(hit, hits.distance, 1)[:, None] * rays
-        body = torch.where(hit, torch.bucketize(hits.face, self._ends, right=True), -1)
+        object_index = torch.where(hit, torch.bucketize(hits.face, self._ends, right=True), -1)
         return Spots(
             hits=hits,
             points=points,
             normals=normalize(hits.interpolate(self._normals, self.mesh.faces), dim=-1),
-            albedo=self._albedo(hits, points, body),
-            body=body,
+            albedo=self._albedo(hits, points, object_index),
+            object_index=object_index,
         )
 
     def lit(
@@ -103,7 +107,7 @@ class Stage:
         normals: Float[Tensor, "ray 3"],
         position: Float[Tensor, " 3"],
     ) -> Bool[Tensor, " ray"]:
-        """Tell where a point light is above a surface's horizon and no body is in between."""
+        """Tell where a point light is above a surface's horizon and no object is in between."""
         start = points + self.clearance * normals
         toward = position - start
         (facing,) = torch.nonzero((normals * toward).sum(dim=-1) > 0, as_tuple=True)
@@ -133,34 +137,39 @@ class Stage:
                 none of them.
             bounces: Of conductors that mirror one another.
         """
-        specular, roughness = self._specular[spots.body], self._roughness[spots.body]
+        specular, roughness = (
+            self._specular[spots.object_index],
+            self._roughness[spots.object_index],
+        )
         to_eye = normalize(eye - spots.points, dim=-1)
         lit = self.lit(spots.points, spots.normals, point_light.position)
-        place_of_flash = eye if flash is None else flash
-        flashed = spots.body >= 0
+        flash_position = eye if flash is None else flash
+        flashed = spots.object_index >= 0
         if flash is not None and point_light.flash > 0:
             flashed = self.lit(spots.points, spots.normals, flash)
         received = torch.full_like(specular, point_light.ambient)
         mirrored = torch.zeros_like(spots.points)
-        for place, irradiance, reached in (
+        for position, irradiance, reached in (
             (point_light.position, point_light.irradiance, lit),
-            (place_of_flash, point_light.flash, flashed),
+            (flash_position, point_light.flash, flashed),
         ):
             if irradiance == 0:
                 continue
-            toward, arriving = point_light.arriving(spots.points, place, irradiance)
+            toward, arriving = point_light.arriving(spots.points, position, irradiance)
             matte, lobe = reflect(spots.normals, toward, to_eye, specular, roughness)
             half = normalize(toward + to_eye, dim=-1)
-            tint = self._tint(spots.body, (half * toward).sum(dim=-1))
+            tint = self._tint(spots.object_index, (half * toward).sum(dim=-1))
             received = received + torch.where(reached, arriving * matte, 0)
             mirrored = mirrored + torch.where(reached, arriving * lobe, 0)[:, None] * tint
         total = received[:, None]
         if indirect is not None:
             total = total + spots.hits.interpolate(indirect, self.mesh.faces)
-        (metal,) = torch.nonzero(self._metal[spots.body] & (spots.body >= 0), as_tuple=True)
+        (metal,) = torch.nonzero(
+            self._metal[spots.object_index] & (spots.object_index >= 0), as_tuple=True
+        )
         if len(metal) and bounces > 0:
             seen = self._mirrored(
-                spots, metal, to_eye[metal], point_light, indirect, place_of_flash, bounces - 1
+                spots, metal, to_eye[metal], point_light, indirect, flash_position, bounces - 1
             )
             mirrored = mirrored.index_add(0, metal, seen)
         return Shaded(matte=spots.albedo * total, mirrored=mirrored, lit=lit)
@@ -175,31 +184,31 @@ class Stage:
         flash: Float[Tensor, " 3"],
         bounces: int,
     ) -> Float[Tensor, "metal channel"]:
-        """Give what smooth conductors show of other bodies and of the environment."""
+        """Give what smooth conductors show of other objects and of the environment."""
         normals = spots.normals[metal]
         cosine = (normals * to_eye).sum(dim=-1, keepdim=True)
         along = normalize(2 * cosine * normals - to_eye, dim=-1)
         start = spots.points[metal] + self.clearance * normals
         there = self.trace(start, along)
         shaded = self.shade(there, start, point_light, indirect, flash=flash, bounces=bounces)
-        hit = (there.body >= 0)[:, None]
+        hit = (there.object_index >= 0)[:, None]
         radiance = torch.where(hit, shaded.matte + shaded.mirrored, point_light.surroundings(along))
-        return self._tint(spots.body[metal], cosine[:, 0]) * radiance
+        return self._tint(spots.object_index[metal], cosine[:, 0]) * radiance
 
     def _tint(
-        self, body: Int[Tensor, " ray"], cosine: Float[Tensor, " ray"]
+        self, object_index: Int[Tensor, " ray"], cosine: Float[Tensor, " ray"]
     ) -> Float[Tensor, "ray 3"]:
         """Give Fresnel's factor of conductors, 1 of all others."""
         tint = cosine.new_ones(len(cosine), 3)
-        for index, one in enumerate(self.bodies):
+        for index, one in enumerate(self.objects):
             if one.conductor is not None:
-                own = (body == index)[:, None]
+                own = (object_index == index)[:, None]
                 tint = torch.where(own, one.conductor.reflectance(cosine), tint)
         return tint
 
     def vertex_albedo(self) -> Float[Tensor, "vertex channel"]:
-        """Evaluate every body's texture at its vertices."""
-        return torch.cat([albedo_at_vertices(body) for body in self.bodies])
+        """Evaluate every object's texture at its vertices."""
+        return torch.cat([albedo_at_vertices(one) for one in self.objects])
 
     @property
     def vertex_normals(self) -> Float[Tensor, "vertex 3"]:
@@ -207,11 +216,11 @@ class Stage:
         return self._normals
 
     def _albedo(
-        self, hits: Hits, points: Float[Tensor, "ray 3"], body: Int[Tensor, " ray"]
+        self, hits: Hits, points: Float[Tensor, "ray 3"], object_index: Int[Tensor, " ray"]
     ) -> Float[Tensor, "ray channel"]:
         albedo = points.new_zeros(len(points), 3)
-        for index, one in enumerate(self.bodies):
-            (own,) = torch.nonzero(body == index, as_tuple=True)
+        for index, one in enumerate(self.objects):
+            (own,) = torch.nonzero(object_index == index, as_tuple=True)
             if len(own) == 0:
                 continue
             if one.texture is not None:

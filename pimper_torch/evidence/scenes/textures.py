@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.evidence.scenes.bodies import Texture
+from pimper_torch.evidence.scenes.scene_object import Texture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -149,7 +149,7 @@ class _Studio:
 
 
 def _stage_in(scene: Scene, view: int) -> tuple[Stage, Interreflection | None]:
-    stage = Stage(scene.bodies_in(view))
+    stage = Stage(scene.objects_in(view))
     bounces, seed = scene.config.bounces, scene.config.seed
     return stage, Interreflection(stage, bounces, seed=seed) if bounces else None
 

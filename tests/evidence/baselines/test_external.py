@@ -25,18 +25,18 @@ def script(path: Path, body: str) -> Path:
     return path
 
 
-def test_a_missing_program_is_named_with_the_place_to_get_it():
+def test_a_missing_program_is_named_with_the_position_to_get_it():
     with pytest.raises(MissingProgramError, match=r"tool is not installed.*https://tool.example"):
         TOOL.find()
 
 
-def test_what_is_given_goes_before_the_variable_before_the_path_before_usual_places(
+def test_what_is_given_goes_before_the_variable_before_the_path_before_usual_positions(
     monkeypatch, tmp_path
 ):
     for name in ("usual", "named", "given"):
         (tmp_path / name).mkdir()
     tool = Program(
-        name="tool", variable="PIMPER_TOOL", source="a shop", places=(tmp_path / "usual",)
+        name="tool", variable="PIMPER_TOOL", source="a shop", folders=(tmp_path / "usual",)
     )
     usual = script(tmp_path / "usual" / "tool", "")
     assert tool.find() == usual

@@ -55,7 +55,7 @@ def _no_openmvs(monkeypatch, tmp_path):
     (tmp_path / "bin").mkdir()
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("PIMPER_OPENMVS", raising=False)
-    assert all(place.is_absolute() for place in openmvs.INTERFACE.places)
+    assert all(folder.is_absolute() for folder in openmvs.INTERFACE.folders)
 
 
 @pytest.fixture

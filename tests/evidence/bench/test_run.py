@@ -19,7 +19,7 @@ from pimper_torch.evidence.bench.rows import read_json
 from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
 from pimper_torch.evidence.metrics import TrueSurface
 from pimper_torch.evidence.metrics.in_view import meet_truth
-from pimper_torch.evidence.scenes import Body, render_bodies, sparse_scene
+from pimper_torch.evidence.scenes import SceneObject, render_objects, sparse_scene
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.meshes import icosphere
@@ -40,7 +40,7 @@ def ball():
     cameras = arc_cameras(5, width=60, height=45, focal_px=80.0, distance=4.0)
     lights = wandering_lights(5, generator, distance=5.0)
     texture = random_speckle(generator, cells=(0.3,))
-    scene = render_bodies([Body(mesh=mesh, texture=texture)], cameras, lights, generator)
+    scene = render_objects([SceneObject(mesh=mesh, texture=texture)], cameras, lights, generator)
     numbers = torch.arange(5)
     capture = Capture(
         views=scene.views,

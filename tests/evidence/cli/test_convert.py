@@ -51,7 +51,7 @@ def test_a_set_goes_to_every_layout_and_comes_back_the_same(data, tmp_path, caps
     assert_close(after.cameras.intrinsics, before.cameras.intrinsics)
     assert_close(after.cameras.cam_from_world, before.cameras.cam_from_world)
     printed = capsys.readouterr().out
-    assert "3 photographs of 12 x 9 from 3 places" in printed
+    assert "3 photographs of 12 x 9 from 3 positions" in printed
     assert f"as {target}" in printed
 
 
@@ -149,7 +149,7 @@ def test_every_layout_that_is_offered_has_a_reader():
     assert set(readers()) == set(get_args(Source))
 
 
-def test_one_light_a_place_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
+def test_one_light_a_position_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
     photographs = tmp_path / "Rectified" / "scan9"
     calibration = tmp_path / "Calibration" / "cal18"
     photographs.mkdir(parents=True)
@@ -162,7 +162,7 @@ def test_one_light_a_place_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
         np.savetxt(calibration / f"pos_{place:03d}.txt", matrix)
     arguments = ["convert", str(tmp_path), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]
     assert main([*arguments, "--scan", "9", "--light-seed", "0", "--target", "colmap"]) == 0
-    assert "3 photographs of 16 x 12 from 3 places, under 2 lights" in capsys.readouterr().out
+    assert "3 photographs of 16 x 12 from 3 positions, under 2 lights" in capsys.readouterr().out
     assert read_colmap(tmp_path / "out").views.num_views == 3
 
 

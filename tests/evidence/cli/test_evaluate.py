@@ -69,7 +69,7 @@ def test_the_true_mesh_of_a_rendered_scene_has_no_error(rendering, capsys):
     assert "f_score at 2 %" in told
     assert "along the rays of view_001.png" in told  # the centre one
     assert "100.0 %" in told
-    assert "seen from 3 places" in told
+    assert "seen from 3 positions" in told
 
 
 def test_expected_against_true_error_is_drawn(ball, tmp_path, capsys):
@@ -126,7 +126,7 @@ def test_a_result_is_judged_by_the_protocol_of_dtu(dtu, tmp_path, capsys):
     assert "--scan" in capsys.readouterr().err
 
 
-def test_views_of_a_set_are_paired_by_place_whatever_their_light():
+def test_views_of_a_set_are_paired_by_position_whatever_their_light():
     names = ("rect_001_0_r5000.png", "rect_002_0_r5000.png", "rect_003_0_r5000.png")
     count = torch.arange(3)
     capture = Capture(

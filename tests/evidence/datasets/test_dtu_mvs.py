@@ -68,7 +68,7 @@ def check_cameras(capture, rig):
     assert_close(capture.cameras.intrinsics, scaled.float(), atol=1e-5, rtol=1e-5)
 
 
-def test_photographs_come_with_the_cameras_of_their_places_and_the_scan(folder, rig):
+def test_photographs_come_with_the_cameras_of_their_positions_and_the_scan(folder, rig):
     capture = read_dtu_mvs(folder, 9)
     assert capture.position.tolist() == [1, 1, 2, 2, 3, 3]
     assert capture.light.tolist() == [0, 3] * 3  # `max` is no light of its own
@@ -89,7 +89,7 @@ def test_the_brightest_of_all_lights_is_read_when_asked_for(folder):
     assert capture.views.names == tuple(f"rect_{place:03d}_max.png" for place in (1, 2, 3))
 
 
-def test_one_light_a_place(folder):
+def test_one_light_a_position(folder):
     capture = read_dtu_mvs(folder, 9, light_seed=0, positions=(1, 3))
     assert capture.position.tolist() == [1, 3]
     assert capture.light[0] != capture.light[1]

@@ -30,7 +30,7 @@ def folder(tmp_path, save_calibration, paint):
     return tmp_path
 
 
-def test_all_photographs_come_with_place_point_light_camera_and_scan(folder, rig):
+def test_all_photographs_come_with_position_point_light_camera_and_scan(folder, rig):
     capture = read_dtu_points(folder, 4)
     assert capture.position.tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     assert capture.light.tolist() == [1, 2, 19] * 3

@@ -52,7 +52,7 @@ def test_a_position_with_a_single_light_takes_it_though_its_neighbour_has_it_too
 
 def test_subsets_are_kept_in_order_of_position_and_light():
     position, light = [2, 1, 2, 1, 3], [0, 1, 1, 0, 0]
-    asked = {"place": Path("set"), "kind": "a set", "light_seed": None}
+    asked = {"path": Path("set"), "kind": "a set", "light_seed": None}
     assert choose_photographs(position, light, positions=None, lights=None, **asked) == [
         3, 1, 0, 2, 4,
     ]  # fmt: skip
@@ -68,7 +68,7 @@ def test_lights_that_were_left_out_are_not_sampled_either():
         positions=range(3, 9),
         lights=(2, 5),
         light_seed=3,
-        place=Path("set"),
+        path=Path("set"),
         kind="a set",
     )
     assert position[chosen].tolist() == list(range(3, 9))
@@ -80,6 +80,4 @@ def test_lights_that_were_left_out_are_not_sampled_either():
 )
 def test_a_position_or_light_that_is_not_there_is_refused(asked):
     with pytest.raises(InputError, match=r"set: not the layout of a set.*(positions 4|lights 9)"):
-        choose_photographs(
-            [1, 2], [0, 1], **asked, light_seed=None, place=Path("set"), kind="a set"
-        )
+        choose_photographs([1, 2], [0, 1], **asked, light_seed=None, path=Path("set"), kind="a set")

@@ -111,7 +111,7 @@ def test_completeness_of_the_seen_part_ignores_the_back(make):
     assert found.seen_fraction == pytest.approx(0.4, abs=0.01)
 
 
-def test_views_from_one_place_count_once(make):
+def test_views_from_one_position_count_once(make):
     cameras = make.cameras(count=4, span_deg=1.0)
     sphere = make.sphere(level=3)
     apart = make.capture_of(sphere, cameras=cameras)

@@ -69,7 +69,7 @@ def test_without_trimming_the_outliers_pull(generator, make):
     assert error_of(found.truth_from_world, known)[0] > 1e-2
 
 
-def test_half_an_estimate_with_outliers_finds_its_place(generator, make):
+def test_half_an_estimate_with_outliers_finds_its_position(generator, make):
     truth = make.potato(level=3)
     centre = truth.vertices_world[truth.faces].mean(dim=1)
     half = truth.replace(faces=truth.faces[centre[:, 2] > 0])

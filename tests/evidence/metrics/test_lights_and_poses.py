@@ -90,23 +90,23 @@ def test_cameras_in_another_frame_and_half_the_size_are_right_after_alignment(ma
     assert found.mean_center_percent != found.mean_center_percent  # nobody told the centre
 
 
-def test_places_are_off_by_the_similarity_and_bend_only_where_cameras_differ(make, generator):
+def test_positions_are_off_by_the_similarity_and_bend_only_where_cameras_differ(make, generator):
     truth = make.cameras()
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64) - 0.5
     shift = torch.eye(4).double()
     shift[0, 3] = 0.02
     found = compare_cameras(truth, truth, shift, views=5, diagonal=2.0, points_true=points)
-    assert found.mean_place_percent == pytest.approx(1.0)
+    assert found.mean_position_percent == pytest.approx(1.0)
     assert found.mean_bend_percent < 1e-9
     longer = truth.replace(
         intrinsics=truth.intrinsics * truth.intrinsics.new_tensor([1.05, 1.05, 1])[:, None]
     )
     found = compare_cameras(longer, truth, IDENTITY, views=5, diagonal=2.0, points_true=points)
     assert found.mean_bend_percent > 0.01
-    assert found.mean_place_percent > found.mean_bend_percent
+    assert found.mean_position_percent > found.mean_bend_percent
 
 
-def test_places_of_resized_photographs_are_compared_in_their_own_pixels(make, generator):
+def test_positions_of_resized_photographs_are_compared_in_their_own_pixels(make, generator):
     truth = make.cameras()
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64) - 0.5
     half = truth.replace(
@@ -114,9 +114,9 @@ def test_places_of_resized_photographs_are_compared_in_their_own_pixels(make, ge
         sizes_px=truth.sizes_px // 2,
     )
     found = compare_cameras(half, truth, IDENTITY, views=5, diagonal=2.0, points_true=points)
-    assert found.mean_place_percent < 1e-9
+    assert found.mean_position_percent < 1e-9
 
 
-def test_nobody_knows_places_without_an_object(make):
+def test_nobody_knows_positions_without_an_object(make):
     found = compare_cameras(make.cameras(), make.cameras(), IDENTITY, views=5)
-    assert found.mean_place_percent != found.mean_place_percent
+    assert found.mean_position_percent != found.mean_position_percent

@@ -78,7 +78,7 @@ def test_cameras_in_a_row_leave_no_rotation_open(generator):
     assert_close(found @ known, torch.eye(4, dtype=torch.float64), atol=1e-10, rtol=0)
 
 
-def test_cameras_in_one_place_do_not_tell_the_scale():
+def test_cameras_in_one_position_do_not_tell_the_scale():
     arc = arc_cameras(2, width=64, height=48, focal_px=70.0, distance=4.0)
     same = arc.replace(cam_from_world=arc.cam_from_world[[0, 0]])
     with pytest.raises(InputError, match="scale"):

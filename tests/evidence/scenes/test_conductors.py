@@ -3,11 +3,11 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.bodies import Body
 from pimper_torch.evidence.scenes.conductors import CONDUCTORS, Conductor
 from pimper_torch.evidence.scenes.environment import random_environment
 from pimper_torch.evidence.scenes.lights import PointLight
 from pimper_torch.evidence.scenes.meshes import icosphere, moved, table
+from pimper_torch.evidence.scenes.scene_object import SceneObject
 from pimper_torch.evidence.scenes.stage import Stage
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.records import Mesh
@@ -68,14 +68,14 @@ def test_a_flat_mirror_shows_what_is_above_it(generator):
     ceiling = moved(table(20.0), shift=(0.0, 0.0, 3.0))
     metal = CONDUCTORS["copper"]
     black = torch.zeros_like
-    floor = Body(mesh=table(4.0), texture=black, conductor=metal)
-    stage = Stage([floor, Body(mesh=ceiling, texture=pattern, surroundings=True)])
+    floor = SceneObject(mesh=table(4.0), texture=black, conductor=metal)
+    stage = Stage([floor, SceneObject(mesh=ceiling, texture=pattern, surroundings=True)])
     eye = torch.tensor([0.3, -0.2, 1.0])
     down = torch.randn(200, 3, generator=generator)
     down[:, 2] = -1.5
     rays = normalize(down, dim=-1)
     spots, seen = radiance(stage, eye, rays, point_light())
-    assert (spots.body == 0).all()
+    assert (spots.object_index == 0).all()
     rise = 3 - stage.clearance  # the reflected ray starts clear of the mirror
     at_ceiling = spots.points + rays * rays.new_tensor([1.0, 1, -1]) * (rise / -rays[:, 2:])
     expected = metal.reflectance(-rays[:, 2]) * pattern(at_ceiling)
@@ -85,13 +85,13 @@ def test_a_flat_mirror_shows_what_is_above_it(generator):
 def test_a_mirroring_sphere_shows_the_environment_by_the_reflected_ray(generator):
     vertices, faces = icosphere(6)
     mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertices)
-    stage = Stage([Body(mesh=mesh, texture=torch.zeros_like, conductor=CONDUCTORS["gold"])])
+    stage = Stage([SceneObject(mesh=mesh, texture=torch.zeros_like, conductor=CONDUCTORS["gold"])])
     picture = random_environment(generator)
     eye = torch.tensor([0.0, -4.0, 1.0])
     toward = 0.9 * even_directions(4000).float()
     rays = normalize(toward - eye, dim=-1)
     spots, seen = radiance(stage, eye, rays, point_light(ambient=0.3, environment=picture))
-    met = spots.body >= 0
+    met = spots.object_index >= 0
     normals = spots.normals[met]
     out = mirrored_about(rays[met], normals)
     fraction = CONDUCTORS["gold"].reflectance(-(rays[met] * normals).sum(dim=-1))
@@ -100,10 +100,12 @@ def test_a_mirroring_sphere_shows_the_environment_by_the_reflected_ray(generator
 
 
 def test_mirrors_face_to_face_end():
-    up = Body(mesh=table(4.0), texture=torch.zeros_like, conductor=CONDUCTORS["silver"])
+    up = SceneObject(mesh=table(4.0), texture=torch.zeros_like, conductor=CONDUCTORS["silver"])
     above = moved(table(4.0), shift=(0.0, 0.0, 2.0))
     down = above.replace(faces=above.faces.flip(1), normals_world=-above.normals_world)
-    stage = Stage([up, Body(mesh=down, texture=torch.zeros_like, conductor=CONDUCTORS["silver"])])
+    stage = Stage(
+        [up, SceneObject(mesh=down, texture=torch.zeros_like, conductor=CONDUCTORS["silver"])]
+    )
     eye = torch.tensor([0.0, 0.0, 1.0])
     rays = normalize(torch.tensor([[0.0, 0.1, -1.0]]), dim=-1)
     _, seen = radiance(stage, eye, rays, point_light())
@@ -112,10 +114,10 @@ def test_mirrors_face_to_face_end():
 
 def test_a_point_light_on_metal_has_the_metals_colour():
     def highlight(**material):
-        body = Body(mesh=table(4.0), texture=torch.zeros_like, roughness=0.3, **material)
+        item = SceneObject(mesh=table(4.0), texture=torch.zeros_like, roughness=0.3, **material)
         eye = torch.tensor([0.0, 0.0, 3.0])
         down = torch.tensor([[0.0, 0.0, -1.0]])
-        return radiance(Stage([body]), eye, down, point_light(irradiance=1.0, ambient=0.0))[1][0]
+        return radiance(Stage([item]), eye, down, point_light(irradiance=1.0, ambient=0.0))[1][0]
 
     copper = highlight(conductor=CONDUCTORS["copper"])
     full = highlight(specular=1.0)

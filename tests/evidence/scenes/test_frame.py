@@ -2,31 +2,31 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.bodies import Body
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.frame import render_frame
 from pimper_torch.evidence.scenes.interreflection import Interreflection
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.meshes import moved, potato, table
 from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.scene_object import SceneObject
 from pimper_torch.evidence.scenes.sensor import SensorConfig
 from pimper_torch.evidence.scenes.stage import Stage
 
 
 @pytest.fixture(scope="module")
-def bodies():
+def objects():
     generator = torch.Generator().manual_seed(81)
     mesh = moved(potato(generator, subdivisions=4), scale=0.6)
     texture = random_speckle(generator, cells=(0.3, 0.1))
     return (
-        Body(mesh=mesh, texture=texture, specular=0.05, roughness=0.3),
-        Body(mesh=table(2.0, cells=8), texture=texture, surroundings=True),
+        SceneObject(mesh=mesh, texture=texture, specular=0.05, roughness=0.3),
+        SceneObject(mesh=table(2.0, cells=8), texture=texture, surroundings=True),
     )
 
 
 @pytest.fixture(scope="module")
-def stage(bodies):
-    return Stage(bodies)
+def stage(objects):
+    return Stage(objects)
 
 
 def shot(stage, sensor, seed=0, between=None, **changes):
@@ -67,9 +67,9 @@ def test_exposure_multiplies_radiance_before_it_saturates(stage):
     assert (thrice == 1).any()
 
 
-def test_the_highlight_is_marked_where_gloss_makes_it(stage, bodies):
+def test_the_highlight_is_marked_where_gloss_makes_it(stage, objects):
     glossy = shot(stage, sensor(supersample=1))
-    matte = [Body(mesh=body.mesh, texture=body.texture) for body in bodies]
+    matte = [SceneObject(mesh=item.mesh, texture=item.texture) for item in objects]
     plain = shot(Stage(matte), sensor(supersample=1))
     assert not plain.highlight.any()
     assert glossy.highlight.any()

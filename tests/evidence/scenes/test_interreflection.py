@@ -1,10 +1,10 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.bodies import Body
 from pimper_torch.evidence.scenes.interreflection import Interreflection, transfer
 from pimper_torch.evidence.scenes.lights import PointLight
 from pimper_torch.evidence.scenes.meshes import icosphere, table
+from pimper_torch.evidence.scenes.scene_object import SceneObject
 from pimper_torch.evidence.scenes.stage import Stage
 from pimper_torch.records import Mesh
 
@@ -23,7 +23,9 @@ def gray(points):
 
 def test_a_point_light_in_a_hollow_ball_is_seen_in_every_bounce_by_its_albedo():
     vertices, faces = icosphere(3)
-    stage = Stage([Body(mesh=Mesh(vertices_world=vertices, faces=faces.flip(1)), texture=gray)])
+    stage = Stage(
+        [SceneObject(mesh=Mesh(vertices_world=vertices, faces=faces.flip(1)), texture=gray)]
+    )
     once = Interreflection(stage, 1, num_rays=16).light(stage, AT_CENTER)
     # Everything receives 0.5, and all that anything sees sends 0.6 of it.
     # Facets bulge less than the ball: their centres are up to 1 % nearer to the point light.
@@ -37,7 +39,9 @@ def test_the_share_of_a_ball_over_a_table_has_its_closed_form():
     radius, height = 0.5, 1.0
     vertices, faces = icosphere(3)
     ball = Mesh(vertices_world=radius * vertices + vertices.new_tensor([0, 0, height]), faces=faces)
-    stage = Stage([Body(mesh=table(1.0, cells=2), texture=gray), Body(mesh=ball, texture=gray)])
+    stage = Stage(
+        [SceneObject(mesh=table(1.0, cells=2), texture=gray), SceneObject(mesh=ball, texture=gray)]
+    )
     fraction = transfer(stage, 1024, seed=0)
     centre, corner = float(fraction[[4]].sum()), float(fraction[[0]].sum())
     # Howell's catalogue: (r / h)^2 below the ball, times the cube of the cosine aside, here
@@ -47,6 +51,6 @@ def test_the_share_of_a_ball_over_a_table_has_its_closed_form():
 
 
 def test_a_lone_table_gets_no_light_from_others():
-    stage = Stage([Body(mesh=table(1.0, cells=4), texture=gray)])
+    stage = Stage([SceneObject(mesh=table(1.0, cells=4), texture=gray)])
     point_light = AT_CENTER.replace(position=torch.tensor([0.0, 0, 2]))
     assert (Interreflection(stage, 2).light(stage, point_light) == 0).all()

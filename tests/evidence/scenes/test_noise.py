@@ -15,7 +15,7 @@ def test_waves_have_the_spread_and_the_gradient_they_promise(generator):
     assert 2 * torch.pi / 0.5 * 0.3 < steepest < 2 * torch.pi / 0.5 * 0.3 * 6
 
 
-def test_speckle_is_a_function_of_the_place_alone_and_within_its_limits(generator):
+def test_speckle_is_a_function_of_the_position_alone_and_within_its_limits(generator):
     speckle = random_speckle(generator, darkest=0.2, brightest=0.7)
     points = 6 * torch.rand(5000, 3, generator=generator) - 3
     albedo = speckle(points)

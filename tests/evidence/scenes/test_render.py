@@ -5,14 +5,14 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.bodies import Body
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.compositions import potato_on_table
 from pimper_torch.evidence.scenes.lights import Lights, wandering_lights
 from pimper_torch.evidence.scenes.meshes import icosphere, join, potato, table
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.photographs import save_masks, save_photographs
-from pimper_torch.evidence.scenes.render import render_bodies, render_shape
+from pimper_torch.evidence.scenes.render import render_objects, render_shape
+from pimper_torch.evidence.scenes.scene_object import SceneObject
 from pimper_torch.evidence.scenes.sensor import SensorConfig
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.geometry.pixels import pixel_centers
@@ -78,7 +78,9 @@ def test_depth_times_ray_is_the_surface_in_closed_forms(cameras):
 def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_squared():
     lights = point_light([0.0, 0.0, 2.0])
     generator = torch.Generator().manual_seed(62)
-    scene = render_bodies([Body(mesh=table(2.0), texture=white)], above(), lights, generator, QUIET)
+    scene = render_objects(
+        [SceneObject(mesh=table(2.0), texture=white)], above(), lights, generator, QUIET
+    )
     image = scene.views.images[0, 0]
     assert_close(image[15, 15], torch.tensor(1.0), atol=1e-4, rtol=0)
     # A pixel is 5/60 wide on the table; 12 pixels aside, x = 1: cos / d^2 = (2 / d) (2 / d)^2.
@@ -87,14 +89,14 @@ def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_
 
 
 def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
-    bodies = [
-        Body(mesh=table(3.0), texture=white),
-        Body(mesh=ball((1.0, 0.0, 1.0), 0.3), texture=white, surroundings=True),
+    objects = [
+        SceneObject(mesh=table(3.0), texture=white),
+        SceneObject(mesh=ball((1.0, 0.0, 1.0), 0.3), texture=white, surroundings=True),
     ]
     # From (2, 0, 2) through the ball's centre (1, 0, 1) light would come to the origin.
     lights = point_light([2.0, 0.0, 2.0], ambient=torch.tensor([0.1], dtype=torch.float64))
     generator = torch.Generator().manual_seed(63)
-    scene = render_bodies(bodies, above(), lights, generator, QUIET)
+    scene = render_objects(objects, above(), lights, generator, QUIET)
     image = scene.views.images[0, 0]
     assert not scene.lit[0, 15, 15]
     assert_close(image[15, 15], torch.tensor(0.1), atol=1e-6, rtol=0)
@@ -110,27 +112,31 @@ def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
 def test_a_point_light_below_the_horizon_gives_no_light_but_the_ambient():
     lights = point_light([0.0, 1.0, -2.0], ambient=torch.tensor([0.25], dtype=torch.float64))
     generator = torch.Generator().manual_seed(64)
-    scene = render_bodies([Body(mesh=table(3.0), texture=white)], above(), lights, generator, QUIET)
+    scene = render_objects(
+        [SceneObject(mesh=table(3.0), texture=white)], above(), lights, generator, QUIET
+    )
     assert_close(scene.views.images, torch.full_like(scene.views.images, 0.25))
 
 
 def test_a_flash_lights_what_faces_the_camera_without_shadows():
     lights = point_light([0.0, 0.0, -2.0], flash=torch.tensor([0.5], dtype=torch.float64))
     generator = torch.Generator().manual_seed(65)
-    scene = render_bodies([Body(mesh=table(3.0), texture=white)], above(), lights, generator, QUIET)
+    scene = render_objects(
+        [SceneObject(mesh=table(3.0), texture=white)], above(), lights, generator, QUIET
+    )
     assert_close(scene.views.images[0, :, 15, 15], torch.full((3,), 0.5), atol=1e-4, rtol=0)
     assert (scene.views.images > 0.2).all()
 
 
 def test_gloss_adds_a_highlight_where_the_mirror_direction_is():
-    matte = Body(mesh=table(3.0), texture=white)
-    glossy = Body(mesh=table(3.0), texture=white, specular=0.04, roughness=0.3)
+    matte = SceneObject(mesh=table(3.0), texture=white)
+    glossy = SceneObject(mesh=table(3.0), texture=white, specular=0.04, roughness=0.3)
     dim = {"irradiance": torch.tensor([0.1], dtype=torch.float64)}
     difference = []
-    for body in (matte, glossy):
+    for item in (matte, glossy):
         generator = torch.Generator().manual_seed(66)
-        scene = render_bodies(
-            [body], above(), point_light([2.0, 0.0, 5.0], **dim), generator, QUIET
+        scene = render_objects(
+            [item], above(), point_light([2.0, 0.0, 5.0], **dim), generator, QUIET
         )
         difference.append(scene.views.images[0, 0])
     extra = difference[1] - difference[0]
@@ -152,8 +158,8 @@ def test_a_ray_traced_ball_agrees_with_its_closed_form():
         flash=torch.zeros(2, dtype=torch.float64),
     )
     texture = random_speckle(generator, cells=(0.5,))
-    traced = render_bodies(
-        [Body(mesh=ball((0.0, 0.0, 0.0), 1.0, subdivisions=6), texture=texture)],
+    traced = render_objects(
+        [SceneObject(mesh=ball((0.0, 0.0, 0.0), 1.0, subdivisions=6), texture=texture)],
         cameras,
         far,
         generator,
@@ -174,14 +180,14 @@ def test_a_ray_traced_ball_agrees_with_its_closed_form():
 def test_noise_and_saturation_are_those_of_the_sensor():
     lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.5], dtype=torch.float64))
     noisy = SensorConfig(supersample=1, read_noise=0.01, shot_noise=0.0)
-    body = Body(mesh=table(3.0), texture=white)
+    item = SceneObject(mesh=table(3.0), texture=white)
     generator = torch.Generator().manual_seed(68)
-    image = render_bodies([body], above(), lights, generator, noisy).views.images
+    image = render_objects([item], above(), lights, generator, noisy).views.images
     assert abs(image.std() - 0.01) < 0.001
     again = torch.Generator().manual_seed(68)
-    assert_close(render_bodies([body], above(), lights, again, noisy).views.images, image)
+    assert_close(render_objects([item], above(), lights, again, noisy).views.images, image)
     bright = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([5.0], dtype=torch.float64))
-    assert (render_bodies([body], above(), bright, generator, noisy).views.images == 1).all()
+    assert (render_objects([item], above(), bright, generator, noisy).views.images == 1).all()
 
 
 def test_a_pixel_gathers_the_light_of_its_whole_area():
@@ -191,8 +197,8 @@ def test_a_pixel_gathers_the_light_of_its_whole_area():
     lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.8], dtype=torch.float64))
     sensor = SensorConfig(supersample=4, read_noise=0.0, shot_noise=0.0)
     generator = torch.Generator().manual_seed(69)
-    body = Body(mesh=table(3.0), texture=halves)
-    image = render_bodies([body], above(), lights, generator, sensor).views.images[0, 0, 15]
+    item = SceneObject(mesh=table(3.0), texture=halves)
+    image = render_objects([item], above(), lights, generator, sensor).views.images[0, 0, 15]
     assert_close(image[15], torch.tensor(0.4), atol=2e-3, rtol=0)
     assert image[14] == 0
     assert_close(image[16], torch.tensor(0.8), atol=2e-3, rtol=0)

@@ -32,7 +32,7 @@ def settings(**changes):
 
 
 def photograph(scene, view):
-    stage = Stage(scene.bodies_in(view))
+    stage = Stage(scene.objects_in(view))
     noise = scene.noise(view)
     return render_frame(stage, scene.cameras, scene.lights, view, noise, scene.config.sensor)
 
@@ -48,7 +48,7 @@ def test_all_but_the_object_and_its_shadow_is_the_same_in_every_photograph(egg):
     assert first.image[:, alike].std() > 0.02  # patterned, so that equality says something
     rotated = first.foreground & second.foreground
     assert (first.image - second.image).abs()[:, rotated].mean() > 0.05
-    assert_close(scene.bodies_in(0)[0].mesh.vertices_world, scene.object_mesh.vertices_world)
+    assert_close(scene.objects_in(0)[0].mesh.vertices_world, scene.object_mesh.vertices_world)
 
 
 def test_a_turning_table_is_where_the_true_cameras_see_it_and_the_room_is_not(egg):

@@ -95,11 +95,11 @@ def test_a_mesh_with_colours_keeps_them(tmp_path, generator):
 
 
 def test_gloss_is_the_scenes_own_unless_told(egg):
-    assert build_scene(egg, SMALL).bodies[0].specular == 0
+    assert build_scene(egg, SMALL).objects[0].specular == 0
     glossy = SceneConfig(num_views=2, width=40, height=30, specular=0.1, roughness=0.5)
     scene = build_scene(egg, glossy)
-    assert (scene.bodies[0].specular, scene.bodies[0].roughness) == (0.1, 0.5)
-    assert scene.bodies[-1].specular == 0  # the table stays matte
+    assert (scene.objects[0].specular, scene.objects[0].roughness) == (0.1, 0.5)
+    assert scene.objects[-1].specular == 0  # the table stays matte
 
 
 def test_a_uniform_albedo_replaces_the_texture_of_the_object_alone(egg):
@@ -151,8 +151,8 @@ def test_normals_of_a_file_that_contradict_its_faces_are_not_taken(tmp_path):
 def test_a_conductor_has_no_albedo_and_an_environment_all_photographs_share(egg):
     options = {"num_views": 3, "width": 40, "height": 30}
     scene = build_scene(egg, SceneConfig(conductor="copper", **options))
-    assert scene.bodies[0].conductor is not None
-    assert scene.bodies[-1].conductor is None  # the table stays cloth
+    assert scene.objects[0].conductor is not None
+    assert scene.objects[-1].conductor is None  # the table stays cloth
     assert (scene.object_mesh.albedo == 0).all()
     directions = even_directions(500)
 
@@ -181,9 +181,9 @@ def test_an_environment_stands_still_with_a_fixed_room(egg):
 
 def test_of_a_pair_the_one_in_front_hides_part_of_the_other(generator):
     scene = build_scene("pair", SceneConfig(num_views=5, width=80, height=60))
-    behind, front = (Stage([body]) for body in scene.bodies[:2])
-    gap = KDTree(scene.bodies[0].mesh.vertices_world.numpy()).query(
-        scene.bodies[1].mesh.vertices_world.numpy()
+    behind, front = (Stage([item]) for item in scene.objects[:2])
+    gap = KDTree(scene.objects[0].mesh.vertices_world.numpy()).query(
+        scene.objects[1].mesh.vertices_world.numpy()
     )[0]
     assert gap.min() > 0.15
     for view in range(5):
@@ -191,7 +191,9 @@ def test_of_a_pair_the_one_in_front_hides_part_of_the_other(generator):
         pixels = pixel_centers(80, 60, like=camera.intrinsics).reshape(-1, 2)
         rays = rays_through(pixels, camera.cam_from_world[view], camera.intrinsics[view]).float()
         eye = camera.centers_world[view].float()
-        hidden = (behind.trace(eye, rays).body >= 0) & (front.trace(eye, rays).body >= 0)
+        hidden = (behind.trace(eye, rays).object_index >= 0) & (
+            front.trace(eye, rays).object_index >= 0
+        )
         assert hidden.sum() > 20
 
 
@@ -293,14 +295,14 @@ def test_paint_covers_and_marks_darken():
 @pytest.mark.parametrize("name", objects.RECIPES)
 def test_every_object_stands_on_the_table_at_its_centre(name, monkeypatch, generator):
     monkeypatch.setattr(objects, "mug_mesh", lambda: _MUG_MESH(cell=0.06))
-    bodies = objects.RECIPES[name](generator)
-    points = torch.cat([body.mesh.vertices_world for body in bodies])
+    made = objects.RECIPES[name](generator)
+    points = torch.cat([item.mesh.vertices_world for item in made])
     assert abs(float(points[:, 2].min())) < 0.01
     size = points.amax(dim=0) - points.amin(dim=0)
     assert 1.8 < float(size.amax()) < 3.2
     assert (points[:, :2].amax(dim=0) + points[:, :2].amin(dim=0)).abs().max() < 0.8
-    for body in bodies:
-        shade = body.texture(body.mesh.vertices_world[::50].float())
+    for item in made:
+        shade = item.texture(item.mesh.vertices_world[::50].float())
         assert ((shade > 0) & (shade < 1)).all()
 
 
@@ -308,20 +310,20 @@ _MUG_MESH = objects.mug_mesh
 
 
 def test_no_ball_cuts_another():
-    bodies = objects.balls(torch.Generator().manual_seed(1))
-    centres = [body.mesh.vertices_world.mean(dim=0) for body in bodies]
+    made = objects.balls(torch.Generator().manual_seed(1))
+    centres = [item.mesh.vertices_world.mean(dim=0) for item in made]
     radii = [
-        float((body.mesh.vertices_world[0] - centre).norm())
-        for body, centre in zip(bodies, centres, strict=True)
+        float((item.mesh.vertices_world[0] - centre).norm())
+        for item, centre in zip(made, centres, strict=True)
     ]
-    for first in range(len(bodies)):
+    for first in range(len(made)):
         for second in range(first):
             distance = float((centres[first] - centres[second]).norm())
             assert distance > radii[first] + radii[second] - 1e-3
 
 
 def test_no_potato_cuts_another():
-    meshes = [body.mesh for body in objects.potatoes(torch.Generator().manual_seed(0))]
+    meshes = [item.mesh for item in objects.potatoes(torch.Generator().manual_seed(0))]
     nearest = []
     for first in range(4):
         for second in range(first):

@@ -51,7 +51,7 @@ def test_a_rendering_holds_what_it_says(rendering):
 def test_photographs_and_masks_are_those_of_the_frames(rendering, ball):
     scene = build_scene(ball, SMALL)
     views = load_views(rendering / "photos", masks=rendering / "masks")
-    stage = Stage(scene.bodies)
+    stage = Stage(scene.objects)
     for view in range(3):
         frame = render_frame(
             stage, scene.cameras, scene.lights, view, scene.noise(view), SMALL.sensor
@@ -69,7 +69,7 @@ def test_deep_linear_photographs_are_read_back_to_the_last_bit(ball, tmp_path):
     views = load_views(tmp_path / "deep" / "photos", encoding=LINEAR)
     scene = build_scene(ball, config)
     frame = render_frame(
-        Stage(scene.bodies), scene.cameras, scene.lights, 1, scene.noise(1), config.sensor
+        Stage(scene.objects), scene.cameras, scene.lights, 1, scene.noise(1), config.sensor
     )
     assert_close(views.images[1], frame.image, atol=0.51 / 65535, rtol=0)
 

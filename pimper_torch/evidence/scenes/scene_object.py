@@ -16,7 +16,7 @@ Texture = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch channel"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Body:
+class SceneObject:
     """A mesh and what it is made of.
 
     Attributes:
@@ -28,8 +28,8 @@ class Body:
         roughness: Of the mirroring facets, as artists count it (its square is GGX's alpha):
             0.1 is polished, 0.5 satin.
         conductor: A metal in place of matte surface under glaze: it mirrors the point lights as
-            ``roughness`` says, other bodies and the environment sharply. Its albedo is 0.
-        surroundings: Part of the scene but not of the object: the table.
+            ``roughness`` says, other objects and the environment sharply. Its albedo is 0.
+        surroundings: True for what stands around the reconstructed object, such as the table.
     """
 
     mesh: Mesh
@@ -53,11 +53,11 @@ class Body:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Carried:
-    """A texture that moves with its body.
+class MovedTexture:
+    """A texture that moves with its object.
 
     Attributes:
-        texture: In the body's own frame.
+        texture: In the object's own frame.
         own_from_world: Rigid.
     """
 
@@ -69,28 +69,28 @@ class Carried:
         return self.texture(transform(self.own_from_world.to(points), points))
 
 
-def transferred(body: Body, world_from_own: Float[Tensor, "4 4"]) -> Body:
-    """Move a body from its own frame to a place in the world, with its texture."""
-    normals, texture = body.mesh.normals_world, body.texture
-    mesh = body.mesh.replace(
-        vertices_world=transform(world_from_own, body.mesh.vertices_world),
+def transferred(item: SceneObject, world_from_own: Float[Tensor, "4 4"]) -> SceneObject:
+    """Move an object from its own frame into the world, with its texture."""
+    normals, texture = item.mesh.normals_world, item.texture
+    mesh = item.mesh.replace(
+        vertices_world=transform(world_from_own, item.mesh.vertices_world),
         normals_world=None if normals is None else rotate(world_from_own, normals),
     )
     if texture is not None:
-        texture = Carried(texture=texture, own_from_world=invert_rigid(world_from_own))
-    return replace(body, mesh=mesh, texture=texture)
+        texture = MovedTexture(texture=texture, own_from_world=invert_rigid(world_from_own))
+    return replace(item, mesh=mesh, texture=texture)
 
 
-def normals_at_vertices(body: Body) -> Float[Tensor, "vertex 3"]:
-    """Give the normals of a body's mesh, its own or averaged from its faces; float32."""
-    if body.mesh.normals_world is not None:
-        return body.mesh.normals_world.float()
-    return vertex_normals(body.mesh.vertices_world, body.mesh.faces).float()
+def normals_at_vertices(item: SceneObject) -> Float[Tensor, "vertex 3"]:
+    """Give the normals of an object's mesh, its own or averaged from its faces; float32."""
+    if item.mesh.normals_world is not None:
+        return item.mesh.normals_world.float()
+    return vertex_normals(item.mesh.vertices_world, item.mesh.faces).float()
 
 
-def albedo_at_vertices(body: Body) -> Float[Tensor, "vertex channel"]:
-    """Evaluate a body's texture, in colour, at its vertices; float32."""
-    if body.texture is not None:
-        return body.texture(body.mesh.vertices_world.float()).expand(-1, 3)
-    assert body.mesh.albedo is not None
-    return body.mesh.albedo.float().expand(-1, 3)
+def albedo_at_vertices(item: SceneObject) -> Float[Tensor, "vertex channel"]:
+    """Evaluate an object's texture, in colour, at its vertices; float32."""
+    if item.texture is not None:
+        return item.texture(item.mesh.vertices_world.float()).expand(-1, 3)
+    assert item.mesh.albedo is not None
+    return item.mesh.albedo.float().expand(-1, 3)
