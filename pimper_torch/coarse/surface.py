@@ -135,8 +135,9 @@ def smoothed_normals(
 ) -> Float[Tensor, "vertex 3"]:
     """Average each vertex normal with the mean of those of its neighbours; unit."""
     normals = vertex_normals(vertices, faces)
-    ends = half_edges(faces)
-    total = torch.zeros_like(normals).index_add(0, ends.flatten(), normals[ends.flip(1).flatten()])
+    source = half_edges(faces[:, [2, 0, 1]])  # summed from each face's first edge on
+    target = source.flip(1).flatten()
+    total = torch.zeros_like(normals).index_add(0, target, normals[source.flatten()])
     return normalize(normals + normalize(total, dim=-1), dim=-1)
 
 
