@@ -33,7 +33,7 @@ albedo and light.
   demo          the photographs of a skull that come with the package
   render        photographs of a scene with known truth
   evaluate      a result against the truth
-  bench         the table: scenes, presets and rivals
+  bench         the table: scenes, presets and baselines
   convert       a data set of another layout, or to one
   gamma         the response of photographs from a fixed camera under several lights
 
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Returns:
-        0; 2 for anything the user can mend, told in one message; 130 when interrupted.
+        0; 2 for anything the user can correct, in one message; 130 when interrupted.
     """
     try:
         try:
@@ -120,7 +120,7 @@ def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # told when the arguments are read in earnest
+            warnings.simplefilter("ignore")  # shown when the arguments are read in earnest
             light(home, "checked")(command, arguments)
     except (PimperError, BrokenPipeError):
         raise

@@ -74,7 +74,7 @@ class InputOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """All that a run is told."""
+    """The arguments of a run."""
 
     photos: Path
     out: Path
@@ -95,7 +95,7 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
 
     Raises:
         ConfigError: No such preset, or an impossible setting.
-        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
     """
     preset = load_config(_preset(arguments))
     settings: Any = type(preset)  # each chain has its own
@@ -159,7 +159,7 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments, and refuse what can be told without reading photographs.
+    """Read the arguments, and check what can be checked without reading photographs.
 
     Raises:
         PimperError: As :func:`parse`; the folder for the result is taken, or there are no

@@ -1,1 +1,1 @@
-"""What the chain is held against: scenes with known truth, data sets, metrics, rivals, tables."""
+"""Evaluation of the chain: scenes of known truth, data sets, metrics, baselines, tables."""

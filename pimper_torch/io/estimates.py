@@ -1,4 +1,4 @@
-"""Results to be judged: a folder that ``pimper reconstruct`` wrote, or a mesh of any method."""
+"""Results to evaluate: a folder that ``pimper reconstruct`` wrote, or a mesh of any method."""
 
 import json
 import zipfile

@@ -28,13 +28,13 @@ def prepare_output(folder: Path | str, contents: Collection[str], overwrite: boo
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; needed: a folder that is new or empty.")
     try:
-        held = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+        present = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     except OSError as error:
         raise OutputError(f"{folder}: cannot be listed ({error.strerror}).") from error
-    foreign = [name for name in held if name not in contents]
-    if held and not overwrite:
+    foreign = [name for name in present if name not in contents]
+    if present and not overwrite:
         raise OutputError(
-            f"{folder}: already holds {some(held)}; needed: a folder that is new or empty. Write "
+            f"{folder}: already holds {some(present)}; needed: a new or empty folder. Write "
             "elsewhere, or replace a former result by `--overwrite` (`overwrite=True`)."
         )
     if foreign:

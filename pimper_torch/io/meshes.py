@@ -21,14 +21,14 @@ from pimper_torch.records import Mesh
 from pimper_torch.viz.maps import albedo_scale
 
 # One number a vertex, written and read under the names of the record's fields.
-_TOLD = ("confidence", "expected_error")
+_ERRORS = ("confidence", "expected_error")
 # Steps that the eye hardly sees on a rendered surface, and errors far below what these two
 # figures are known to.
 _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
 
 
 def write_ply(mesh: Mesh, path: Path | str) -> None:
-    """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, what is told of errors.
+    """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, and what is known of errors.
 
     These are the properties ``confidence`` and ``expected_error``, the latter in scene units.
     """
@@ -38,10 +38,10 @@ def write_ply(mesh: Mesh, path: Path | str) -> None:
     if mesh.albedo is not None:
         colors = to_bytes(_colors(mesh)).unbind(dim=1)
         columns |= dict(zip(("red", "green", "blue"), colors, strict=True))
-    for name in _TOLD:
-        told = getattr(mesh, name)
-        if told is not None:
-            columns[name] = told.float()
+    for name in _ERRORS:
+        known = getattr(mesh, name)
+        if known is not None:
+            columns[name] = known.float()
     kinds = [
         ("uchar", "u1") if one.dtype == torch.uint8 else ("float", "<f4")
         for one in columns.values()
@@ -166,7 +166,7 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
         encoded = encoded[:, :3] / (255 if np.asarray(colors).dtype.kind in "ui" else 1)
     raw = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
     written = getattr(getattr(raw, "dtype", None), "names", None) or raw
-    told = {name: _rows(raw[name]) if name in written else None for name in _TOLD}
+    known = {name: _rows(raw[name]) if name in written else None for name in _ERRORS}
     if normals is None and {"nx", "ny", "nz"} <= set(written):  # of a cloud, trimesh drops them
         normals = _rows(np.stack([np.ravel(raw[axis]) for axis in ("nx", "ny", "nz")], axis=1))
     return Mesh(
@@ -176,7 +176,7 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
         if normals is None
         else normalize(rotate(scene_from_part, normals), dim=-1),
         albedo=encoded if linear or encoded is None else linear_from_srgb(encoded),
-        **{name: None if one is None else one.reshape(-1) for name, one in told.items()},
+        **{name: None if one is None else one.reshape(-1) for name, one in known.items()},
     )
 
 
@@ -207,7 +207,7 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
         faces=torch.cat(faces),
         normals_world=all_of([part.normals_world for part in parts]),
         albedo=all_of([part.albedo for part in parts]),
-        **{name: all_of([getattr(part, name) for part in parts]) for name in _TOLD},
+        **{name: all_of([getattr(part, name) for part in parts]) for name in _ERRORS},
     )
 
 

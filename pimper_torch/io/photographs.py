@@ -38,7 +38,7 @@ def load_views(
 
     JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette; other files, hidden ones and
     folders inside are passed over. EXIF's orientation is applied, its focal length kept in
-    pixels. The response, sRGB unless told otherwise, is undone, so that radiance is linear;
+    pixels. The response, sRGB unless given, is undone, so that radiance is linear;
     colour profiles are not looked at. Radiance 1 is saturation, in every colour: the level that
     is told, or at which values pile up, or full scale. Photographs of unlike sizes are padded.
 
@@ -128,9 +128,9 @@ def list_images(folder: Path | str) -> list[Path]:
         raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
     paths = [path for path in entries if path.suffix.lower() in SUFFIXES and path.is_file()]
     if not paths:
-        held = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
+        content = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
         raise InputError(
-            f"{folder}: no images; {held}. Read are files ending in {', '.join(SUFFIXES)}, not "
+            f"{folder}: no images; {content}. Read are files ending in {', '.join(SUFFIXES)}, not "
             "those in folders inside."
         )
     paths.sort(key=lambda path: _natural(path.name))

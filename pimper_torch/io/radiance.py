@@ -112,7 +112,7 @@ def resized_radiance(
 ) -> Float[Tensor, "channel {height} {width}"]:
     """Shrink radiance; a pixel made of some that are saturated is saturated, colour by colour.
 
-    How bright the saturated ones were nobody knows, so neither is their mean with others.
+    The radiance of saturated pixels is unknown, and so is their mean with others.
     """
     if tuple(radiance.shape[-2:]) == (height, width):
         return radiance

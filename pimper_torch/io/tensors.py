@@ -32,7 +32,7 @@ def scene_of(
 
     Args:
         images: Linear radiance, ``view channel height width``; 1 is where the sensor saturates.
-            Bytes are taken for sRGB-coded and made linear by nobody: divide and decode them first.
+            Bytes are refused: decode them to linear radiance first.
         intrinsics: ``K`` of every view, ``view 3 3``, or one for all, ``3 3``; in pixels, the
             centre of the top-left pixel at (0.5, 0.5).
         cam_from_world: ``view 4 4`` or ``view 3 4``, rigid; camera axes x right, y down, z forward.

@@ -220,7 +220,7 @@ class Convergence(Record):
 
 
 class PatchStatus(IntEnum):
-    """Whether light told a patch's shape, or what kept it from that."""
+    """Whether light determines a patch's shape, or why not."""
 
     DETERMINED = 0
     """Normals and albedo come from the photographs."""
@@ -281,7 +281,7 @@ class Photometry(Record):
 
     @property
     def determined(self) -> Bool[Tensor, " patch"]:
-        """Whether light told the patch's shape."""
+        """Whether light determines the patch's shape."""
         return self.status == int(PatchStatus.DETERMINED)
 
 
@@ -446,7 +446,7 @@ class Surface(Record):
         confidence: In [0, 1]; 0 where no view determined the vertex.
         convergence: Of the refinement, one entry.
         expected_error: Standard error of each vertex across the surface, scene units, given the
-            cameras; ``None`` where nobody tells.
+            cameras; ``None`` where unknown.
     """
 
     vertices_world: Float[Tensor, "vertex 3"]

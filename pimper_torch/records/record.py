@@ -24,7 +24,7 @@ _NODES: dict[object, set[str]] = {}
 class Record:
     """Frozen data with a few verbs: move it, take a part of it, change a field in a copy.
 
-    Tensors are held to the shapes and kinds that the fields state when a record is made; what
+    Shapes and kinds of tensors are checked against the fields when a record is made; what
     their values have to be, :meth:`check` asks where a record enters a stage. Frozen stops
     rebinding, not writing into a tensor; stages never write into what they were handed.
 
@@ -145,7 +145,8 @@ class Record:
                 continue
             if any(value is None for value in values):
                 raise InputError(
-                    f"{cls.__name__}.cat: some records have {name}, others none; needed: alike."
+                    f"{cls.__name__}.cat: some records have {name}, others none; needed: it in all "
+                    "or in none."
                 )
             if isinstance(values[0], tuple):
                 changes[name] = tuple(item for value in values for item in value)

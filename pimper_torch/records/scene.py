@@ -147,7 +147,7 @@ class FacetPoints(Record):
 
 
 class Support(IntEnum):
-    """What tells where a facet lies, the best of it."""
+    """The best evidence of where a facet lies."""
 
     NOTHING = 0
     """It closes the surface."""
@@ -171,8 +171,8 @@ class CoarseMesh(Record):
         covariance_world: Of each vertex that is a point, scene units squared; zero for the
             others. ``None`` for a mesh that comes from elsewhere.
         points: The cloud between the vertices; ``None`` for a mesh from elsewhere.
-        support: What tells where each facet lies, a value of :class:`Support`; ``None`` where
-            nobody asked.
+        support: The best evidence of where each facet lies, a value of :class:`Support`; ``None``
+            if unknown.
     """
 
     mesh: Mesh

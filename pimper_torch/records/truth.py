@@ -12,7 +12,7 @@ from pimper_torch.records.views import Cameras, Views
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Truth(Record):
-    """What is known of an object besides its photographs; ``None`` where nobody knows.
+    """What is known of an object besides its photographs; ``None`` where unknown.
 
     Maps hold what the ray through each pixel's centre meets first, one a view.
 
@@ -20,7 +20,7 @@ class Truth(Record):
         mesh: Surface of the object alone, as scanned or as rendered.
         surroundings: What else stands in the scene, such as the table.
         points_world: Scanned points, where no surface was made of them.
-        depth: Along the camera's z; infinite where the ray meets nothing or nobody knows.
+        depth: Along the camera's z; infinite where the ray meets nothing, or unknown.
         normals_world: Unit, outward; zero where the ray meets nothing.
         albedo: Linear; zero where the ray meets nothing.
         foreground: True on the object, false on its table and the background.
@@ -68,7 +68,7 @@ class Capture(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DtuProtocol(Record):
-    """Where a scan of the DTU 2014 set is judged, in the data set's frame and millimetres.
+    """Where a scan of the DTU 2014 set is evaluated, in the data set's frame and millimetres.
 
     Attributes:
         obs_mask: True in voxels that the structured light scanner could see. The centre of

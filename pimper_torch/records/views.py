@@ -22,7 +22,7 @@ class Views(Record):
         images: Linear radiance; 1 is the level at which the sensor saturates.
         sizes_px: Width and height of each photograph inside the raster.
         names: File names, unique, in the order of the views.
-        masks: True on the object; ``None`` when nobody drew any.
+        masks: True on the object; ``None`` where there are none.
         focals_px: Focal length from EXIF in pixels; NaN where the file does not say.
     """
 

@@ -237,10 +237,10 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
         )
         for index, panels in enumerate(_columns(row, names)):
             left = _NAME_IN + index * (_PANEL_IN + _GAP_IN)
-            said = "" if panels.surface is None else panels.note  # once is enough
+            again = "" if panels.surface is None else panels.note  # once is enough
             for picture, bottom, note in (
                 (panels.surface, top - height, panels.note),
-                (panels.error, top - 2 * height - _GAP_IN, said),
+                (panels.error, top - 2 * height - _GAP_IN, again),
             ):
                 _show(figure, size, (left, bottom, _PANEL_IN, height), picture, note=note)
         top -= 2 * (height + _GAP_IN)

@@ -12,7 +12,7 @@ from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import Hits, cast_view
 from pimper_torch.records import Cameras, Mesh, Record
 
-_GREY = 0.5  # colour of a mesh whose albedo nobody knows
+_GREY = 0.5  # colour of a mesh of unknown albedo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -43,7 +43,7 @@ def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys)
     assert "samples 1,200" in told.err
 
 
-def test_options_reach_their_positions(photos, chain, tmp_path):
+def test_options_reach_their_stages(photos, chain, tmp_path):
     out = tmp_path / "out"
     code = run(
         *("reconstruct", "--photographs.saturation", "250,251,252", photos, "--out", out),

@@ -97,7 +97,7 @@ def test_shrinking_averages_light_not_codes_and_scales_the_focal_length(tmp_path
     assert views.focals_px[0].item() == pytest.approx(5000 / 3600 * 24)
 
 
-def test_shrinking_keeps_corners_in_position(photos):
+def test_shrinking_keeps_corners_where_they_are(photos):
     ramp = np.tile(np.arange(0, 240, 5, dtype=np.uint8)[None, :, None], (32, 1, 3))
     for name in ("1.png", "2.png", "10.png"):
         save(photos / name, ramp)

@@ -312,7 +312,7 @@ def test_a_folder_with_other_things_is_never_overwritten(tmp_path):
         prepare_output(tmp_path / "out", RESULT_NAMES)
 
 
-def test_a_position_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file: is a file"):
         prepare_output(tmp_path / "file", RESULT_NAMES)

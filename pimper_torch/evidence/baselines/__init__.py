@@ -1,4 +1,4 @@
-"""Rivals, to be run beside the method on the same scene."""
+"""Baselines, run on the same scene as the method."""
 
 from pimper_torch.evidence.baselines.colmap_dense import ColmapDense, ColmapDenseConfig
 from pimper_torch.evidence.baselines.global_stereo import GlobalStereo, GlobalStereoConfig

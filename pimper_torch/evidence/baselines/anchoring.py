@@ -1,4 +1,4 @@
-r"""Sparse points hold an integrated relief: the bas-relief freedom, fixed by depths.
+r"""Sparse points anchor an integrated height field: the bas-relief freedom, fixed by depths.
 
 Shading tells depth only up to :math:`z' = \lambda z + \mu x + \nu y + c` (a constant that
 integration leaves free, and the generalised bas-relief transformation that uncalibrated light

@@ -46,7 +46,7 @@ def write_masks(scene: SparseScene, folder: Path, suffix: str) -> bool:
     """Write the object's masks, white on the object, as ``00000000`` with the suffix.
 
     Returns:
-        False, and nothing is written, where nobody drew any.
+        False, and nothing is written, where there are none.
     """
     if scene.views.masks is None:
         return False

@@ -1,4 +1,4 @@
-"""Programs that somebody else wrote: finding them, running them, saying what went wrong."""
+"""External programs: find them, run them, report what went wrong."""
 
 import contextlib
 import os

@@ -249,8 +249,8 @@ def fix_ambiguity(matrix: Matrix, whole: Whole, min_views: int) -> Whole:
         min_views: Samples that fewer views see say nothing.
     """
     often = matrix.seen.sum(dim=0) >= min_views
-    (told,) = often.nonzero(as_tuple=True)
-    few = told[:: _stride(len(told), LIGHT_SAMPLES)]
+    (observed,) = often.nonzero(as_tuple=True)
+    few = observed[:: _stride(len(observed), LIGHT_SAMPLES)]
     some = matrix.columns(few)
     lights = fit_distant_lights(some.radiance.mT, some.seen.mT, some.normals)
     move = align_factorizations(
@@ -313,8 +313,8 @@ def _stride(samples: int, number: int) -> int:
 
 def _well_seen(matrix: Matrix, min_views: int, number: int) -> Matrix:
     """Pick about so many samples, evenly among those that enough views see."""
-    (told,) = (matrix.seen.sum(dim=0) >= min_views).nonzero(as_tuple=True)
-    return matrix.columns(told[:: _stride(len(told), number)])
+    (observed,) = (matrix.seen.sum(dim=0) >= min_views).nonzero(as_tuple=True)
+    return matrix.columns(observed[:: _stride(len(observed), number)])
 
 
 def _best_shading(matrix: Matrix, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "4 sample"]:

@@ -198,8 +198,8 @@ def relief_from(
 ) -> Round:
     """Factorize, fix the ambiguity by integrability and points, and integrate."""
     often = matrix.seen.sum(dim=0) >= config.min_views
-    (told,) = often.nonzero(as_tuple=True)
-    some = matrix.columns(told[:: max(1, -(-len(told) // config.light_samples))])
+    (observed,) = often.nonzero(as_tuple=True)
+    some = matrix.columns(observed[:: max(1, -(-len(observed) // config.light_samples))])
     lights = factorize_rank_three(some.radiance, some.seen, config.alternations)
     factors = Rank3(lights=lights, vectors=solve_vectors(matrix.radiance, matrix.seen, lights))
     spans = spans_between(edges_of(points), template, factors, often)

@@ -97,27 +97,27 @@ def solve_whole(
         trace = (count * (lights.double() ** 2).sum(dim=1)).sum() / (4 * num_seen)
         packed = lights.new_zeros(1, 10, len(lights), dtype=torch.float64)
         rhs = lights.new_zeros(1, 4, len(lights), dtype=torch.float64)
-        moved = apart = length = 0.0
+        moved = difference = length = 0.0
         for part in chunks(shading.shape[1]):
             problem = as_problem(matrix.columns(part), lights, shading[:, part])
             A, b = equations_of_samples(problem, problem.lights, problem.weight)
             penalty = float(fraction * trace)
             A[:, diagonal(4)] += penalty
-            old, held = problem.shading, multiplier[None, :, part]
-            free = solve_packed(A, b + penalty * (old - held))
-            new = project_to_cone((free + held).mT).mT
+            old, dual = problem.shading, multiplier[None, :, part]
+            free = solve_packed(A, b + penalty * (old - dual))
+            new = project_to_cone((free + dual).mT).mT
             on_lights = equations_of_views(problem, free, problem.weight)
             packed, rhs = packed + on_lights[0], rhs + on_lights[1]
             moved += float((new - old).square().sum(dtype=torch.float64))
-            apart += float((free - new).square().sum(dtype=torch.float64))
+            difference += float((free - new).square().sum(dtype=torch.float64))
             length += float(new.square().sum(dtype=torch.float64))
-            multiplier[:, part] = (held + free - new)[0]
+            multiplier[:, part] = (dual + free - new)[0]
             shading[:, part] = new[0]
         lights = solve_packed(packed, rhs)[0].mT.to(lights)
         factor = (size / (lights**2).sum().clamp_min(1e-30)).sqrt()
         lights = lights * factor
         shading /= factor
         multiplier /= factor
-        if max(moved, apart) <= tolerance**2 * length:
+        if max(moved, difference) <= tolerance**2 * length:
             return Whole(lights=lights, shading=shading, iterations=step + 1, converged=True)
     return Whole(lights=lights, shading=shading, iterations=max_iterations, converged=False)

@@ -63,7 +63,7 @@ class SmoothedConfig:
 
 
 class Smoothed(Stage):
-    """Smooth the coarse mesh as a thin plate held by its vertices.
+    """Smooth the coarse mesh as a thin plate fixed at its vertices.
 
     Any mesh will do, closed ones and several pieces too. Photographs are not looked at;
     albedo and lights stay unknown. Not differentiable.
@@ -82,8 +82,8 @@ class Smoothed(Stage):
         """
         mesh = coarse.mesh
         used = torch.unique(mesh.faces)
-        held = coarse.is_point[used].any() or self.config.filled_fidelity > 0
-        if len(mesh.faces) == 0 or not held:
+        fixed = coarse.is_point[used].any() or self.config.filled_fidelity > 0
+        if len(mesh.faces) == 0 or not fixed:
             raise ReconstructionError(
                 f"the coarse mesh has {len(mesh.faces)} facets and "
                 f"{int(coarse.is_point[used].sum())} sparse points; at least one of each is "
@@ -118,7 +118,7 @@ def thin_plate(
         weights: ``w`` of its vertices; one at least, in every piece, above 0.
 
     Raises:
-        SingularSystemError: A piece of the mesh is held by less than it takes.
+        SingularSystemError: A piece of the mesh is fixed by too few vertices.
     """
     points = subdivision.points.double()
     corners = mesh.vertices_world.double()[mesh.faces]
@@ -132,11 +132,11 @@ def thin_plate(
         _gram((rows, cols, values * keep[rows]), count, count),
         _gram(_rim_differences(subdivision, edge), count, count),
     ]
-    held, target = _holders(subdivision, mesh)
+    fixed, target = _fixed_vertices(subdivision, mesh)
     regularization = weights.double()[target] / edge**2
-    diagonal = torch.zeros_like(mass).index_add(0, held, regularization)
+    diagonal = torch.zeros_like(mass).index_add(0, fixed, regularization)
     rhs = torch.zeros_like(points).index_add(
-        0, held, regularization[:, None] * mesh.vertices_world.double()[target]
+        0, fixed, regularization[:, None] * mesh.vertices_world.double()[target]
     )
     index = torch.arange(len(points), device=points.device)
     factor = SparseCholesky(
@@ -210,10 +210,10 @@ def _rim_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
     return half_edges(faces)[face_counts(index)[index.flatten()] == 1]
 
 
-def _holders(
+def _fixed_vertices(
     subdivision: Subdivision, mesh: Mesh
-) -> tuple[Int[Tensor, " held"], Int[Tensor, " held"]]:
+) -> tuple[Int[Tensor, " fixed"], Int[Tensor, " fixed"]]:
     """Find the subdivided mesh's vertices that are vertices of the coarse mesh, and which."""
-    (held,) = (subdivision.barycentric == 1).any(dim=1).nonzero(as_tuple=True)
-    slot = subdivision.barycentric[held].argmax(dim=1)
-    return held, mesh.faces[subdivision.facet[held], slot]
+    (fixed,) = (subdivision.barycentric == 1).any(dim=1).nonzero(as_tuple=True)
+    slot = subdivision.barycentric[fixed].argmax(dim=1)
+    return fixed, mesh.faces[subdivision.facet[fixed], slot]

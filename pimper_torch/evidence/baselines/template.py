@@ -220,7 +220,7 @@ def fit_colours(
     """Fit every channel's albedo to all views, shading given; zero where nothing is lit.
 
     Args:
-        seen: See :func:`registered_views`; one view is held at a time.
+        seen: See :func:`registered_views`; one view is in memory at a time.
         lights: One a view.
         basis: What the lights are linear in, ``(1, n)`` or ``n``; shading below zero is none.
     """

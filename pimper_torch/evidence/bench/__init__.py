@@ -1,1 +1,1 @@
-"""The table: scenes, presets and rivals, measured alike."""
+"""The table: scenes, presets and baselines, measured in the same way."""

@@ -28,7 +28,7 @@ def with_common(
     Args:
         rows: One a method.
         covered: True where rays of the view meet truth and method; ``None`` for methods
-            without a surface, which limit nobody.
+            without a surface, which limit no other.
         meshes: The surfaces as files, in the frame of the truth.
         maps: The truth in that view alone.
     """

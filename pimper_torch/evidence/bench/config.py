@@ -22,7 +22,7 @@ METHODS = {
         "colmap-dense",
     ),
 }
-"""What each scale runs unless told otherwise."""
+"""What each scale runs by default."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +32,7 @@ class BenchConfig:
     Attributes:
         scale: quick: 16 photographs of 640x480 a scene; full: 30 of 1600x1200.
         scenes: Names of rendered scenes, or folders that `pimper render` wrote.
-        methods: Presets, YAML files of settings, and rivals. None is those of the scale: quick
+        methods: Presets, YAML files of settings, and baselines. None is those of the scale: quick
             runs default, smoothed and global-stereo; full also paper, lim, pmvs, openmvs and
             colmap-dense.
         masks: Give the methods the true masks of the object; without, they see the table too.

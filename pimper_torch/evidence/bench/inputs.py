@@ -28,7 +28,7 @@ class Inputs(Record):
 
     Attributes:
         scene: Cameras and cloud, found or true, and the photographs.
-        coarse: Facets for the rivals that start from some; of the default preset.
+        coarse: Facets for the baselines that start from some; of the default preset.
         capture: The truth, without photographs and maps.
         surface: Its surface, prepared for the comparison with all methods.
         maps: Of the methods' reference view alone, for those of all fill the memory.

@@ -1,4 +1,4 @@
-"""The most memory that a part of the program held, not the program as a whole."""
+"""The peak memory of a part of the program, not of the program as a whole."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -14,8 +14,8 @@ def peak_memory() -> Iterator[Callable[[], float | None]]:
     """Forget the former peak of resident memory when the ``with`` block begins.
 
     The operating system's own peak is of the whole life of a process, so that a frugal method
-    would inherit that of the one before. What was held already counts, what external programs
-    hold does not.
+    would inherit that of the one before. What was in use before counts, what external programs
+    use does not.
 
     Yields:
         A function that gives the peak since then in MB; ``None`` where the system, other than

@@ -1,4 +1,4 @@
-"""Presets and rivals under one signature: a sparse scene and a coarse mesh in, an estimate out."""
+"""Presets and baselines under one signature: sparse scene and coarse mesh in, estimate out."""
 
 import time
 from collections.abc import Callable
@@ -48,7 +48,7 @@ class Outcome(Record):
 
 Method = Callable[[SparseScene, CoarseMesh], Outcome]
 
-_RIVALS: dict[str, Callable[[], nn.Module]] = {
+_BASELINES: dict[str, Callable[[], nn.Module]] = {
     "smoothed": Smoothed,
     "global-stereo": GlobalStereo,
     "lim": Lim,
@@ -59,17 +59,19 @@ _RIVALS: dict[str, Callable[[], nn.Module]] = {
 
 
 def method_named(name: str) -> Method:
-    """Find a rival by name, or a preset, or a YAML file of settings.
+    """Find a baseline by name, or a preset, or a YAML file of settings.
 
     Raises:
         ConfigError: Nothing has that name.
     """
-    if name in _RIVALS:
-        return _rival(_RIVALS[name]())
+    if name in _BASELINES:
+        return _baseline(_BASELINES[name]())
     try:
         return _preset(name)
     except ConfigError as error:
-        raise ConfigError(f"method {name!r}: {error} Rivals are {', '.join(_RIVALS)}.") from error
+        raise ConfigError(
+            f"method {name!r}: {error} Rivals are {', '.join(_BASELINES)}."
+        ) from error
 
 
 def _preset(name: str) -> Method:
@@ -93,7 +95,7 @@ def _preset(name: str) -> Method:
     return run
 
 
-def _rival(module: nn.Module) -> Method:
+def _baseline(module: nn.Module) -> Method:
     def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
         began = time.perf_counter()
         estimate = module(scene, coarse)

@@ -24,7 +24,7 @@ class Row(Record):
 
     Attributes:
         scene: Name.
-        method: Preset or rival.
+        method: Preset or baseline.
         mesh_points: Vertices of the coarse mesh.
         triangles: Its facets.
         samples: Samples of all templates times views, missing ones included.
@@ -97,9 +97,13 @@ def row_of_failure(scene: str, method: str, error: Exception, **known: int | flo
         error: What stopped it; a missing program is no failure.
         known: Fields that are known all the same, such as ``minutes``.
     """
-    said = str(error) or type(error).__name__
+    message = str(error) or type(error).__name__
     # The table shows the first line only.
-    note = f"not installed\n{said}" if isinstance(error, MissingProgramError) else f"failed: {said}"
+    note = (
+        f"not installed\n{message}"
+        if isinstance(error, MissingProgramError)
+        else f"failed: {message}"
+    )
     return Row(scene=scene, method=method, note=note, **known)  # type: ignore[arg-type]
 
 
@@ -244,7 +248,7 @@ def _mapping(value: object, where: str) -> dict[str, object]:
 
 
 def _finite(value: object) -> object:
-    """Replace what JSON cannot hold, and nobody measured, by null."""
+    """Replace figures that are not finite by null."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):

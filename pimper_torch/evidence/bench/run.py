@@ -1,4 +1,4 @@
-"""Scenes by methods, measured alike."""
+"""Scenes by methods, measured in the same way."""
 
 import tempfile
 import time

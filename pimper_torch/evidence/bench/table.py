@@ -160,9 +160,9 @@ def terminal(table: Table) -> Group:
     """
     parts: list[RenderableType] = []
     for title, shown in columns(table.rows).items():
-        told = [row for row in table.rows if any(_is_known(one.value(row)) for one in shown)]
-        if told:
-            parts.append(_grid(f"{title}, scale {table.scale}", shown, told))
+        shown_rows = [row for row in table.rows if any(_is_known(one.value(row)) for one in shown)]
+        if shown_rows:
+            parts.append(_grid(f"{title}, scale {table.scale}", shown, shown_rows))
     # Text, for a name in brackets is no markup.
     parts += [Text(f"{row.scene}, {row.method}: {row.note}") for row in table.rows if row.note]
     return Group(*parts)

@@ -52,7 +52,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
     Raises:
         PimperError: An impossible setting, or the folder holds something else.
-        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
     """
     kept = user_cache()
 
@@ -62,7 +62,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         cache: Annotated[Path, tyro.conf.arg(metavar="DIR")] = kept,
         overwrite: Flag = False,
     ) -> _Job:
-        """Run presets and rivals on scenes with known truth, and print and save the table.
+        """Run presets and baselines on scenes with known truth, and print and save the table.
 
         Args:
             out: Folder for the table, its figures and all surfaces; new or empty.

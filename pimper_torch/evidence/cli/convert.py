@@ -83,7 +83,7 @@ def _named(name: str) -> object:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadOptions:
-    """What a reader may be told; each goes with the layouts that know it.
+    """Options of readers; each goes with the layouts that know it.
 
     Attributes:
         scan: Number of the scene or scan; the DTU sets need one.
@@ -115,7 +115,7 @@ _OPTIONS = tuple(field.name for field in dataclasses.fields(ReadOptions))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """All that a conversion is told."""
+    """The arguments of a conversion."""
 
     data: Path
     out: Path
@@ -144,7 +144,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments, and refuse what can be told without reading DATA.
+    """Read the arguments, and check what can be checked without reading DATA.
 
     Raises:
         PimperError: The folder for the result is taken, or there is no data.
@@ -160,7 +160,7 @@ def parse(arguments: Sequence[str]) -> Job:
     """Read the arguments of ``convert``.
 
     Raises:
-        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
     """
 
     def convert(
@@ -181,7 +181,7 @@ def parse(arguments: Sequence[str]) -> Job:
             source: Layout of DATA.
             target: Layout to write.
             overwrite: Replace a former result in OUT.
-            options: What the reader is told.
+            options: Of the reader.
         """
         return Job(
             data=data,

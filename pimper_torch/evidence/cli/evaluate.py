@@ -51,7 +51,7 @@ class EvaluateOptions:
         truth_layout: What TRUTH is. `mesh`: a mesh file or point cloud in the result's frame;
             `rendered`: a folder that `pimper render` wrote; `dtu-mvs`: the folder of the
             DTU multi-view stereo set, with its protocol if ObsMask is there;
-            `diligent-mv`: an object's folder. `auto` tells the first two apart.
+            `diligent-mv`: an object's folder. `auto` distinguishes the first two.
         scan: Number of the scan of `dtu-mvs`.
         alignment: Before measuring: `none`, `cameras` (similarity on the cameras both have),
             `icp` (trimmed similarity between the surfaces, from the cameras on), or `auto`:
@@ -98,7 +98,7 @@ class EvaluateOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """All that an evaluation is told."""
+    """The arguments of an evaluation."""
 
     result: Path
     truth: Path
@@ -135,7 +135,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments, and refuse what can be told without reading RESULT and TRUTH.
+    """Read the arguments, and check what can be checked without reading RESULT and TRUTH.
 
     Raises:
         PimperError: An impossible setting, nothing to measure, or files that cannot be written.
@@ -155,7 +155,7 @@ def parse(arguments: Sequence[str]) -> Job:
     """Read the arguments of ``evaluate``.
 
     Raises:
-        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
     """
 
     def evaluate(
@@ -202,7 +202,7 @@ def read_truth(job: Job, estimate: Estimate, config: EvaluateConfig) -> TruthRea
     grow with the number of its views.
 
     Raises:
-        InputError: TRUTH is not laid out as it was said to be, or ``--scan`` is missing.
+        InputError: TRUTH is not laid out as `--truth-layout` says, or ``--scan`` is missing.
     """
     layout, truth = job.options.truth_layout, job.truth
     if layout == "auto":
@@ -259,7 +259,7 @@ def mesh_capture(path: Path) -> Capture:
     """Read a mesh or a point cloud as a truth without photographs."""
     mesh = read_mesh(path)
     points = None if len(mesh.faces) else mesh.vertices_world
-    nobody = torch.zeros(0, dtype=torch.long)
+    empty = torch.zeros(0, dtype=torch.long)
     return Capture(
         views=Views(
             images=torch.zeros(0, 3, 1, 1),
@@ -269,8 +269,8 @@ def mesh_capture(path: Path) -> Capture:
         ),
         cameras=None,
         truth=Truth(mesh=mesh if points is None else None, points_world=points),
-        position=nobody,
-        light=nobody,
+        position=empty,
+        light=empty,
     )
 
 

@@ -57,10 +57,10 @@ def run(command: str, arguments: Sequence[str]) -> None:
                 figures={"photographs": job.config.num_views},
             )
         )
-    told = "" if job.config.encoding == "srgb" else " --photographs.response linear"
+    option = "" if job.config.encoding == "srgb" else " --photographs.response linear"
     Console().print(
         f"{job.out}/photos are the photographs, {job.out}/truth is what they show. Next:\n"
-        f"  pimper reconstruct {job.out}/photos -o RESULT{told}",
+        f"  pimper reconstruct {job.out}/photos -o RESULT{option}",
         highlight=False,
         soft_wrap=True,
         markup=False,
@@ -72,7 +72,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
     Raises:
         ConfigError: An impossible setting.
-        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
     """
 
     def render(

@@ -1,4 +1,4 @@
-"""Does a capture hold together? Finds the classic mistakes by what contradicts them.
+"""Is a capture consistent? Finds the classic mistakes by what contradicts them.
 
 Every mistake is a hypothesis with a way to undo it (:mod:`.mistakes`).
 The capture as given and as each hypothesis would have it are scored by whatever evidence
@@ -137,8 +137,8 @@ def _check_cameras(
         near = [
             name for name, value in zip(names, total, strict=True) if value > total[best] - _TIE
         ]
-        rivals = tuple(name for name in near if name != mistake.name)
-        findings.append(_named(mistake, scores, best, rivals))
+        alternatives = tuple(name for name in near if name != mistake.name)
+        findings.append(_named(mistake, scores, best, alternatives))
         return _with_cameras(subject, candidates[best])
     geometric = [values[0] for test, values in scores.items() if test != "features"]
     if geometric and max(geometric) < _HOPELESS:
@@ -186,7 +186,7 @@ def _camera_tests(subject: _Subject) -> dict[str, Callable[[Cameras], float]]:
 
 
 def _named(
-    mistake: CameraMistake, scores: dict[str, list[float]], best: int, rivals: tuple[str, ...]
+    mistake: CameraMistake, scores: dict[str, list[float]], best: int, alternatives: tuple[str, ...]
 ) -> Finding:
     evidence = {f"{test}, as given": values[0] for test, values in scores.items()}
     evidence |= {f"{test}, set right": values[best] for test, values in scores.items()}
@@ -195,7 +195,7 @@ def _named(
         meaning=mistake.meaning,
         remedy=mistake.remedy,
         evidence=evidence,
-        rivals=rivals,
+        alternatives=alternatives,
     )
 
 

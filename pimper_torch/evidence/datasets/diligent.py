@@ -55,7 +55,7 @@ class NormalMap(Record):
         normals: Unit, facing the viewer (``n_z < 0``), camera frame; zero off the mask.
         mask: True on the object.
         intrinsics: ``K`` in our pixels; ``None`` for an orthographic map.
-        depth: True depth along the camera's z, millimetres; infinite where nobody knows;
+        depth: True depth along the camera's z, millimetres; infinite where unknown;
             ``None`` if the set has none.
     """
 
@@ -257,8 +257,8 @@ def _rows_of_three(path: Path, kind: str) -> Float[Tensor, "row 3"]:
 
 def _read_depth(path: Path, kind: str) -> Float[Tensor, "height width"]:
     try:
-        with np.load(path, allow_pickle=False) as held:
-            array = held["depth_gt"].astype(np.float32)
+        with np.load(path, allow_pickle=False) as arrays:
+            array = arrays["depth_gt"].astype(np.float32)
     except Exception as error:  # numpy's readers raise whatever a damaged file leads to
         raise InputError(
             f"{path}: cannot be read ({error}); needed: an array depth_gt. Copy the file again."

@@ -123,7 +123,7 @@ def cones_touch(cameras: Cameras, masks: Bool[Tensor, "view height width"]) -> f
         points = _along_rim(small, view, mask, centre, radius)
         if points is None:
             continue
-        held = torch.ones(points.shape[:2], dtype=torch.bool)
+        covered = torch.ones(points.shape[:2], dtype=torch.bool)
         for other, wide in enumerate(spared):
             if other != view:
                 pixels, depth = project(points.reshape(-1, 3), *_of(small, other))
@@ -131,8 +131,8 @@ def cones_touch(cameras: Cameras, masks: Bool[Tensor, "view height width"]) -> f
                 on = torch.zeros_like(inside)
                 column, row = pixels[inside].long().unbind(dim=1)
                 on[inside] = wide[row, column]
-                held = held & on.reshape(held.shape)
-        found.append(float(held.any(dim=1).float().mean()))
+                covered = covered & on.reshape(covered.shape)
+        found.append(float(covered.any(dim=1).float().mean()))
     return float(np.mean(found)) if found else 0.0
 
 
@@ -335,9 +335,9 @@ def _coverage(
     factor = min(1.0, cells / max(height, width))
     high, wide = max(1, round(height * factor)), max(1, round(width * factor))
     drawn = nearest(mask, wide, high)
-    held = torch.zeros_like(mask)
-    held[row, column] = True
-    filled = adaptive_max_pool2d(held[None, None].float(), (high, wide))[0, 0] > 0
+    covered = torch.zeros_like(mask)
+    covered[row, column] = True
+    filled = adaptive_max_pool2d(covered[None, None].float(), (high, wide))[0, 0] > 0
     return float((drawn & filled).sum()) / max(1, int(drawn.sum()))
 
 

@@ -14,19 +14,19 @@ class Finding(Record):
         meaning: What is wrong.
         remedy: What to do about it.
         evidence: Figures that say so.
-        rivals: Other mistakes that would explain it about as well.
+        alternatives: Other mistakes that would explain it about as well.
     """
 
     name: str
     meaning: str
     remedy: str
     evidence: dict[str, float]
-    rivals: tuple[str, ...] = ()
+    alternatives: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         figures = ", ".join(f"{what} {value:.2g}" for what, value in self.evidence.items())
-        rivals = f" Or else: {', '.join(self.rivals)}." if self.rivals else ""
-        return f"{self.name}: {self.meaning} ({figures}). To do: {self.remedy}.{rivals}"
+        alternatives = f" Or else: {', '.join(self.alternatives)}." if self.alternatives else ""
+        return f"{self.name}: {self.meaning} ({figures}). To do: {self.remedy}.{alternatives}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

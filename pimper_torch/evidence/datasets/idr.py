@@ -238,8 +238,8 @@ def _matrices(path: Path, key: str, count: int) -> Float[Tensor, "view 4 4"]:
     try:
         with np.load(path, allow_pickle=False) as file:
             expect(isinstance(file, Mapping), path, _KIND, "an .npz archive", "a lone array")
-            held = sorted(name for name in file.files if name.startswith(f"{key}_"))
-            arrays = {name: np.asarray(file[name]) for name in held if "inv" not in name}
+            present = sorted(name for name in file.files if name.startswith(f"{key}_"))
+            arrays = {name: np.asarray(file[name]) for name in present if "inv" not in name}
     except (OSError, ValueError, EOFError, BadZipFile, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); needed: an archive of arrays as numpy.savez "

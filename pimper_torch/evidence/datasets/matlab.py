@@ -26,7 +26,7 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
         InputError: No such file, not a MATLAB file, or a variable is absent or no array of
             numbers; says what the file holds.
     """
-    held = variables(path, kind)
+    present = variables(path, kind)
     try:
         found = scipy.io.loadmat(path, variable_names=list(names))
     except Exception as error:  # scipy's readers raise whatever a damaged file leads to
@@ -37,7 +37,7 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
         path,
         kind,
         f"the variables {some(absent)}",
-        f"variables {some(sorted(held), at_most=12)}" if held else "no variables",
+        f"variables {some(sorted(present), at_most=12)}" if present else "no variables",
     )
     for name in names:
         numeric = isinstance(found[name], np.ndarray) and found[name].dtype.kind in "fiub"

@@ -58,7 +58,7 @@ def read_meshroom(
         images: Folder of the photographs, which are looked up by file name: the paths in the
             file are those of the machine that wrote it. By default ``images`` beside the file,
             or the file's own folder.
-        masks: Folder of masks, if somebody drew some.
+        masks: Folder of masks, if there are any.
         names: Keep these photographs, in this order.
         mesh: File of the true surface, if it is known.
         encoding: Response, saturation and black level of the files.

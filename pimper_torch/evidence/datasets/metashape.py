@@ -50,7 +50,7 @@ def read_metashape(
         folder: With one ``.xml`` file; or the file itself.
         images: Folder of the photographs, which are called as the cameras are labelled, with
             or without suffix; by default ``images`` beside the file, or the file's own folder.
-        masks: Folder of masks, if somebody drew some.
+        masks: Folder of masks, if there are any.
         names: Keep these photographs, in this order; names of files.
         mesh: File of the true surface, if it is known.
         encoding: Response, saturation and black level of the files.
@@ -217,9 +217,12 @@ def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, f
 
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
-    said = None if resolution is None else [resolution.get("width"), resolution.get("height")]
+    resolution_px = (
+        None if resolution is None else [resolution.get("width"), resolution.get("height")]
+    )
     width, height = (
-        int(side) for side in numbers(said, 2, f"resolution of the sensor {label}", path, _KIND)
+        int(side)
+        for side in numbers(resolution_px, 2, f"resolution of the sensor {label}", path, _KIND)
     )
     old = calibration.find("f") is None and calibration.find("fx") is not None
     expect(

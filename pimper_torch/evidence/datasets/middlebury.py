@@ -38,7 +38,7 @@ def read_middlebury(
 
     Args:
         folder: Of the set, or the ``_par.txt`` file itself.
-        masks: Folder of masks, if somebody drew some.
+        masks: Folder of masks, if there are any.
         names: Keep these photographs, in this order.
         mesh: File of the true surface, if it is known.
         encoding: Response, saturation and black level of the files.

@@ -41,7 +41,7 @@ def write_mask(views: Views, index: int, path: Path) -> None:
 
 
 def file_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Name a PNG file for each photograph: no folders, no two alike.
+    """Name a PNG file for each photograph: no folders, no two the same.
 
     >>> file_names(["a.jpg", "left/b.tif"])
     ('a.png', 'left_b.png')

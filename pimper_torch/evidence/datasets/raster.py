@@ -1,4 +1,4 @@
-"""Photographs and maps of a data set, read by path and shrunk alike."""
+"""Photographs and maps of a data set, read by path and shrunk by the same factor."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -147,9 +147,9 @@ def _said(cameras: Cameras, index: int) -> dict[str, float | int]:
 
 def _image(frame: Mapping[str, object], path: Path) -> Path:
     """Find the file of a frame, whose suffix may be left out."""
-    said = frame.get("file_path")
-    expect(isinstance(said, str) and said != "", path, _KIND, "a text as file_path", repr(said))
-    image = inside(path.parent, str(said).replace("\\", "/"), _KIND)
+    name = frame.get("file_path")
+    expect(isinstance(name, str) and name != "", path, _KIND, "a text as file_path", repr(name))
+    image = inside(path.parent, str(name).replace("\\", "/"), _KIND)
     if image.suffix.lower() in SUFFIXES:
         return image
     tried = [image.with_name(image.name + suffix) for suffix in (".png", *SUFFIXES)]
@@ -163,8 +163,8 @@ def _names(images: Sequence[Path], path: Path) -> list[str]:
     return [PurePosixPath(image.relative_to(path.parent)).as_posix() for image in images]
 
 
-def _photograph(said: Mapping[str, object], image: Path, name: str, path: Path) -> PosedPhotograph:
-    matrix = said.get("transform_matrix")
+def _photograph(frame: Mapping[str, object], image: Path, name: str, path: Path) -> PosedPhotograph:
+    matrix = frame.get("transform_matrix")
     expect(
         isinstance(matrix, list) and len(matrix) in (3, 4),
         path,
@@ -181,24 +181,24 @@ def _photograph(said: Mapping[str, object], image: Path, name: str, path: Path) 
         path,
         _KIND,
     )
-    mask = said.get("mask_path")
+    mask = frame.get("mask_path")
     return PosedPhotograph(
         name=name,
         image=image,
         mask=inside(path.parent, str(mask), _KIND) if mask else None,
-        lens=_lens(said, image, name, path),
+        lens=_lens(frame, image, name, path),
         cam_from_world=invert_rigid(pose),
     )
 
 
-def _lens(said: Mapping[str, object], image: Path, name: str, path: Path) -> Lens:
+def _lens(frame: Mapping[str, object], image: Path, name: str, path: Path) -> Lens:
     def value(key: str, default: float = 0.0) -> float:
-        given = said.get(key)
+        given = frame.get(key)
         if given is None:
             return default
         return float(numbers(given, 1, f"{key} of {name}", path, _KIND))
 
-    if "w" in said and "h" in said:
+    if "w" in frame and "h" in frame:
         width, height = value("w"), value("h")
     else:
         expect(image.is_file(), path, _KIND, f"the photograph {image.name}", "no such file")
@@ -216,9 +216,9 @@ def _lens(said: Mapping[str, object], image: Path, name: str, path: Path) -> Len
     fx, fy = focal or focal_y, focal_y or focal
     pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = str(said.get("camera_model") or "OPENCV")
+    model = str(frame.get("camera_model") or "OPENCV")
     kind, params = "PINHOLE", tuple[float, ...]()
-    if model == "OPENCV_FISHEYE" or said.get("is_fisheye") is True:
+    if model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True:
         kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     else:
         expect(model in _POLYNOMIAL, path, _KIND, f"a camera_model of {_POLYNOMIAL}", model)

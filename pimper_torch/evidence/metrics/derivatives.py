@@ -133,14 +133,14 @@ def check_derivatives(
             name: torch.stack([jumps[output] for _, jumps in each]) for name, each in moving.items()
         }
         smooth = {name: jump.double().mean(dim=1) <= _MAX_JUMPS for name, jump in jumps.items()}
-        apart = torch.stack([jumps[name][smooth[name]].any(dim=0) for name in inputs]).any(dim=0)
+        jumping = torch.stack([jumps[name][smooth[name]].any(dim=0) for name in inputs]).any(dim=0)
         sums = torch.randn(weights, values.numel(), generator=generator).to(values)
-        sums = torch.where(apart, 0, sums)
+        sums = torch.where(jumping, 0, sums)
         grads = [_gradients(values, some, live) for some in sums]
         for name in inputs:
             numeric = torch.stack([fine[output].flatten() for fine, _ in moving[name]])
             # A jump elsewhere may be infinite.
-            numeric = torch.where(apart, 0, numeric)
+            numeric = torch.where(jumping, 0, numeric)
             analytic = torch.stack([grad[name].flatten() for grad in grads])
             analytic = analytic @ paths[name].reshape(directions, -1).mT
             none = analytic.abs() <= _rounding(values.detach(), steps[1]) * values.numel() ** 0.5
@@ -176,15 +176,15 @@ def _differences(
         after, before = at(step), at(-step)
         central.append({key: (after[key] - before[key]) / (2 * step) for key in centre})
     coarse, fine = central
-    apart = {}
+    jumping = {}
     for key in centre:
         bend = (after[key] - 2 * centre[key] + before[key]) / steps[1]
         size = torch.maximum(coarse[key].abs(), fine[key].abs()).flatten()
         off = torch.maximum((coarse[key] - fine[key]).abs(), bend.abs()).flatten()
         floor = _rounding(centre[key], steps[1])
-        apart[key] = ~(off <= _JUMP * (size + size.median()) + floor)
+        jumping[key] = ~(off <= _JUMP * (size + size.median()) + floor)
         fine[key] = torch.where(fine[key].abs() <= floor, 0, fine[key])
-    return fine, apart
+    return fine, jumping
 
 
 def _rounding(values: Tensor, step: float) -> Tensor:

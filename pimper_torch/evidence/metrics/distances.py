@@ -86,9 +86,9 @@ class SurfaceComparison(Record):
             surroundings than to the object, and is left out of the accuracy.
         whole: With the completeness of the whole truth.
         seen: With that of the truth seen from at least ``seen_from`` positions; ``None`` if
-            nobody knows which it is, or none is.
+            it is unknown, or none is.
         seen_from: How many positions of the camera.
-        seen_fraction: Fraction of the truth that is seen so; ``None`` if nobody knows.
+        seen_fraction: Fraction of the truth that is seen so; ``None`` if unknown.
         calibration: Of the estimate's expected error, over its samples that count for the
             accuracy; ``None`` if it tells none.
     """

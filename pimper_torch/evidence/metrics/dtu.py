@@ -31,9 +31,9 @@ class DtuFigures(Record):
         median_completeness: The same.
         overall: Mean of the two means.
         points: Of the result after thinning.
-        judged: Of these, inside the mask.
-        judged_true: Points of the scan above the table.
-        capped_fraction: Fraction of the judged points left out of accuracy, 20 mm off or more.
+        evaluated: Of these, inside the mask.
+        evaluated_true: Points of the scan above the table.
+        capped_fraction: Fraction of the evaluated points left out of accuracy, 20 mm off or more.
         capped_fraction_true: Fraction of the scan's left out of completeness.
     """
 
@@ -43,8 +43,8 @@ class DtuFigures(Record):
     median_completeness: float
     overall: float
     points: int
-    judged: int
-    judged_true: int
+    evaluated: int
+    evaluated_true: int
     capped_fraction: float
     capped_fraction_true: float
 
@@ -79,14 +79,14 @@ def dtu_figures(
     dense = supersample(mesh, THINNING_MM)
     points = dense[thin(dense, THINNING_MM, generator)]
     truth = scan.detach().cpu().double()
-    judged = points[observed(points, protocol)]
+    evaluated = points[observed(points, protocol)]
     plane = protocol.plane.to(truth)
-    judged_true = truth[truth @ plane[:3] + plane[3] > 0]
-    accuracy = _near(judged, truth, protocol)
-    completeness = _near(judged_true, points, protocol)
+    evaluated_true = truth[truth @ plane[:3] + plane[3] > 0]
+    accuracy = _near(evaluated, truth, protocol)
+    completeness = _near(evaluated_true, points, protocol)
     if len(accuracy) == 0 or len(completeness) == 0:
         raise InputError(
-            f"of {len(points)} points of the result {len(judged)} lie in the observability mask "
+            f"of {len(points)} points of the result {len(evaluated)} lie in the observability mask "
             f"and {len(accuracy)} of these within {CAP_MM:g} mm of the scan; {len(completeness)} "
             "of the scan's are as near to the result. Needed: a result in the frame and the "
             "millimetres of the set. Align it by its cameras first."
@@ -98,10 +98,10 @@ def dtu_figures(
         median_completeness=float(completeness.median()),
         overall=float(accuracy.mean() + completeness.mean()) / 2,
         points=len(points),
-        judged=len(judged),
-        judged_true=len(judged_true),
-        capped_fraction=1 - len(accuracy) / len(judged),
-        capped_fraction_true=1 - len(completeness) / len(judged_true),
+        evaluated=len(evaluated),
+        evaluated_true=len(evaluated_true),
+        capped_fraction=1 - len(accuracy) / len(evaluated),
+        capped_fraction_true=1 - len(completeness) / len(evaluated_true),
     )
 
 

@@ -111,7 +111,7 @@ def evaluate(
             :func:`prepared_surface`.
         maps: The same data set with the maps of the views to compare in, where ``capture``
             was read without any to save memory.
-        dtu: Where the scan is judged, if it is one of the DTU set; needs the scan's points.
+        dtu: Where the scan is evaluated, if it is one of the DTU set; needs the scan's points.
 
     Raises:
         InputError: The alignment cannot be made, a view that was asked for is unknown, or
@@ -141,7 +141,7 @@ def evaluate(
 
 
 def prepared_surface(capture: Capture, config: EvaluateConfig) -> TrueSurface | None:
-    """Prepare the true surface for :func:`evaluate`; ``None`` if nobody knows it."""
+    """Prepare the true surface for :func:`evaluate`; ``None`` if it is unknown."""
     if capture.truth.mesh is None and capture.truth.points_world is None:
         return None
     return TrueSurface(

@@ -45,7 +45,7 @@ class ViewFigures(Record):
             the surroundings; the other figures are over these.
         pixels: Rays that meet the truth.
         transferred_normals: Of the normals that the mesh carries at its vertices; ``None`` if it
-            carries none or nobody knows the true ones.
+            carries none or the true ones are unknown.
         shape_normals: Of the normals of its shape: its faces', averaged at the vertices by
             area and blended between them.
         albedo: ``None`` where either side has none.
@@ -98,7 +98,7 @@ def meet_truth(
     """Cast the rays of a true view on a mesh.
 
     The truth is what its maps hold; where it has no depth map, its mesh is ray cast. It is
-    compared on the object alone if anybody said where that is: the truth's foreground, else
+    compared on the object alone where that is known: the truth's foreground, else
     the masks of the photographs. Rays that pass the object and meet the mesh on the truth's
     surroundings are misses.
 

@@ -40,7 +40,7 @@ def compare_lights(
     """Compare the directions of first-order lights, as they are and up to a rotation.
 
     Uncalibrated methods leave a rotation of all lights and normals together open, and normals
-    are often judged after it; both figures are given. The rotation minimises the summed
+    are often compared after it; both figures are given. The rotation minimises the summed
     squares of the distances between unit directions. Two lights or fewer, or lights in a
     plane with the origin, are brought nearer by it than they deserve.
 

@@ -29,8 +29,8 @@ def pitted_percent(
     >>> pitted_percent(angle, torch.ones(50, 50, dtype=torch.bool))
     0.04
     """
-    held = known.double()
-    both = torch.stack([torch.where(known, angle_deg, 0).double() * held, held])
+    weight = known.double()
+    both = torch.stack([torch.where(known, angle_deg, 0).double() * weight, weight])
     total, count = avg_pool2d(both, _ACROSS, stride=1, padding=_ACROSS // 2)
     around = total / torch.where(known, count, 1)
     pit = (around < _SOUND_DEG) & (angle_deg - around > _EXCESS_DEG)

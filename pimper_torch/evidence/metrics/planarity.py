@@ -18,7 +18,7 @@ from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_no
 from pimper_torch.geometry.topology import face_components
 from pimper_torch.records import Mesh, Record
 
-# Points that candidates for planes are judged by, and candidates for each plane.
+# Points that candidates for planes are scored on, and candidates for each plane.
 _JUDGES, _CANDIDATES = 20_000, 256
 
 # Rounds of fitting a plane to what lies near it, and taking what lies near that.

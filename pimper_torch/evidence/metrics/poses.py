@@ -32,13 +32,13 @@ class CameraFigures(Record):
         mean_center: Distance between the cameras' positions, scene units of the truth.
         median_center: The same.
         mean_center_percent: Of each true camera's distance from the object's centre; NaN
-            where nobody knows the object.
+            where the object is unknown.
         mean_center_percent_of_diagonal: Of the object's bounding box; NaN the same.
         mean_focal_percent: Of the focal length, absolute; images of unlike size are taken
             for resized ones.
         mean_position_percent: How far off the object's points are put when each is where our
             cameras' rays through its true pixels meet, of the diagonal: no surface made with
-            these cameras is nearer, but by chance. NaN where nobody knows the object.
+            these cameras is nearer, but by chance. NaN where the object is unknown.
         mean_bend_percent: The same once the points themselves were brought together: what
             another alignment cannot repair.
     """

@@ -226,13 +226,13 @@ def _dtu_rows(dtu: DtuFigures) -> Iterator[Row]:
     yield Row(
         name="accuracy",
         value=f"{dtu.mean_accuracy:.4f} mm; {dtu.median_accuracy:.4f} mm",
-        meaning=f"{dtu.judged} points in the mask, thinned to {THINNING_MM:g} mm: mean; median; "
+        meaning=f"{dtu.evaluated} points in the mask, thinned to {THINNING_MM:g} mm: mean; median; "
         f"{_fraction(dtu.capped_fraction)} {cap}",
     )
     yield Row(
         name="completeness",
         value=f"{dtu.mean_completeness:.4f} mm; {dtu.median_completeness:.4f} mm",
-        meaning=f"{dtu.judged_true} points of the scan above the table: mean; median; "
+        meaning=f"{dtu.evaluated_true} points of the scan above the table: mean; median; "
         f"{_fraction(dtu.capped_fraction_true)} {cap}",
     )
     yield Row(name="overall", value=f"{dtu.overall:.4f} mm", meaning="mean of the two means")

@@ -44,7 +44,7 @@ def pair_views(
     if not pairs:
         raise InputError(
             f"no view is in both sets: found {', '.join(names[:3])}, ... and "
-            f"{', '.join(names_true[:3])}, ... Name the photographs alike in both."
+            f"{', '.join(names_true[:3])}, ... Give the photographs the same names in both."
         )
     ours, truth = torch.tensor(pairs).unbind(dim=1)
     return ours, truth

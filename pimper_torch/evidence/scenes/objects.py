@@ -1,7 +1,7 @@
 """The objects of the four published sequences, and others, grown from a seed.
 
 Each stands on ``z = 0`` round the z axis, is about 2.4 scene units large, and is seen from
--y. Surfaces, not brands: what is alike is how they reflect and how much texture they have.
+-y. Surfaces, not brands: they are similar in reflectance and in how much texture they have.
 """
 
 from collections.abc import Callable
@@ -91,7 +91,7 @@ def mug(generator: torch.Generator) -> tuple[SceneObject, ...]:
         generator, cells=(0.5, 0.06), darkest=0.5, brightest=0.8, contrast=0.3, colour=0.1
     )
     outside = CylinderRegion(radii=(_MUG_RADIUS - _MUG_WALL / 2, float("inf")))
-    texture = Painted(ground=plain, paint=decor, where=outside)
+    texture = Painted(base=plain, paint=decor, where=outside)
     mesh = moved(mug_mesh(), rotation_deg=-25.0)
     return (SceneObject(mesh=mesh, texture=texture, specular=0.045, roughness=0.22),)
 
@@ -141,7 +141,7 @@ def jar(generator: torch.Generator) -> tuple[SceneObject, ...]:
         tint=(0.94, 0.98, 1.0),
     )
     front = CylinderRegion(radii=(0.7, 1.0), heights=(0.62, 1.08), azimuths_deg=(-34.0, 34.0))
-    texture = Marked(ground=Painted(ground=glaze, paint=label, where=front), marks=blemishes)
+    texture = Marked(base=Painted(base=glaze, paint=label, where=front), marks=blemishes)
     return (SceneObject(mesh=jar_mesh(), texture=texture, specular=0.05, roughness=0.3),)
 
 
@@ -210,7 +210,7 @@ def potatoes(generator: torch.Generator) -> tuple[SceneObject, ...]:
         )
         mesh = moved(grown, scale=size, rotation_deg=rotation_deg)
         mesh = push_clear(mesh, [one.mesh for one in made], (x, y))
-        made.append(SceneObject(mesh=mesh, texture=Marked(ground=skin, marks=eyes)))
+        made.append(SceneObject(mesh=mesh, texture=Marked(base=skin, marks=eyes)))
     return tuple(made)
 
 

@@ -58,18 +58,18 @@ class Painted:
     """One texture with another on top of it in some places.
 
     Attributes:
-        ground: Underneath.
+        base: Underneath.
         paint: On top.
         where: Of the paint.
     """
 
-    ground: Texture
+    base: Texture
     paint: Texture
     where: CylinderRegion
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
         """Give the albedo at points."""
-        return torch.where(self.where(points)[..., None], self.paint(points), self.ground(points))
+        return torch.where(self.where(points)[..., None], self.paint(points), self.base(points))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,13 +77,13 @@ class Marked:
     """One texture darkened by another, such as by blemishes.
 
     Attributes:
-        ground: Multiplied by the marks.
+        base: Multiplied by the marks.
         marks: 1 where there are none.
     """
 
-    ground: Texture
+    base: Texture
     marks: Texture
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
         """Give the albedo at points."""
-        return self.ground(points) * self.marks(points)
+        return self.base(points) * self.marks(points)

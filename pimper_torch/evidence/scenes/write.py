@@ -61,7 +61,7 @@ def render_scene(
 ) -> Path:
     """Photograph a scene, and write photographs and truth to a folder.
 
-    The folder is there whole or not at all; what lies in it is told in
+    The folder is there whole or not at all; its contents are described in
     :mod:`pimper_torch.evidence.scenes.write`. The same settings give the same files, whatever the
     number of processes.
 

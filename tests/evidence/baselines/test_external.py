@@ -25,12 +25,12 @@ def script(path: Path, body: str) -> Path:
     return path
 
 
-def test_a_missing_program_is_named_with_the_position_to_get_it():
+def test_a_missing_program_is_named_with_its_source():
     with pytest.raises(MissingProgramError, match=r"tool is not installed.*https://tool.example"):
         TOOL.find()
 
 
-def test_what_is_given_goes_before_the_variable_before_the_path_before_usual_positions(
+def test_what_is_given_goes_before_the_variable_before_the_path_before_usual_folders(
     monkeypatch, tmp_path
 ):
     for name in ("usual", "named", "given"):

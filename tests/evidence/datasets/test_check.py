@@ -203,10 +203,10 @@ def test_a_pose_mistake_is_named_whatever_tells_it(whole, name, evidence):
     (finding,) = check_capture(with_pose(EVIDENCE[evidence](whole), name)).findings
     if evidence == "masks" and name in ("flipped_x", "flipped_y"):
         # Silhouettes are the same for a body and its mirror image seen from the other side.
-        assert {finding.name, *finding.rivals} == {"flipped_x", "flipped_y"}
+        assert {finding.name, *finding.alternatives} == {"flipped_x", "flipped_y"}
     else:
         assert finding.name == name
-        assert finding.rivals == () or evidence == "masks"
+        assert finding.alternatives == () or evidence == "masks"
 
 
 @pytest.mark.parametrize(

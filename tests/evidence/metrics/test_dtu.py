@@ -34,7 +34,7 @@ def test_a_raised_grid_is_off_by_its_height_in_both_directions(generator):
     assert found.median_accuracy == pytest.approx(0.3)
     assert found.mean_completeness == pytest.approx(0.3)
     assert found.overall == pytest.approx(0.3)
-    assert found.points == found.judged == found.judged_true == 400
+    assert found.points == found.evaluated == found.evaluated_true == 400
 
 
 def test_points_outside_the_mask_count_for_completeness_alone(generator):
@@ -44,7 +44,7 @@ def test_points_outside_the_mask_count_for_completeness_alone(generator):
     raised[raised[:, 0] < 14.5, 2] += 3.0  # would spoil the accuracy
     found = dtu_figures(cloud(raised), grid(), protocol_of(mask), generator)
     assert found.mean_accuracy == 0
-    assert found.judged == 200
+    assert found.evaluated == 200
     # Half the scan is 3 mm from its own point; the row next to the good half is 1 mm away.
     far = [min(3.0, float(rows)) for rows in range(1, 11)]
     assert found.mean_completeness == pytest.approx(sum(far) / 20, rel=1e-6)
@@ -55,7 +55,7 @@ def test_the_scan_below_the_table_need_not_be_found(generator):
     scan = torch.cat([grid(), grid(z=2.0)])
     found = dtu_figures(cloud(grid()), scan, protocol_of(plane=(0, 0, 1, -5.0)), generator)
     assert found.mean_completeness == 0
-    assert found.judged_true == 400
+    assert found.evaluated_true == 400
     whole = dtu_figures(cloud(grid()), scan, protocol_of(), generator)
     assert whole.mean_completeness == pytest.approx(4.0)  # half is 8 mm off
 
@@ -85,11 +85,11 @@ def test_a_point_is_in_the_voxel_whose_centre_is_nearest():
     assert not observed(outside, protocol).any()
 
 
-def test_points_beyond_the_cells_of_the_box_are_not_judged(generator):
+def test_points_beyond_the_cells_of_the_box_are_not_evaluated(generator):
     # A box of 40 mm has one cell of 60 mm; a mask may reach past it.
     scan = torch.cat([grid(), torch.tensor([[61.0, 10, 10]]).double()])
     found = dtu_figures(cloud(grid()), scan, protocol_of(), generator)
-    assert found.judged_true == 401
+    assert found.evaluated_true == 401
     assert found.capped_fraction_true == pytest.approx(1 / 401)
 
 

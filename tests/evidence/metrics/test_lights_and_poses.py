@@ -117,6 +117,6 @@ def test_positions_of_resized_photographs_are_compared_in_their_own_pixels(make,
     assert found.mean_position_percent < 1e-9
 
 
-def test_nobody_knows_positions_without_an_object(make):
+def test_positions_are_unknown_without_an_object(make):
     found = compare_cameras(make.cameras(), make.cameras(), IDENTITY, views=5)
     assert found.mean_position_percent != found.mean_position_percent

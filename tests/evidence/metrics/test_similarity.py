@@ -95,7 +95,7 @@ def test_views_are_paired_by_name():
     ours, truth = pair_views(["c", "a", "x"], ["a", "b", "c"])
     assert ours.tolist() == [0, 1]
     assert truth.tolist() == [2, 0]
-    with pytest.raises(InputError, match="Name the photographs alike"):
+    with pytest.raises(InputError, match="the same names in both"):
         pair_views(["p"], ["q"])
 
 

@@ -287,9 +287,9 @@ def test_paint_covers_and_marks_darken():
         return torch.full_like(at, 0.25)
 
     front = CylinderRegion(radii=(0.5, 1.5), heights=(0.0, 1.0), azimuths_deg=(-30.0, 30.0))
-    painted = Painted(ground=white, paint=gray, where=front)
+    painted = Painted(base=white, paint=gray, where=front)
     assert painted(points)[:, 0].tolist() == [0.25, 1.0, 1.0]
-    assert Marked(ground=painted, marks=gray)(points)[:, 0].tolist() == [0.0625, 0.25, 0.25]
+    assert Marked(base=painted, marks=gray)(points)[:, 0].tolist() == [0.0625, 0.25, 0.25]
 
 
 @pytest.mark.parametrize("name", objects.RECIPES)

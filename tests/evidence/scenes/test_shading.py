@@ -54,7 +54,7 @@ def test_no_more_light_leaves_a_white_surface_than_arrives(roughness, tilt_deg):
     assert (mirrored / torch.pi).sum() * solid_angle > 0.01  # rough facets hide one another
 
 
-def test_light_and_eye_may_change_positions(generator):
+def test_light_and_eye_may_change_roles(generator):
     pairs = normalize(torch.rand(2, 100, 3, generator=generator, dtype=torch.float64), dim=-1)
     there, back = (split(UP, *pair, 0.04, 0.3)[1] for pair in (pairs, pairs.flip(0)))
     assert_close(there / pairs[0, :, 2], back / pairs[1, :, 2])
