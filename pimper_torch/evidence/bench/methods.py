@@ -70,7 +70,7 @@ def method_named(name: str) -> Method:
         return _preset(name)
     except ConfigError as error:
         raise ConfigError(
-            f"method {name!r}: {error} Rivals are {', '.join(_BASELINES)}."
+            f"method {name!r}: {error} Baselines are {', '.join(_BASELINES)}."
         ) from error
 
 
