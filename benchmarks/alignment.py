@@ -162,7 +162,7 @@ def with_height_field(
                 albedo=depth.new_ones(1).expand(count, height, width, 1),
                 lights_patch=depth.new_ones(count, 1, 4),
                 valid=templates.inside,
-                confidence=depth.new_ones(1).expand(count, height, width),
+                information=depth.new_ones(1).expand(count, height, width),
                 status=0 * one.long(),
                 convergence=Convergence(
                     iterations=one.long(), residual=0 * one, cause=0 * one.long()

@@ -1,3 +1,4 @@
+import math
 import os
 from functools import cache
 from pathlib import Path
@@ -133,7 +134,7 @@ def reconstruction():
         albedo=ones[..., None].expand(2, 4, 4, 3),
         lights_patch=lights_patch,
         valid=ones > 0,
-        confidence=ones,
+        information=1e3 * ones,
         status=torch.tensor([0, 4]),
         convergence=Convergence(
             iterations=torch.tensor([12, 40]),
@@ -229,7 +230,7 @@ def lift():
                     albedo=torch.ones(*shape, 3).double(),
                     lights_patch=rotate_lights(templates.patch_from_world, scene.lights_world),
                     valid=templates.inside,
-                    confidence=torch.full(shape, 0.9, dtype=torch.float64),
+                    information=torch.full(shape, 1 / math.radians(8 / 3) ** 2).double(),
                     status=torch.zeros(count, dtype=torch.long),
                     convergence=Convergence(
                         iterations=torch.ones(count, dtype=torch.long),

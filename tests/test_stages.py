@@ -69,7 +69,7 @@ def spoilt(normals):
             lambda found: changed(found, normals_patch=opengl),
             "they look like OpenGL's, with y up and z to the viewer: negate both",
         ),
-        (lambda found: changed(found, confidence=lambda c: c + 2), "outside .0, 1., such as"),
+        (lambda found: changed(found, information=lambda i: -1 - i), "outside .0, inf., such as -"),
     ],
 )
 def test_a_factorization_of_ones_own_is_told_what_is_wrong(factorized, mistake, told):

@@ -39,7 +39,7 @@ def streamed(given, factorize: nn.Module | None = None):
 def values(swept):
     for photometry, heights in zip(swept.photometric.buckets, swept.buckets, strict=True):
         yield from (photometry.normals_patch, photometry.albedo, photometry.lights_patch)
-        yield from (photometry.valid, photometry.confidence, heights.offset, heights.information)
+        yield from (photometry.valid, photometry.information, heights.offset, heights.information)
 
 
 def test_a_few_buckets_at_a_time_give_what_all_patches_give_at_once(given):

@@ -57,10 +57,11 @@ class Blend(Record):
         normals_world: Photometric, unit; zero where no patch has one.
         albedo: Linear; zero where no patch has one.
         seen: True where normal and albedo are photometric.
-        confidence: In [0, 1]; 0 where not supported or not determined by the photographs.
+        normal_information: Inverse variance of the normals, one over squared radians; 0 where not
+            supported or not determined by the photographs.
         offsets: How far outside the height fields the sweep has the surface, along their normals;
             0 where not swept.
-        information: Inverse variance of the offsets; 0 where not swept.
+        offset_information: Inverse variance of the offsets; 0 where not swept.
     """
 
     heights: Float[Tensor, " vertex"]
@@ -68,9 +69,9 @@ class Blend(Record):
     normals_world: Float[Tensor, "vertex 3"]
     albedo: Float[Tensor, "vertex channel"]
     seen: Bool[Tensor, " vertex"]
-    confidence: Float[Tensor, " vertex"]
+    normal_information: Float[Tensor, " vertex"]
     offsets: Float[Tensor, " vertex"]
-    information: Float[Tensor, " vertex"]
+    offset_information: Float[Tensor, " vertex"]
 
 
 def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Float[Tensor, "vertex 3"]:
@@ -103,10 +104,15 @@ def blend_patches(
     facet's edge to 1 as far inside: the union is continuous across seams, and on the centre
     of a seam both patches count alike. Where three or more patches meet, one that lies
     ``d > outlier_samples`` samples from the weighted median has its weight divided by
-    ``1 + 10 (d / outlier_samples - 1)^2``: a wild patch is outvoted. Swept offsets count by
-    their information, besides.
+    ``1 + 10 (d / outlier_samples - 1)^2``: a wild patch is outvoted.
 
-    Differentiable in templates, depth, normals, albedo, confidence and swept heights; which
+    Normals and swept offsets ``x`` of inverse variance ``I`` are averaged by it besides,
+    :math:`\sum w I x / \sum w I`, and the mean has the inverse variance
+    :math:`\sum w I / \sum w`: patches see the same photographs, so that their errors are
+    correlated and a second one adds nothing. It is never too large, whatever the correlation, as
+    :math:`(\sum w I^{1/2})^2 \le \sum w \sum w I`. A patch that does not know has ``I = 0``.
+
+    Differentiable in templates, depth, normals, albedo, information and swept heights; which
     patches and samples are blended is constant.
     """
     coarse = depths.patches.coarse
@@ -125,23 +131,15 @@ def blend_patches(
             list(buckets),
         )
     )
-    joined = _Estimates(
-        vertex=torch.cat([one.vertex for one in estimates]),
-        height=torch.cat([one.height for one in estimates]),
-        weight=torch.cat([one.weight for one in estimates]),
-        scale=torch.cat([one.scale for one in estimates]),
-        known=torch.cat([one.known for one in estimates]),
-        values=torch.cat([one.values for one in estimates]),
-        swept=torch.cat([one.swept for one in estimates]),
-    )
-    return _blend(joined, len(subdivision.points), outlier_samples)
+    return _blend(_Estimates.cat(estimates), len(subdivision.points), outlier_samples)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Estimates:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Estimates(Record):
     """What single patches say of single vertices.
 
-    ``values`` are normal, confidence, albedo; ``swept`` is information, and with it the offset.
+    ``albedo`` counts where ``known``. ``normal`` and ``offset`` begin with the information, which
+    what follows is multiplied by.
     """
 
     vertex: Int[Tensor, " estimate"]
@@ -149,8 +147,9 @@ class _Estimates:
     weight: Float[Tensor, " estimate"]
     scale: Float[Tensor, " estimate"]
     known: Float[Tensor, " estimate"]
-    values: Float[Tensor, "estimate value"]
-    swept: Float[Tensor, "estimate 2"]
+    albedo: Float[Tensor, "estimate channel"]
+    normal: Float[Tensor, "estimate 4"]
+    offset: Float[Tensor, "estimate 2"]
 
 
 def _estimates(
@@ -179,24 +178,26 @@ def _estimates(
     weight = _taper(barycentric, bands)
     found = present & hit & (weight > 0)
     xy = points[..., :2]
-    inverse = templates.patch_from_world.mT
-    normals_world = photometry.normals_patch @ inverse[:, None, :3, :3].mT
-    layers = torch.cat([normals_world, photometry.confidence[..., None], photometry.albedo], dim=-1)
-    place = (xy, templates.origin, templates.spacing)
-    values = sample_raster(layers.movedim(-1, 1), *place, valid=photometry.valid)
-    known = sample_raster(photometry.valid[:, None].to(height_field.depth), *place)[:, 0]
-    of_sweep = values.new_zeros(values.shape[0], 2, values.shape[2])
+    raster = templates.origin, templates.spacing
+    valid = photometry.valid
+    known = sample_raster(valid[:, None].to(height_field.depth), xy, *raster)[:, 0]
+    normals_world = photometry.normals_patch @ templates.patch_from_world[:, None, :3, :3]
+    certain = photometry.information[..., None]
+    layers = torch.cat([certain, certain * normals_world, photometry.albedo], dim=-1)
+    values = sample_raster(layers.movedim(-1, 1), xy, *raster, valid=valid)
+    offset = values.new_zeros(values.shape[0], 2, values.shape[2])
     if swept is not None:
-        told = torch.stack([swept.information, swept.information * swept.offset], dim=1)
-        of_sweep = sample_raster(told, *place)
+        layers = torch.stack([swept.information, swept.information * swept.offset], dim=1)
+        offset = sample_raster(layers, xy, *raster)
     return _Estimates(
         vertex=vertex[found],
         height=((points - origins) * along).sum(dim=-1)[found],
         weight=weight[found],
         scale=templates.spacing[:, None].expand_as(weight)[found],
         known=known[found],
-        values=values.movedim(1, -1)[found],
-        swept=of_sweep.movedim(1, -1)[found],
+        normal=values[:, :4].movedim(1, -1)[found],
+        albedo=values[:, 4:].movedim(1, -1)[found],
+        offset=offset.movedim(1, -1)[found],
     )
 
 
@@ -300,28 +301,35 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     """Average the estimates of each vertex."""
     vertex, height = estimates.vertex, estimates.height
     weight = estimates.weight * _agreement(estimates, count, outlier_samples)
-    total = _sum_at(vertex, weight, count)
     seen_weight = weight * estimates.known
-    seen_total = _sum_at(vertex, seen_weight, count)
-    supported, seen = total > _MIN_WEIGHT, seen_total > _MIN_WEIGHT
+    total, seen = _sum_at(vertex, weight, count), _sum_at(vertex, seen_weight, count)
+    supported = total > _MIN_WEIGHT
     per_support = torch.where(supported, 1 / total.clamp_min(_MIN_WEIGHT), 0)
-    per_seen = torch.where(seen, 1 / seen_total.clamp_min(_MIN_WEIGHT), 0)
-    values = _sum_at(vertex, seen_weight[:, None] * estimates.values, count)
-    normals, confidence, albedo = values[:, :3], values[:, 3], values[:, 4:]
-    told = _sum_at(vertex, weight[:, None] * estimates.swept, count)
-    information = told[:, 0]
-    some = information > 0
+    certain, normals = _split(_sum_at(vertex, seen_weight[:, None] * estimates.normal, count))
+    swept, offsets = _split(_sum_at(vertex, weight[:, None] * estimates.offset, count))
+    photometric = (seen > _MIN_WEIGHT) & (certain > 0)
+    albedo = _sum_at(vertex, seen_weight[:, None] * estimates.albedo, count)
+    per_seen = torch.where(photometric, 1 / seen.clamp_min(_MIN_WEIGHT), 0)
     return Blend(
         heights=_sum_at(vertex, weight * height, count) * per_support,
         supported=supported,
-        normals_world=normalize(normals * per_seen[:, None], dim=-1),
+        normals_world=normalize(normals, dim=-1) * photometric[:, None],
         albedo=albedo * per_seen[:, None],
-        seen=seen,
-        # Divided by the whole weight: a patch that does not know speaks against certainty.
-        confidence=(confidence * per_support).clamp(0, 1),
-        offsets=torch.where(some, told[:, 1] / torch.where(some, information, 1), 0),
-        information=information * per_support,
+        seen=photometric,
+        normal_information=certain * per_support * photometric,
+        offsets=offsets[:, 0],
+        offset_information=swept * per_support,
     )
+
+
+def _split(
+    sums: Float[Tensor, "vertex layer"],
+) -> tuple[Float[Tensor, " vertex"], Float[Tensor, "vertex value"]]:
+    """Give the summed information and the mean by it of what follows; 0 where there is none."""
+    information = sums[:, 0]
+    some = information > 0
+    mean = sums[:, 1:] / torch.where(some, information, 1)[:, None]
+    return information, torch.where(some[:, None], mean, 0)
 
 
 def _agreement(

@@ -35,7 +35,6 @@ from pimper_torch.fusion.terms import (
 from pimper_torch.geometry.subdivision import Subdivision, subdivide, transferred
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_edges
-from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.records import (
     Convergence,
     DepthPatches,
@@ -65,6 +64,14 @@ _FOLD = 0.25
 # Squared turn from vertex to vertex that even flat facets are said to have, radians; and the
 # least variance of the slopes that a surface has already.
 _MIN_ROTATION, _MIN_DOUBT = 1e-8, 1e-6
+
+# Standard error of slopes that a surface without any normal has: a choice.
+_UNKNOWN_SLOPE_DEG = 8.0
+
+# Normals count as if they had this standard error at least, and at most. No normals of rendered
+# scenes are as good as the one in the mean (1.6 degrees, `benchmarks/README.md`); the other only
+# keeps numbers in range.
+_NORMAL_ERROR_DEG = 0.25, 800.0
 
 # Between its vertices the surface is flat: points tell no more than this fraction of a spacing.
 _FINEST = 0.03
@@ -182,7 +189,7 @@ class Fuse(Stage):
     that of normals known to err alike (:mod:`~pimper_torch.fusion.bands`).
 
     The surface's normals are its own; its albedo is continued over what no light tells,
-    without confidence. Differentiable in templates, normals, albedo, confidence, swept heights
+    without confidence. Differentiable in templates, normals, albedo, information, swept heights
     and the cloud, through every solve; which patches, samples, edges, vertices and faces take part
     is constant.
     """
@@ -203,7 +210,8 @@ class Fuse(Stage):
         scene units; its iterations are the solves at full size.
 
         Raises:
-            InputError: A normal, a confidence or a height that is none.
+            InputError: A normal that is not unit, an inverse variance below 0 or a height that
+                is not finite.
         """
         rough = self._task(swept, _COARSER * self.config.samples_per_vertex)
         contacts = self._contacts(rough, swept, contours)
@@ -225,7 +233,7 @@ class Fuse(Stage):
             barycentric=subdivision.barycentric,
             normals_world=normals,
             albedo=about_mean(blend.albedo, blend.seen, task.edges),
-            confidence=blend.confidence,
+            information=blend.normal_information,
             expected_error=error,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=moved.device),
@@ -255,7 +263,7 @@ class Fuse(Stage):
             subdivision=subdivision,
             facets=facets,
             directions=directions,
-            blend=blend.replace(information=density * blend.information),
+            blend=blend.replace(offset_information=density * blend.offset_information),
             places=places,
             shape=vertex_normals(places, subdivision.faces),
             edges=face_edges(subdivision.faces)[0],
@@ -280,8 +288,8 @@ class Fuse(Stage):
             return []
         blend = task.blend
         facing = (task.shape * task.directions).sum(dim=-1)
-        told = blend.heights, blend.offsets, blend.information, facing
-        upright = upright_heights(blend.information, facing)
+        told = blend.heights, blend.offsets, blend.offset_information, facing
+        upright = upright_heights(blend.offset_information, facing)
         shared = None if common is None else alike(common, task.subdivision.facet, upright)
         return [swept_heights(*told, task.correlated, shared)]
 
@@ -377,9 +385,7 @@ class Fuse(Stage):
     def _known(self, task: _Task) -> tuple[Bool[Tensor, " vertex"], Bool[Tensor, " edge"]]:
         """Mark vertices that light tells normals of, and the edges between such."""
         blend = task.blend
-        known = blend.seen & (blend.confidence > 0)
-        if not self.config.slopes:
-            known = torch.zeros_like(known)
+        known = blend.seen & self.config.slopes
         lit = known[task.edges].all(dim=1)
         return known, lit & upright(task.edges, task.directions, blend.normals_world)
 
@@ -391,7 +397,7 @@ class Fuse(Stage):
         common: Common | None = None,
     ) -> Terms:
         """Give what the normals say, singly or knowing what they err by together."""
-        variance = _variance(task.blend.confidence)
+        variance = _variance(task.blend.normal_information)
         edges = task.edges[lit]
         return slopes(edges, task.subdivision.points, task.directions, normals, variance, common)
 
@@ -428,7 +434,7 @@ class Fuse(Stage):
     def _doubt(self, task: _Task, known: Bool[Tensor, " vertex"]) -> Float[Tensor, ""]:
         """Estimate the variance of the slopes that the surface has already, from the others."""
         if not bool(known.any()):
-            return task.shape.new_tensor(math.radians(HALF_CONFIDENCE_DEG) ** 2)
+            return task.shape.new_tensor(math.radians(_UNKNOWN_SLOPE_DEG) ** 2)
         apart = (task.blend.normals_world - task.shape)[known].square().sum(dim=-1)
         return (apart.median() / MEDIAN_OF_TILT).clamp_min(_MIN_DOUBT)
 
@@ -473,7 +479,7 @@ def _rotation(
     return (square.sum() / max(len(edges), 1)).clamp_min(_MIN_ROTATION)
 
 
-def _variance(confidence: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
-    """Undo confidence: the squared standard error of normals, in radians."""
-    half = math.radians(HALF_CONFIDENCE_DEG)
-    return half**2 * (1 / confidence.clamp(1e-4, 1 - 1e-3) - 1)
+def _variance(information: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
+    """Give the variance of normals, radians squared, within what single precision can solve for."""
+    low, high = (math.radians(error) ** 2 for error in _NORMAL_ERROR_DEG)
+    return 1 / information.clamp(1 / high, 1 / low)

@@ -74,7 +74,7 @@ class Repair(Stage):
             normals_world=torch.where(
                 beside[:, None], vertex_normals(vertices, faces), surface.normals_world
             ),
-            confidence=torch.where(moved, 0, surface.confidence),
+            information=torch.where(moved, 0, surface.information),
         )
 
 

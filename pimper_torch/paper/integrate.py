@@ -22,9 +22,9 @@ from pimper_torch.stage import Stage
 # alone, large enough to decide where nothing else does.
 _FILLED_WEIGHT = 1e-4
 
-# Uncertain slopes weigh no less than this: their neighbours are hardly better.
-_MIN_CONFIDENCE = 0.05
-
+# Standard error of the slopes besides that of noise, which makes weights of 0 to 1 of their
+# information, and the least of these: a sample's neighbours are hardly better. Choices.
+_MODEL_ERROR_DEG, _MIN_WEIGHT = 8.0, 0.05
 
 # Normals farther from the facet's own are brought to this angle, that of the warp's limit: such a
 # sample lies on the contour or is wrong, and one alone can bend its whole patch.
@@ -55,7 +55,7 @@ class Integrate(Stage):
     the samples around them; a patch without any normals stays its facet's plane. The free
     constant is chosen so that the height field passes, on average, through the facet's corners.
 
-    Differentiable in normals and confidence.
+    Differentiable in normals and information.
 
     Source: Frankot & Chellappa, A method for enforcing integrability in shape from shading
     algorithms, PAMI 10(4), 1988.
@@ -74,7 +74,7 @@ class Integrate(Stage):
             height_field = integrate_normals(
                 photometry.normals_patch,
                 photometry.valid,
-                photometry.confidence,
+                photometry.information,
                 templates.spacing,
                 steepest,
                 self.config.iterations,
@@ -87,7 +87,7 @@ class Integrate(Stage):
 def integrate_normals(
     normals: Float[Tensor, "patch height width 3"],
     valid: Bool[Tensor, "patch height width"],
-    confidence: Float[Tensor, "patch height width"],
+    information: Float[Tensor, "patch height width"],
     spacing: Float[Tensor, " patch"],
     steepest: float,
     iterations: int,
@@ -97,7 +97,8 @@ def integrate_normals(
     Args:
         normals: Unit, ``n_z < 0``; anything where not valid.
         valid: Where the normals are to be followed.
-        confidence: In [0, 1]; how closely, if ``iterations`` is not 0.
+        information: Inverse variance of the normals, one over squared radians. They weigh
+            ``1 / (1 + (sigma / 8°)^2)``, if ``iterations`` is not 0.
         spacing: Between samples, in the units of the depth.
         steepest: Limit of a slope's size.
         iterations: Of the weighted refinement.
@@ -107,7 +108,8 @@ def integrate_normals(
     # Half-way between samples the mean of the two is right to second order.
     right = (slopes[:, 0, :, 1:] + slopes[:, 0, :, :-1]) / 2
     down = (slopes[:, 1, 1:] + slopes[:, 1, :-1]) / 2
-    weight = torch.where(valid, confidence.double().clamp(_MIN_CONFIDENCE, 1), _FILLED_WEIGHT)
+    certain = math.radians(_MODEL_ERROR_DEG) ** 2 * information.double()
+    weight = torch.where(valid, (certain / (1 + certain)).clamp_min(_MIN_WEIGHT), _FILLED_WEIGHT)
     height_field = integrate_weighted(
         right,
         down,

@@ -1,6 +1,5 @@
-"""Sample by sample: albedo under given normals, the exact minimum on the manifold, and how sure."""
+"""Sample by sample: albedo under given normals, the minimum on the manifold, and its variance."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -17,11 +16,12 @@ from pimper_torch.photometry.bilinear import (
 from pimper_torch.photometry.quadratics import apply_packed, solve_packed
 from pimper_torch.records import Record
 
-# A normal whose standard error is this counts half.
-HALF_CONFIDENCE_DEG = 8.0
-
-# A sample's own residuals are few; the patch's spread joins as if it were so many views.
+# A sample's own residuals are few; the patch's variance joins as if it were so many views. A
+# choice: with it the mean claimed variance is right to 2 % (`test_certainty.py`).
 BORROWED_VIEWS = 4.0
+
+# Standard error of a normal without residuals, radians: the rounding of single precision.
+_ROUNDING = 1e-7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -31,12 +31,13 @@ class Certain(Record):
     Attributes:
         albedo: Gray.
         normals: Unit.
-        confidence: In (0, 1], where the equations allow any.
+        information: Inverse variance of the normals, one over squared radians; 0 where the
+            equations do not determine them.
     """
 
     albedo: Float[Tensor, "patch sample"]
     normals: Float[Tensor, "patch sample 3"]
-    confidence: Float[Tensor, "patch sample"]
+    information: Float[Tensor, "patch sample"]
 
 
 def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
@@ -47,21 +48,18 @@ def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
     next to nothing, and so is its derivative if the factors carry gradients by the implicit
     function (:mod:`~pimper_torch.photometry.implicit`).
 
-    The same matrix tells the standard error of the normal, :math:`\sigma^2 = s^2
-    (C_{11} + C_{22}) / \rho^2` with ``C`` the inverse of :math:`B^\top A B` for the tangents
-    that turn the normal and ``s`` the spread of the residuals, the sample's and the patch's
-    pooled. Confidence is :math:`1 / (1 + (\sigma / 8°)^2)`: many views, lights that differ,
-    brightness and small residuals all raise it. Differentiable in factors and radiance.
+    The same matrix gives the variance of the normal, the mean square of its angular error:
+    :math:`\sigma^2 = s^2 (C_{11} + C_{22}) / \rho^2` with ``C`` the inverse of
+    :math:`B^\top A B` for the tangents that rotate the normal and :math:`s^2` the variance of the
+    residuals, the sample's and the patch's pooled. Differentiable in factors and radiance.
     """
     A, b = equations_of_samples(problem, factors.lights, factors.weight)
     slope = b - apply_packed(A, factors.shading)
     moved = step_along(problem.manifold, A, slope, factors.shading)
     albedo, normals = problem.manifold.split(moved.mT)
     curvature = curvature_along(problem.manifold.tangents(factors.shading), A)
-    error = _standard_error(problem, factors, curvature)
-    half = math.radians(HALF_CONFIDENCE_DEG)
-    confidence = 1 / (1 + (error / half) ** 2)
-    return Certain(albedo=albedo, normals=normals, confidence=confidence.nan_to_num(nan=0.0))
+    information = _information(problem, factors, curvature)
+    return Certain(albedo=albedo, normals=normals, information=information)
 
 
 def fit_albedo(
@@ -99,24 +97,24 @@ def start_from_mesh(
     return fit_albedo(radiance[:, :, None], weight, lights, basis) * basis
 
 
-def _standard_error(
+def _information(
     problem: Bilinear, factors: Factors, curvature: Float[Tensor, "patch 6 sample"]
 ) -> Float[Tensor, "patch sample"]:
+    """Give the inverse variance of the normals; 0 where they are not determined."""
     residual = problem.radiance - factors.lights @ factors.shading
     square = (factors.weight * residual**2).sum(dim=1)
     count = factors.weight.sum(dim=1)
     # A sample with m views has spent 3 of them on its own albedo and normal.
     pooled = square.sum(dim=1) / (count - 3).clamp_min(0).sum(dim=1).clamp_min(1)
-    spread = (square + BORROWED_VIEWS * pooled[:, None]) / (
+    variance = (square + BORROWED_VIEWS * pooled[:, None]) / (
         (count - 3).clamp_min(0) + BORROWED_VIEWS
     )
-    variance = torch.zeros_like(square)
-    for place in (1, 2):
+    spread = torch.zeros_like(square)
+    for angle in (1, 2):
         unit = torch.zeros_like(factors.shading[:, :3])
-        unit[:, place] = 1
-        variance = variance + solve_packed(curvature, unit)[:, place]
+        unit[:, angle] = 1
+        spread = spread + solve_packed(curvature, unit)[:, angle]
     albedo, _ = problem.manifold.split(factors.shading.mT)
-    some = (albedo > 0) & (spread * variance > 0)
-    error = torch.where(some, spread * variance, 1).sqrt() / torch.where(some, albedo, 1)
-    exact = (albedo > 0) & (variance > 0) & (spread == 0)
-    return torch.where(some, error, torch.where(exact, 0, torch.inf))
+    determined = (albedo > 0) & (spread > 0) & variance.isfinite()
+    error = torch.where(determined, variance * spread, 1) / torch.where(determined, albedo, 1) ** 2
+    return torch.where(determined, 1 / error.clamp_min(_ROUNDING**2), 0)

@@ -181,7 +181,7 @@ class Factorize(Stage):
     its own Lorentz ambiguity, which stays at that of the start.
 
     Where it fails softly: samples lit in fewer than ``min_views`` views, or found to face
-    away, carry the coarse normal, are not ``valid`` and have confidence 0. Patches that light
+    away, carry the coarse normal, are not ``valid`` and have information 0. Patches that light
     does not determine carry coarse normals throughout and a status why (see
     :class:`~pimper_torch.records.PatchStatus`); a :class:`PimperWarning` counts them. A view
     that sees nothing of a patch has the light zero there. NaN and infinity in the radiance
@@ -288,7 +288,7 @@ class Factorize(Stage):
             albedo=on_raster(albedo.mT, rows.position, black),
             lights_patch=lights,
             valid=on_raster(valid, rows.position, nothing),
-            confidence=on_raster(found.confidence * valid, rows.position, blank),
+            information=on_raster(found.information * valid, rows.position, blank),
             status=status,
             convergence=factors.convergence,
         )

@@ -7,6 +7,7 @@ The patch frame is x right, y down, z forward into the surface: the facet lies i
 plane z = 0 and its outward normal is -z. A depth on the template is a coordinate along z.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
@@ -236,6 +237,20 @@ class PatchStatus(IntEnum):
     """The solver's answer is not finite or has no albedo anywhere."""
 
 
+# Standard error of a normal of confidence 1/2, for people: a choice.
+_HALF_CONFIDENCE_DEG = 8.0
+
+
+def confidence_of(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    r"""Give a score in [0, 1] for people: :math:`1 / (1 + (\sigma / 8°)^2)`.
+
+    >>> confidence_of(1 / torch.tensor([8.0, 24.0]).deg2rad().square())
+    tensor([0.5000, 0.1000])
+    """
+    half = math.radians(_HALF_CONFIDENCE_DEG) ** 2 * information
+    return half / (1 + half)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Photometry(Record):
     """A bucket of factorized patches.
@@ -246,7 +261,8 @@ class Photometry(Record):
         lights_patch: First-order harmonics ``l`` with radiance = albedo * l . (1, n), n in the
             patch frame, constants folded in. A view without samples has zeros.
         valid: True where the sample was determined by the photographs.
-        confidence: In [0, 1]; 0 where not valid.
+        information: Inverse variance of the normals, the mean square of their angular error;
+            one over squared radians, 0 where not valid.
         status: A :class:`PatchStatus` each. The normals of a patch that is not determined
             are those of the coarse mesh, and none of its samples is valid.
         convergence: Of the factorization.
@@ -256,7 +272,7 @@ class Photometry(Record):
     albedo: Float[Tensor, "patch height width channel"]
     lights_patch: Float[Tensor, "patch view 4"]
     valid: Bool[Tensor, "patch height width"]
-    confidence: Float[Tensor, "patch height width"]
+    information: Float[Tensor, "patch height width"]
     status: Int[Tensor, " patch"]
     convergence: Convergence
 
@@ -266,7 +282,7 @@ class Photometry(Record):
         return tuple(self.valid.shape)
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
-        """List values that are no normals, albedo or confidence."""
+        """List values that are no normals, albedo or information."""
         normals, valid = self.normals_patch, self.valid
         known = id(valid)
         if found := once(normals, lambda: not_unit(normals, valid), known):
@@ -275,9 +291,14 @@ class Photometry(Record):
             yield "normals_patch", found, "n_z < 0: x right, y down, z into the surface"
         if found := once(self.albedo, lambda: not_finite(self.albedo, valid), known):
             yield "albedo", found, "finite where valid"
-        confidence = self.confidence
-        if found := once(confidence, lambda: outside(confidence, 1.0)):
-            yield "confidence", found, "in [0, 1], 1 for a normal without error"
+        information = self.information
+        if found := once(information, lambda: outside(information, torch.inf)):
+            yield "information", found, "an inverse variance, 0 where unknown"
+
+    @property
+    def confidence(self) -> Float[Tensor, "patch height width"]:
+        """For people: in [0, 1], a half for a standard error of 8 degrees."""
+        return confidence_of(self.information)
 
     @property
     def determined(self) -> Bool[Tensor, " patch"]:
@@ -443,7 +464,8 @@ class Surface(Record):
         barycentric: Where in that facet.
         normals_world: Unit, outward; photometric where valid, else of the mesh.
         albedo: Linear, up to one scale; continued from round about where no light tells it.
-        confidence: In [0, 1]; 0 where no view determined the vertex.
+        information: Inverse variance of the photometric normals, one over squared radians; 0
+            where no view determined the vertex.
         convergence: Of the refinement, one entry.
         expected_error: Standard error of each vertex across the surface, scene units, given the
             cameras; ``None`` where unknown.
@@ -455,7 +477,7 @@ class Surface(Record):
     barycentric: Float[Tensor, "vertex 3"]
     normals_world: Float[Tensor, "vertex 3"]
     albedo: Float[Tensor, "vertex channel"]
-    confidence: Float[Tensor, " vertex"]
+    information: Float[Tensor, " vertex"]
     convergence: Convergence
     expected_error: Float[Tensor, " vertex"] | None = None
 
@@ -465,6 +487,11 @@ class Surface(Record):
         normals = self.normals_world
         if found := once(normals, lambda: not_unit(normals, None)):
             yield "normals_world", found, "unit, outward"
+
+    @property
+    def confidence(self) -> Float[Tensor, " vertex"]:
+        """For people: in [0, 1], a half for a standard error of 8 degrees."""
+        return confidence_of(self.information)
 
     @property
     def mesh(self) -> Mesh:

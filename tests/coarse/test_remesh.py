@@ -41,14 +41,14 @@ def coarse_of(vertices, faces):
     return CoarseMesh(mesh=mesh, reference=0, is_point=torch.zeros(len(vertices), dtype=torch.bool))
 
 
-def surface_on(coarse, place, spacing=SPACING, normals=None, confidence=None):
+def surface_on(coarse, place, spacing=SPACING, normals=None, information=None):
     """The subdivided mesh of a mesh, its vertices moved by ``place``."""
     mesh = coarse.mesh
     count = len(mesh.faces)
     subdivision = subdivide(mesh.vertices_world, mesh.faces, torch.full((count,), spacing).double())
     points = place(subdivision.points)
     found = vertex_normals(points, subdivision.faces) if normals is None else normals(points)
-    sure = torch.ones_like(points[:, 0]) if confidence is None else confidence(subdivision)
+    certain = 1e6 * torch.ones_like(points[:, 0])
     return Surface(
         vertices_world=points,
         faces=subdivision.faces,
@@ -56,7 +56,7 @@ def surface_on(coarse, place, spacing=SPACING, normals=None, confidence=None):
         barycentric=subdivision.barycentric,
         normals_world=found,
         albedo=torch.ones_like(points),
-        confidence=sure,
+        information=certain if information is None else information(subdivision),
         convergence=Convergence(
             iterations=torch.ones(1).long(), residual=torch.zeros(1), cause=torch.zeros(1).long()
         ),
@@ -220,19 +220,19 @@ def test_facets_without_data_go_except_holes_inside(generator):
     hole = centres[:, :2].norm(dim=1).argsort()[:2]
     border = centres[:, 0] > 0.7
 
-    def confidence(subdivision):
+    def information(subdivision):
         inner = (subdivision.barycentric > 0).all(dim=1)
         lost = torch.isin(subdivision.facet, torch.cat([hole, border.nonzero()[:, 0]])) & inner
-        return (~lost).double()
+        return 1e6 * (~lost).double()
 
-    surface = surface_on(coarse, lambda points: points, confidence=confidence)
+    surface = surface_on(coarse, lambda points: points, information=information)
     found = remesh(coarse, surface, SPACING)
     assert len(found.mesh.faces) == len(coarse.mesh.faces) - int(border.sum())
     strict = remesh(coarse, surface, SPACING, RemeshConfig(max_hole=0.0))
     assert len(strict.mesh.faces) == len(found.mesh.faces) - 2
     seen = border.clone()
     assert len(remesh(coarse, surface, SPACING, seen=seen).mesh.faces) == len(coarse.mesh.faces)
-    dark = surface.replace(confidence=torch.zeros_like(surface.confidence))
+    dark = surface.replace(information=torch.zeros_like(surface.information))
     assert len(remesh(coarse, dark, SPACING).mesh.faces) == len(coarse.mesh.faces)
     assert boundary_vertices(found.mesh.faces, len(found.mesh.vertices_world)).any()
 

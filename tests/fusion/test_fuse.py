@@ -1,4 +1,3 @@
-import math
 from functools import cache
 
 import pytest
@@ -10,7 +9,6 @@ from pimper_torch.coarse.remesh import Remesh
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.geometry.topology import face_edges
-from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, Silhouettes
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.sweep.sweep import Sweep
@@ -117,12 +115,12 @@ def spoiled(given, **changes):
         ({"normals_patch": torch.tensor([0.0, 0, 1]).double()}, "1 of .* face away"),
         ({"normals_patch": torch.tensor([1.0, 0, 0]).double()}, "1 of .* face away"),
         ({"normals_patch": torch.full((3,), torch.nan).double()}, "1 of .* NaN"),
-        ({"confidence": 1.5}, "confidence has 1 .* such as 1.5"),
-        ({"confidence": -0.1}, "such as -0.1"),
-        ({"confidence": torch.nan}, "such as nan"),
+        ({"information": -0.1}, "information has 1 .* such as -0.1"),
+        ({"information": torch.inf}, "such as inf"),
+        ({"information": torch.nan}, "such as nan"),
     ],
 )
-def test_normals_and_confidences_that_cannot_be_are_refused(swept, changes, told):
+def test_normals_and_information_that_cannot_be_are_refused(swept, changes, told):
     _, given = swept(0.5)
     with pytest.raises(InputError, match=told):
         Fuse()(spoiled(given, valid=True, **changes), FREE)
@@ -233,9 +231,8 @@ def noisy(lifted, given, points: float, rotation: float, seed: int):
     for found in given.photometric.buckets:
         noise = torch.randn(found.normals_patch.shape, generator=generator, dtype=torch.float64)
         wrong = normalize(found.normals_patch + rotation * noise, dim=-1)
-        sure = 1 / (1 + (rotation / math.radians(HALF_CONFIDENCE_DEG)) ** 2)
-        confidence = torch.full_like(found.confidence, sure)
-        buckets.append(found.replace(normals_patch=wrong, confidence=confidence))
+        information = torch.full_like(found.information, 1 / rotation**2)
+        buckets.append(found.replace(normals_patch=wrong, information=information))
     rotated = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
     cloud = near_plane(lifted, 0.0)
     cloud = cloud + points * spacing * torch.randn(cloud.shape, generator=generator).double()
@@ -267,7 +264,7 @@ def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
     lifted, given = swept(0.8)
     nothing = tuple(
         found.replace(
-            valid=torch.zeros_like(found.valid), confidence=torch.zeros_like(found.confidence)
+            valid=torch.zeros_like(found.valid), information=torch.zeros_like(found.information)
         )
         for found in given.photometric.buckets
     )
@@ -290,7 +287,7 @@ def in_the_centre_of_each(found, spoiled):
     square = (slice(None), slice(centre - 4, centre + 4), slice(centre - 4, centre + 4))
     valid[square] = False
     spoiled(square)
-    return found.replace(valid=valid, confidence=found.confidence * valid)
+    return found.replace(valid=valid, information=found.information * valid)
 
 
 def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
@@ -341,18 +338,19 @@ def test_what_is_continued_does_not_outvote_points(swept):
     places = flat.vertices_world[dark].double()
     inner = (places - places.mean(dim=0)).norm(dim=1) < 2.5 * spacing
     raised = places[inner] + 0.5 * spacing * lifted.normal
-    points = torch.cat([near_plane(lifted, 0.0, count=60), raised])
+    # The raised points are a sixth of all, so that they are no noise of the cloud.
+    points = torch.cat([near_plane(lifted, 0.0, count=240), raised])
     surface = Fuse()(with_points(holed, points, 0.02 * spacing), FREE)
     off = off_plane(lifted, surface)
-    assert off[dark[inner]].median() > 0.4
-    assert off[surface.confidence > 0].median() < 0.05  # as stiff as lit ground: 0.2, like the bump
+    assert off[dark[inner]].median() > 0.4  # as stiff as the lit surface: 0.14
+    assert off[surface.confidence > 0].median() < 0.01
 
 
 def test_facets_that_views_see_stay_though_light_tells_nothing_of_them(swept):
     _, given = swept(0.8)
     surface = Fuse()(given, FREE)
-    dark = surface.replace(confidence=torch.zeros_like(surface.confidence))
-    dark.confidence[0] = 1.0  # so that there is some confidence at all
+    dark = surface.replace(information=torch.zeros_like(surface.information))
+    dark.information[0] = 1.0  # so that there is some at all
     kept = Remesh()(given, dark, FREE)
     assert len(kept.mesh.faces) >= len(given.patches.coarse.mesh.faces)
 

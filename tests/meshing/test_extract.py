@@ -11,7 +11,7 @@ from pimper_torch.records import Convergence, Surface
 SIDE = 21
 
 
-def sheet(side=SIDE, confidence=None):
+def sheet(side=SIDE, information=None):
     """A gently bent square sheet of unit steps, seen from -z; two facets."""
     row, column = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
     x, y = column.flatten().double(), row.flatten().double()
@@ -29,7 +29,7 @@ def sheet(side=SIDE, confidence=None):
         barycentric=torch.full_like(vertices, 1 / 3),
         normals_world=torch.nn.functional.normalize(normals, dim=-1),
         albedo=vertices / side,
-        confidence=torch.ones_like(x) if confidence is None else confidence,
+        information=torch.ones_like(x) if information is None else information,
         convergence=Convergence(
             iterations=torch.ones(1, dtype=torch.long),
             residual=torch.zeros(1, dtype=torch.float64),
@@ -61,12 +61,12 @@ def test_small_holes_stay_filled_and_large_ones_open():
     x, y = columns(surface), surface.vertices_world[:, 1]
     small = (x - 4).abs().maximum((y - 4).abs()) <= 1
     large = (x - 13).abs().maximum((y - 13).abs()) <= 4
-    confidence = (~(small | large)).double()
-    mesh = Extract(ExtractConfig(max_hole=0.2))(surface.replace(confidence=confidence))
+    information = (~(small | large)).double()
+    mesh = Extract(ExtractConfig(max_hole=0.2))(surface.replace(information=information))
     assert (mesh.confidence == 0).sum() == 9
     assert len(mesh.vertices_world) == SIDE**2 - 81
     assert as_trimesh(mesh).euler_number == 0  # a disc with one hole
-    closed = Extract(ExtractConfig(max_hole=0.5))(surface.replace(confidence=confidence))
+    closed = Extract(ExtractConfig(max_hole=0.5))(surface.replace(information=information))
     assert as_trimesh(closed).euler_number == 1
 
 
@@ -82,7 +82,7 @@ def test_unsupported_groups_are_measured_one_by_one():
 
 
 def test_islands_go_and_the_largest_piece_stays():
-    surface = sheet(confidence=((columns(sheet()) < 6) | (columns(sheet()) > 9)).double())
+    surface = sheet(information=((columns(sheet()) < 6) | (columns(sheet()) > 9)).double())
     mesh = Extract(ExtractConfig(max_hole=0.1, min_piece=1.0))(surface)
     assert columns(mesh).min() == 10
     assert len(as_trimesh(mesh).split(only_watertight=False)) == 1
@@ -96,7 +96,7 @@ def test_pieces_that_touch_in_a_vertex_are_parted():
     x, y = columns(surface), surface.vertices_world[:, 1]
     hourglass = ((x <= 10) & (y >= 10)) | ((x >= 10) & (y <= 10))
     mesh = Extract(ExtractConfig(max_hole=0.1, min_piece=0.0))(
-        surface.replace(confidence=hourglass.double())
+        surface.replace(information=hourglass.double())
     )
     # Diagonals run the other way, so that no face bridges the two squares.
     waist = (mesh.vertices_world[:, :2] == 10).all(dim=1)
@@ -104,7 +104,7 @@ def test_pieces_that_touch_in_a_vertex_are_parted():
     assert (
         len(
             Extract(ExtractConfig(max_hole=0.1, min_piece=1.0))(
-                surface.replace(confidence=hourglass.double())
+                surface.replace(information=hourglass.double())
             ).vertices_world
         )
         == 121
@@ -130,9 +130,9 @@ def test_spikes_and_overturned_faces_go():
 def test_vertices_carry_gradients():
     surface = sheet()
     vertices = surface.vertices_world.clone().requires_grad_()
-    confidence = (columns(surface) < 15).double()
+    information = (columns(surface) < 15).double()
     mesh = Extract(ExtractConfig(max_hole=0.1))(
-        surface.replace(vertices_world=vertices, confidence=confidence)
+        surface.replace(vertices_world=vertices, information=information)
     )
     mesh.vertices_world.sum().backward()
     kept = (columns(surface) < 15).double()[:, None].expand(-1, 3)
@@ -148,15 +148,15 @@ def test_normals_come_out_unit_and_faces_outward():
 
 
 def test_a_surface_without_confidence_anywhere_is_kept_whole():
-    surface = sheet(confidence=torch.zeros(SIDE**2).double())
+    surface = sheet(information=torch.zeros(SIDE**2).double())
     assert len(Extract()(surface).faces) == len(surface.faces)
 
 
 def test_a_surface_without_enough_support_is_refused():
-    confidence = torch.zeros(SIDE**2).double()
-    confidence[0] = 0.1  # one vertex alone
+    information = torch.zeros(SIDE**2).double()
+    information[0] = 0.1  # one vertex alone
     with pytest.raises(ReconstructionError, match="0 have support"):
-        Extract(ExtractConfig(max_hole=0.2))(sheet(confidence=confidence))
+        Extract(ExtractConfig(max_hole=0.2))(sheet(information=information))
 
 
 def test_faces_with_a_large_expected_error_are_cut_out():

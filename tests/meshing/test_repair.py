@@ -40,7 +40,7 @@ def surface_of(vertices, faces, facet=None):
         barycentric=torch.full_like(vertices, 1 / 3),
         normals_world=vertex_normals(vertices, faces),
         albedo=vertices.abs(),
-        confidence=torch.ones_like(vertices[:, 0]),
+        information=torch.full_like(vertices[:, 0], 1e30),
         convergence=Convergence(
             iterations=torch.ones(1, dtype=torch.long),
             residual=torch.zeros(1, dtype=torch.float64),

@@ -61,7 +61,7 @@ def photographed():
                     albedo=torch.ones(*x.shape, 1, dtype=x.dtype),
                     lights_patch=torch.ones(count, 1, 4, dtype=x.dtype),
                     valid=valid,
-                    confidence=valid.to(x),
+                    information=1e3 * valid.to(x),
                     status=0 * one.long(),
                     convergence=Convergence(
                         iterations=one.long(), residual=0 * one, cause=0 * one.long()

@@ -106,26 +106,26 @@ def test_uncertain_normals_yield_to_certain_ones(generator):
     normals[..., 2] = -1
     normals[:, 8:12, 8:12] = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
     valid = torch.ones(1, 20, 20, dtype=torch.bool)
-    confidence = torch.ones(1, 20, 20, dtype=torch.float64)
+    information = torch.full((1, 20, 20), 1e6, dtype=torch.float64)
     spacing = torch.ones(1, dtype=torch.float64)
-    reliable = integrate_normals(normals, valid, confidence, spacing, 4.0, 30)
-    confidence[:, 8:12, 8:12] = 0
-    doubted = integrate_normals(normals, valid, confidence, spacing, 4.0, 30)
+    reliable = integrate_normals(normals, valid, information, spacing, 4.0, 30)
+    information[:, 8:12, 8:12] = 0
+    doubted = integrate_normals(normals, valid, information, spacing, 4.0, 30)
     assert doubted.abs().max() < 0.4 * reliable.abs().max()
 
 
-def test_gradients_reach_normals_and_confidence(generator):
+def test_gradients_reach_normals_and_information(generator):
     slopes = 0.3 * torch.randn(1, 3, 4, 2, generator=generator, dtype=torch.float64)
     normals = torch.cat([slopes, -torch.ones_like(slopes[..., :1])], dim=-1)
-    confidence = 0.2 + 0.7 * torch.rand(1, 3, 4, generator=generator, dtype=torch.float64)
+    information = 10 + 90 * torch.rand(1, 3, 4, generator=generator, dtype=torch.float64)
     valid = torch.ones(1, 3, 4, dtype=torch.bool)
     valid[0, 1, 2] = False
     spacing = torch.tensor([0.5], dtype=torch.float64)
 
-    def integrate(normals, confidence):
-        return integrate_normals(normals, valid, confidence, spacing, 10.0, 15)
+    def integrate(normals, information):
+        return integrate_normals(normals, valid, information, spacing, 10.0, 15)
 
-    inputs = normals.requires_grad_(), confidence.requires_grad_()
+    inputs = normals.requires_grad_(), information.requires_grad_()
     # The solve stops at 1e-7, and finite differences magnify that.
     assert torch.autograd.gradcheck(integrate, inputs, atol=1e-4, eps=1e-4)
 

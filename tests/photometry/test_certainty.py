@@ -1,10 +1,8 @@
-import math
-
 import pytest
 import torch
 
 from pimper_torch.photometry.bilinear import Factors, equations_of_samples, follow
-from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG, fit_albedo, refine_on_manifold
+from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold
 from pimper_torch.records import Convergence
 
 
@@ -23,7 +21,7 @@ def solved_under(problem, lights):
 
 
 @pytest.mark.parametrize("deviation", [0.002, 0.01])
-def test_confidence_is_the_variance_of_normals_under_noise(problem, generator, deviation):
+def test_information_is_the_inverse_variance_of_normals_under_noise(problem, generator, deviation):
     # Oracle: the mean square angle over many draws of the noise.
     given, lights, shading = problem(patches=1, views=14, samples=40, missing=0.3)
     draws = 1000
@@ -41,7 +39,7 @@ def test_confidence_is_the_variance_of_normals_under_noise(problem, generator, d
         regularization=given.regularization.expand(draws, -1),
     )
     found = refine_on_manifold(many, solved_under(many, many.lights))
-    variance = math.radians(HALF_CONFIDENCE_DEG) ** 2 * (1 / found.confidence - 1)
+    variance = 1 / found.information
     _, true = given.manifold.split(shading.mT)
     square = (found.normals - true).square().sum(dim=-1)  # the angle's, to second order
     ratio = variance.mean(dim=0) / square.mean(dim=0)

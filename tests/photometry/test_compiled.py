@@ -142,8 +142,10 @@ def test_whole_factorizations_agree_and_nan_is_missing(scene):
     for one, other in zip(results[0].buckets, results[1].buckets, strict=True):
         assert_close(one.status, other.status)
         assert_close(one.valid, other.valid)
-        for name in ("normals_patch", "albedo", "lights_patch", "confidence"):
+        for name in ("normals_patch", "albedo", "lights_patch"):
             assert_close(getattr(one, name), getattr(other, name), rtol=0, atol=5e-3)
+        # Measured 6e-5: solvers stop at 1e-3 of the objective.
+        assert_close(one.information, other.information, rtol=1e-3, atol=0)
 
 
 def test_patches_can_be_factorized_one_by_one(scene):

@@ -7,7 +7,6 @@ from torch.testing import assert_close
 from pimper_torch.chains.presets import load_config
 from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.patches.transfer import coarse_normals
-from pimper_torch.photometry.certainty import HALF_CONFIDENCE_DEG
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.records import PatchStatus, PatchViews
@@ -63,7 +62,8 @@ def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
     for bucket in found.buckets:
         assert bucket.determined.all()
         assert (bucket.normals_patch[..., 2] < 0).all()
-        assert (bucket.confidence[~bucket.valid] == 0).all()
+        assert (bucket.information[bucket.valid] > 0).all()
+        assert (bucket.information[~bucket.valid] == 0).all()
         assert (bucket.confidence >= 0).all()
         assert (bucket.confidence <= 1).all()
 
@@ -82,7 +82,7 @@ def test_samples_lit_by_few_have_no_say(scene):
     seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
     found = Factorize()(seen).buckets[0]
     assert not found.valid[1, 4:7].any()
-    assert (found.confidence[1, 4:7] == 0).all()
+    assert (found.information[1, 4:7] == 0).all()
     coarse = coarse_normals(seen.patches.coarse, seen.patches.buckets[0])
     assert_close(found.normals_patch[1, 4:7], coarse[1, 4:7])
     assert found.valid[1, 8:].any()
@@ -139,7 +139,7 @@ def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how)
     assert bad.status[2] == reason
     assert not bad.determined[2]
     assert not bad.valid[2].any()
-    for name in ("normals_patch", "albedo", "lights_patch", "confidence"):
+    for name in ("normals_patch", "albedo", "lights_patch", "information"):
         assert getattr(bad, name).isfinite().all()
         assert_close(getattr(bad, name)[keep], getattr(good, name)[keep])
     assert bad.determined[keep].all()
@@ -182,7 +182,7 @@ def test_parts_make_no_difference(scene, monkeypatch):
 
 
 @pytest.mark.parametrize("deviation", [0.01, 0.04])
-def test_confidence_tells_the_error_that_noise_makes(scene, generator, deviation):
+def test_information_is_the_inverse_variance_that_noise_makes(scene, generator, deviation):
     true = scene(bumps=0.0)  # lights fitted to the mesh are exact but for the noise
     buckets = tuple(
         each.replace(
@@ -195,9 +195,9 @@ def test_confidence_tells_the_error_that_noise_makes(scene, generator, deviation
     found = Factorize(alone)(true.seen.replace(buckets=buckets))
     variance, square = [], []
     for bucket, normals in zip(found.buckets, true.normals, strict=True):
-        variance.append((1 / bucket.confidence - 1)[bucket.valid])
-        square.append(angles_deg(bucket.normals_patch, normals, bucket.valid).square())
-    ratio = HALF_CONFIDENCE_DEG**2 * torch.cat(variance).mean() / torch.cat(square).mean()
+        variance.append(1 / bucket.information[bucket.valid])
+        square.append(angles_deg(bucket.normals_patch, normals, bucket.valid).deg2rad().square())
+    ratio = torch.cat(variance).mean() / torch.cat(square).mean()
     assert ratio == pytest.approx(1, abs=0.1)
 
 

@@ -119,7 +119,7 @@ def test_records_inside_are_taken_along():
         albedo=torch.zeros(3, 2, 2, 1),
         lights_patch=torch.zeros(3, 5, 4),
         valid=torch.zeros(3, 2, 2, dtype=torch.bool),
-        confidence=torch.zeros(3, 2, 2),
+        information=torch.zeros(3, 2, 2),
         status=torch.zeros(3).long(),
         convergence=convergence,
     )

@@ -38,6 +38,7 @@ from pimper_torch.photometry.cone import split_shading
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.lights import fit_light_field
 from pimper_torch.records import CoarseMesh, Convergence, Estimate, Record, SparseScene
+from pimper_torch.records.patches import confidence_of
 from pimper_torch.single_view.factorization.ambiguity import align_factorizations
 from pimper_torch.single_view.factorization.starts import start_from_data
 from pimper_torch.stage import Stage
@@ -103,7 +104,7 @@ class WholePhotometry(Record):
         normals: Unit; the mesh's where not valid.
         albedo: Gray.
         valid: True where the photographs determined the normal.
-        confidence: In [0, 1]; 0 where not valid.
+        information: Inverse variance of the normals; 0 where not valid.
         iterations: Of the solver on the whole matrix.
         converged: Whether it did.
     """
@@ -112,7 +113,7 @@ class WholePhotometry(Record):
     normals: Float[Tensor, "sample 3"]
     albedo: Float[Tensor, " sample"]
     valid: Bool[Tensor, " sample"]
-    confidence: Float[Tensor, " sample"]
+    information: Float[Tensor, " sample"]
     iterations: int
     converged: bool
 
@@ -173,7 +174,8 @@ class GlobalStereo(Stage):
             harmonics(photometry.normals),
         )
         albedo, lights = in_gauge(colours, photometry.lights, photometry.valid)
-        mesh = surface_of(template, depth, photometry.normals, albedo, photometry.confidence)
+        confidence = confidence_of(photometry.information)
+        mesh = surface_of(template, depth, photometry.normals, albedo, confidence)
         world_from_template = invert_rigid(template.template_from_world)
         return Estimate(
             mesh=mesh,
@@ -334,7 +336,7 @@ def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
     lit = matrix.seen.sum(dim=0) >= min_views
     none = torch.zeros(1, dtype=torch.long, device=lit.device)
     convergence = Convergence(iterations=none, residual=none.to(whole.lights), cause=none)
-    albedo, normals, confidence = [], [], []
+    albedo, normals, information = [], [], []
     for part in chunks(len(lit)):
         problem = as_problem(matrix.columns(part), whole.lights, whole.shading[:, part])
         factors = Factors(
@@ -346,7 +348,7 @@ def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
         found = refine_on_manifold(problem, factors)
         albedo.append(found.albedo[0])
         normals.append(found.normals[0])
-        confidence.append(found.confidence[0])
+        information.append(found.information[0])
     photometric, gray = torch.cat(normals), torch.cat(albedo)
     sure = photometric.isfinite().all(dim=1) & (gray > 0) & (photometric[:, 2] < 0)
     valid = lit & sure
@@ -355,7 +357,7 @@ def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
         normals=torch.where(valid[:, None], photometric, matrix.normals),
         albedo=torch.where(valid, gray, split_shading(whole.shading.mT)[0].nan_to_num()),
         valid=valid,
-        confidence=torch.cat(confidence) * valid,
+        information=torch.cat(information) * valid,
         iterations=whole.iterations,
         converged=whole.converged,
     )
@@ -367,7 +369,7 @@ def _integrated(
     return integrate_normals(
         on_template(found.normals, template.inside)[None],
         on_template(found.valid, template.inside)[None],
-        on_template(found.confidence, template.inside)[None],
+        on_template(found.information, template.inside)[None],
         template.spacing[None],
         math.tan(math.radians(max_tilt_deg)),
         steps,

@@ -265,15 +265,19 @@ def _factorize(stage: nn.Module, seen: Any) -> Probe:  # noqa: ANN401
 
 
 def _integrate(stage: nn.Module, photometric: Any) -> Probe:  # noqa: ANN401
+    information = _gathered(photometric.buckets, "information")
+
     def function(x: Tensors) -> Tensors:
         buckets = _replaced(
-            photometric.buckets, normals_patch=x["normals"], confidence=x["confidence"]
+            photometric.buckets,
+            normals_patch=x["normals"],
+            information=information * x["information"],
         )
         return {"depth": _gathered(stage(photometric.replace(buckets=buckets)).buckets, "depth")}
 
     inputs = {
         "normals": _gathered(photometric.buckets, "normals_patch"),
-        "confidence": _gathered(photometric.buckets, "confidence"),
+        "information": torch.ones_like(information),  # as a factor: none stays none
     }
     return Probe(function=function, inputs=inputs, scales={})
 
@@ -351,7 +355,7 @@ def _fuse(stage: nn.Module, swept: Any, contours: Any, expected: bool) -> Probe:
     patches = photometric.patches
     spacing, cloud = _spacing(patches), patches.coarse.points
     information = _gathered(swept.buckets, "information")
-    confidence = _gathered(photometric.buckets, "confidence")
+    certain = _gathered(photometric.buckets, "information")
 
     def function(x: Tensors) -> Tensors:
         carrying = patches.replace(buckets=_replaced(patches.buckets, depth=x["depth"]))
@@ -362,7 +366,7 @@ def _fuse(stage: nn.Module, swept: Any, contours: Any, expected: bool) -> Probe:
             photometric.buckets,
             normals_patch=x["normals"],
             albedo=x["albedo"],
-            confidence=confidence ** x["confidence"],
+            information=certain * x["normal information"],
         )
         heights = _replaced(
             swept.buckets, offset=x["offset"], information=information * x["information"]
@@ -380,7 +384,7 @@ def _fuse(stage: nn.Module, swept: Any, contours: Any, expected: bool) -> Probe:
     inputs = {
         "normals": _gathered(photometric.buckets, "normals_patch"),
         "albedo": _gathered(photometric.buckets, "albedo"),
-        "confidence": torch.ones_like(confidence),  # as a power: it stays between 0 and 1
+        "normal information": torch.ones_like(certain),
         "offset": _gathered(swept.buckets, "offset"),
         "information": torch.ones_like(information),  # as a factor: none stays none
         "depth": _gathered(patches.buckets, "depth"),
@@ -408,7 +412,7 @@ def _adapt(stage: nn.Module, swept: Any, surface: Any, contours: Any) -> Probe: 
             surface.replace(
                 vertices_world=x["vertices"],
                 normals_world=x["normals"],
-                confidence=x["confidence"],
+                information=surface.information * x["information"],
             ),
             contours,
         )
@@ -417,7 +421,7 @@ def _adapt(stage: nn.Module, swept: Any, surface: Any, contours: Any) -> Probe: 
     inputs = {
         "vertices": surface.vertices_world,
         "normals": surface.normals_world,
-        "confidence": surface.confidence,
+        "information": torch.ones_like(surface.information),
     }
     scale = _step_of(surface.vertices_world, surface.faces)
     return Probe(function=function, inputs=inputs, scales={"vertices": scale})

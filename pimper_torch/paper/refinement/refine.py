@@ -55,9 +55,9 @@ class Refine(Stage):
     sides. See :mod:`~pimper_torch.paper.refinement.energy` for the discretisation and for what
     ``keep_planes`` adds to the published energy, and :mod:`~pimper_torch.fusion.blend` for the
     union. Vertices that no patch supports are
-    filled by the smoothness term and have confidence 0.
+    filled by the smoothness term and have information 0.
 
-    Differentiable in depth, photometric normals, albedo and confidence; the coarse mesh and
+    Differentiable in depth, photometric normals, albedo and information; the coarse mesh and
     the templates are constants.
     """
 
@@ -72,7 +72,7 @@ class Refine(Stage):
         the surface, in scene units, after one solve.
 
         Where no patch has valid height field anywhere, as under one light for all views, the
-        surface is that of the facets, its seams smoothed, with confidence 0.
+        surface is that of the facets, its seams smoothed, with information 0.
         """
         patches = depths.patches
         mesh = patches.coarse.mesh
@@ -93,7 +93,7 @@ class Refine(Stage):
             barycentric=subdivision.barycentric,
             normals_world=_normals(blend, vertices, subdivision),
             albedo=about_mean(blend.albedo, blend.seen, face_edges(subdivision.faces)[0]),
-            confidence=blend.confidence,
+            information=blend.normal_information,
             convergence=Convergence(
                 iterations=torch.ones(1, dtype=torch.long, device=points.device),
                 residual=apart.square().sum(dim=-1).mean().sqrt()[None].to(points),

@@ -100,7 +100,7 @@ def _blank(patches):
                 albedo=like.new_ones(count, height, width, 1),
                 lights_patch=like.new_ones(count, 1, 4),
                 valid=templates.inside,
-                confidence=templates.inside.to(like),
+                information=1e3 * templates.inside.to(like),
                 status=0 * one.long(),
                 convergence=Convergence(
                     iterations=one.long(), residual=0 * one, cause=0 * one.long()

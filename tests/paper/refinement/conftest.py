@@ -101,7 +101,7 @@ def _exact(templates, height):
         albedo=(0.5 + 0.25 * world.detach()).reshape(*shape, 3),
         lights_patch=torch.zeros(count, 1, 4, dtype=torch.float64),
         valid=exact,
-        confidence=exact.double(),
+        information=1e3 * exact.double(),
         status=torch.zeros(count, dtype=torch.long),
         convergence=Convergence(
             iterations=torch.ones(count, dtype=torch.long),

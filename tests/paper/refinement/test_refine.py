@@ -67,7 +67,7 @@ def test_the_rim_of_a_cap_moves_less_than_a_sample(cap):
     assert (free - points)[rim].norm(dim=-1).max() > SPACING
 
 
-def test_normals_albedo_and_confidence_come_from_the_patches(cap):
+def test_normals_albedo_and_information_come_from_the_patches(cap):
     surface = Refine(RefineConfig(smoothing_radius_samples=1.0))(cap)
     centre = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     radial = torch.nn.functional.normalize(surface.vertices_world - centre, dim=-1)
@@ -75,7 +75,7 @@ def test_normals_albedo_and_confidence_come_from_the_patches(cap):
     assert_close(surface.normals_world.norm(dim=-1), torch.ones(len(radial)).double())
     albedo = 0.5 + 0.25 * surface.vertices_world
     assert_close(surface.albedo, albedo, atol=0.25 * SPACING, rtol=0)
-    assert_close(surface.confidence, torch.ones(len(radial)).double())
+    assert_close(surface.information, torch.full((len(radial),), 1e3).double())
     assert surface.convergence.converged.all()
 
 
@@ -142,7 +142,7 @@ def test_a_hole_in_the_height_field_is_filled_and_marked(cap):
         }
 
     surface = Refine(RefineConfig(smoothing_radius_samples=1.0))(changed(cap, change))
-    empty = surface.confidence == 0
+    empty = surface.information == 0
     assert 20 < empty.sum() < 120
     for part in (surface.vertices_world, surface.normals_world, surface.albedo):
         assert part.isfinite().all()
