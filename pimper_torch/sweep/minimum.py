@@ -11,7 +11,7 @@ def parabola_minimum(
     """Fit a parabola to the least cost and the two beside it.
 
     Returns:
-        The place of the minimum in steps from the first hypothesis, the parabola's second
+        The position of the minimum in steps from the first hypothesis, the parabola's second
         derivative there (per squared step), and whether there is such a minimum: a cost at
         an end of the range is none, for the range may end before it.
 
@@ -29,29 +29,41 @@ def parabola_minimum(
     curvature = before - 2 * here + after
     bent = interior[..., 0] & (curvature > 0)
     aside = (before - after) / (2 * torch.where(bent, curvature, 1))
-    place = torch.where(bent, centre[..., 0] + aside.clamp(-0.5, 0.5), best[..., 0].to(cost))
-    return place, torch.where(bent, curvature, 0), bent
+    position = torch.where(bent, centre[..., 0] + aside.clamp(-0.5, 0.5), best[..., 0].to(cost))
+    return position, torch.where(bent, curvature, 0), bent
 
 
 def posterior_variance(
-    cost: Float[Tensor, "*batch hypothesis"], curvature: Float[Tensor, "*batch"]
+    cost: Float[Tensor, "*batch hypothesis"],
+    position: Float[Tensor, "*batch"],
+    curvature: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch"]:
-    r"""Give the variance of the place, in squared steps, if costs are negative log likelihoods.
+    r"""Give the variance of the minimum's position, in squared steps.
 
-    That of the hypotheses, :math:`p_k \propto e^{-C_k}`, and that of the parabola between
-    them. Several minima that suit nearly as well make it wide, which the curvature of the best
-    alone does not tell.
+    Costs are taken for negative log likelihoods, :math:`p_k \propto e^{-C_k}`. The variance is
+    that of the parabola at the minimum, :math:`1 / C''`, and by how much the variance over all
+    hypotheses exceeds that over the same hypotheses of this parabola: costs of a Gaussian have
+    its variance, and further minima that are nearly as low add their spread.
 
     Args:
         cost: Of evenly spaced hypotheses.
-        curvature: Second derivative at the minimum; where it is 0 the variance is infinite.
+        position: Of the minimum, in steps from the first hypothesis.
+        curvature: Second derivative there; where it is 0 the variance is infinite.
 
-    >>> posterior_variance(torch.tensor([[100.0, 0.0, 100.0]]), torch.tensor([200.0]))
+    >>> cost = torch.tensor([[100.0, 0.0, 100.0]])
+    >>> posterior_variance(cost, torch.tensor([1.0]), torch.tensor([200.0]))
     tensor([0.0050])
     """
     steps = torch.arange(cost.shape[-1], device=cost.device, dtype=cost.dtype)
-    fraction = torch.softmax(-cost, dim=-1)
-    mean = (fraction * steps).sum(dim=-1, keepdim=True)
-    spread = (fraction * (steps - mean).square()).sum(dim=-1)
+    parabola = 0.5 * curvature[..., None] * (steps - position[..., None]).square()
+    beyond = (_variance(cost) - _variance(parabola)).clamp_min(0)
     bent = curvature > 0
-    return torch.where(bent, spread + 1 / torch.where(bent, curvature, 1), torch.inf)
+    return torch.where(bent, beyond + 1 / torch.where(bent, curvature, 1), torch.inf)
+
+
+def _variance(cost: Float[Tensor, "*batch hypothesis"]) -> Float[Tensor, "*batch"]:
+    """Give the variance of the hypotheses' index under their likelihoods."""
+    steps = torch.arange(cost.shape[-1], device=cost.device, dtype=cost.dtype)
+    likelihood = torch.softmax(-cost, dim=-1)
+    mean = (likelihood * steps).sum(dim=-1, keepdim=True)
+    return (likelihood * (steps - mean).square()).sum(dim=-1)

@@ -36,7 +36,8 @@ from pimper_torch.sweep.minimum import parabola_minimum, posterior_variance
 from pimper_torch.sweep.selection import best_views, view_scores
 from pimper_torch.sweep.windows import level_weight, window_mean, window_size
 
-# So many samples err alike, as they were looked up between the same pixels, blurred.
+# Samples whose noise is correlated, as they are interpolated between the same pixels: with 4 the
+# claimed deviation of heights is 0.8 to 1.25 times that of their errors (`test_sweep.py`).
 CORRELATED_SAMPLES = 4.0
 
 # A sample seen at a flatter angle (cosine) is looked up as if seen at this one.
@@ -179,13 +180,13 @@ class Sweep(Stage):
         weight = _LOSS_SCALE**2 * averaged / CORRELATED_SAMPLES
         costs = weight * window_mean(costs, window, _WINDOW)
         costs = costs.movedim(1, -1)
-        place, curvature, found = parabola_minimum(costs)
-        variance = posterior_variance(costs, curvature)
+        position, curvature, found = parabola_minimum(costs)
+        variance = posterior_variance(costs, position, curvature)
         unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
         fraction = (1 / variance - 1 / unknown).clamp_min(0) / averaged
         found = found & (window > 0) & (fraction > 0)
         return Heights(
-            offset=torch.where(found, (place - config.steps) * step[:, None, None], 0),
+            offset=torch.where(found, (position - config.steps) * step[:, None, None], 0),
             information=torch.where(found, fraction / step[:, None, None].square(), 0),
             num_views=shown,
         )

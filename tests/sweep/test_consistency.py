@@ -77,3 +77,25 @@ def test_costs_can_be_differentiated(generator, shading):
     assert torch.autograd.gradcheck(
         lambda x: inconsistency(x, shading, all_seen(), scale, iterations=200), radiance
     )
+
+
+def test_every_sample_has_a_cost_of_its_own_scale(generator, shading):
+    """Against the formula, at the albedo that minimizes it on a grid; the median starts there."""
+    albedo = 0.3 + torch.rand(5, 1, 1, generator=generator, dtype=torch.float64)
+    scale = torch.tensor([0.01, 0.02, 0.05, 0.1, 0.2], dtype=torch.float64)
+    noise = torch.randn(5, VIEWS, 2, generator=generator, dtype=torch.float64)
+    radiance = albedo * shading[..., None] + 0.5 * scale[:, None, None] * noise
+    cost = inconsistency(radiance, shading, all_seen(), scale, iterations=100)
+    grid = torch.linspace(0, 2, 20_001, dtype=torch.float64)
+    residual = radiance[..., None] - grid * shading[:, :, None, None]
+    squares = (residual / scale[:, None, None, None]).square()
+    assert_close(cost, 0.5 * torch.log1p(squares).sum(dim=1).amin(dim=-1), rtol=0, atol=1e-4)
+
+
+def test_radiance_and_scale_in_other_units_cost_the_same(generator, shading):
+    radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64)
+    scale = torch.tensor([0.02, 0.05, 0.1, 0.2, 0.4], dtype=torch.float64)
+    unit = torch.tensor([1.0, 10.0, 0.1, 3.0, 0.3], dtype=torch.float64)
+    here = inconsistency(radiance, shading, all_seen(), scale)
+    there = inconsistency(unit[:, None, None] * radiance, shading, all_seen(), unit * scale)
+    assert_close(here, there)

@@ -38,13 +38,21 @@ def test_minima_can_be_differentiated():
     assert torch.autograd.gradcheck(lambda c: parabola_minimum(c)[0], cost)
 
 
-def test_a_wide_bowl_has_the_variance_of_its_gaussian():
-    # Steps much finer than the bowl: the sum is the integral.
-    cost = costs(20.0, 1 / 9, count=41)
-    _, curvature, _ = parabola_minimum(cost)
-    variance = posterior_variance(cost, curvature)
-    # That of the hypotheses, and that of the parabola, which counts it once more here.
-    assert_close(variance, torch.tensor([18.0], dtype=torch.float64), rtol=0.01, atol=0)
+@pytest.mark.parametrize("deviation", [0.05, 0.3, 1.0, 3.0])
+@pytest.mark.parametrize("position", [20.0, 20.3, 19.5])
+def test_costs_of_a_gaussian_have_its_variance(deviation, position):
+    cost = costs(position, deviation**-2, count=41)
+    found, curvature, _ = parabola_minimum(cost)
+    variance = posterior_variance(cost, found, curvature)
+    assert_close(variance, torch.tensor([deviation**2], dtype=torch.float64))
+
+
+def test_tails_heavier_than_the_parabola_add_to_the_variance():
+    steps = torch.arange(401, dtype=torch.float64)
+    cost = 3 * torch.log1p(((steps - 200) / 20).square())[None]  # Student's t of 5 degrees
+    variance = posterior_variance(cost, *parabola_minimum(cost)[:2])
+    # Of t with nu degrees and scale s = 20 / nu^(1/2) is s^2 nu / (nu - 2); cut at 10 scales.
+    assert_close(variance, torch.tensor([400 / 3], dtype=torch.float64), rtol=0.02, atol=0)
 
 
 def test_two_minima_that_suit_alike_make_the_place_unsure():
@@ -52,7 +60,7 @@ def test_two_minima_that_suit_alike_make_the_place_unsure():
     one[0, 2] = 0
     two = one.clone()
     two[0, 7] = 1e-3
-    alone = posterior_variance(one, parabola_minimum(one)[1])
-    torn = posterior_variance(two, parabola_minimum(two)[1])
+    alone = posterior_variance(one, *parabola_minimum(one)[:2])
+    torn = posterior_variance(two, *parabola_minimum(two)[:2])
     assert float(alone) < 0.1
     assert math.isclose(float(torn), 2.5**2 + 0.01, rel_tol=0.01)

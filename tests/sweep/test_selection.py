@@ -18,17 +18,10 @@ def test_the_best_usable_views_are_chosen_and_no_others():
         assert all(float(score[row, view]) > max(left, default=-1.0) for view in mine)
 
 
-def test_angle_resolution_and_light_all_count():
-    ones = torch.ones(1, 3)
-    fair = view_scores(ones, ones, ones)
-    assert_close(fair, ones)
-    worse = torch.tensor([[1.0, 1.0, 0.5]])
-    for scores in (
-        view_scores(worse, ones, ones),
-        view_scores(ones, worse, ones),
-        view_scores(ones, ones, worse),
-    ):
-        assert scores[0, 2] < scores[0, 0]
-    finer = view_scores(ones, torch.tensor([[1.0, 1.0, 3.0]]), ones)
-    assert_close(finer, fair)  # a sample that several pixels cover is no better judged
-    assert float(view_scores(ones, ones, torch.tensor([[1.0, 1.0, -1.0]]))[0, 2]) == 0
+def test_the_score_is_the_cosine_times_the_resolution_times_the_relative_light():
+    facing = torch.tensor([[0.5, 1.0, 0.8, 1.0]])
+    footprint = torch.tensor([[3.0, 0.5, 1.0, 2.0]])  # more than a pixel is no better than one
+    shading = torch.tensor([[2.0, 4.0, 1.0, -1.0]])  # of a mean of 7/4 with -1 taken for 0
+    expected = torch.tensor([[0.5 * 1.0, 0.5 * 1.0, 0.8 / 1.75, 0.0]])
+    assert_close(view_scores(facing, footprint, shading), expected)
+    assert (view_scores(facing, footprint, 0 * shading) == 0).all()  # no light at all

@@ -71,9 +71,10 @@ def test_fewer_views_suffice_and_too_few_are_none(lift):
     assert all((bucket.offset == 0).all() for bucket in none.buckets)
 
 
-@pytest.mark.parametrize("noise", [0.01, 0.04])
-def test_the_claimed_deviation_is_of_the_size_of_the_error(lift, noise):
-    lifted = lift(0.4)
+@pytest.mark.parametrize("height", [0.4, -1.1])
+@pytest.mark.parametrize("noise", [0.005, 0.01, 0.02, 0.04])
+def test_the_claimed_deviation_is_that_of_the_error(lift, noise, height):
+    lifted = lift(height)
     views, cameras, fitted = lifted.scene.views, lifted.scene.cameras, lifted.photometric
     drawn = torch.randn(views.images.shape, generator=torch.Generator().manual_seed(0))
     noisy = views.replace(images=views.images + noise * drawn)
@@ -88,9 +89,9 @@ def test_the_claimed_deviation_is_of_the_size_of_the_error(lift, noise):
     swept = Sweep()(noisy, cameras, seen, fitted.replace(buckets=tuple(buckets)))
     offsets, deviations = told(swept)
     error = (offsets + lifted.height) / (deviations / swept.averaged**0.5)
-    # 0.6745: the median of a standard normal's absolute values. Measured 0.59 and 0.93:
-    # neighbouring samples share pixels, and are counted as if they shared more.
-    assert 0.5 < float(error.abs().median()) / 0.6745 < 1.1
+    # 0.6745: the median of a standard normal's absolute values. Measured 0.82 to 1.21: how many
+    # samples share pixels, and so their noise, varies with the view.
+    assert 0.8 < float(error.abs().median()) / 0.6745 < 1.25
 
 
 def test_heights_have_the_slope_of_the_photographs_differences(lift):
