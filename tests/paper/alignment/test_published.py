@@ -1,5 +1,7 @@
 """The published system against a dense assembly, and what keeps it from flattening."""
 
+import dataclasses
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -66,12 +68,22 @@ def sphere(facets_over, height_fields, sphere_height_field):
     return height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
 
 
-def test_the_preset_paper_is_the_published_system():
-    align = load_config("paper").align
-    assert align.offset is False
-    assert align.curvature is True
-    assert align.outlier == float("inf")
-    assert align.points == 0
+def test_the_preset_paper_solves_the_published_system(disc):
+    """Three unknowns a patch, no weights for outliers, and no points of the cloud."""
+    depths, _ = disc
+    preset = load_config("paper").align
+
+    def aligned(depths, **changes):
+        return by_facet(Align(dataclasses.replace(preset, **changes))(depths))
+
+    found = aligned(depths)
+    assert (found[:, 3] == 0).all()  # no offset
+    assert aligned(depths, offset=True)[:, 3].abs().max() > 1e-3
+    # Nothing is weighted down: the step of the disc counts in full.
+    assert_close(found, aligned(depths, outlier=1e9))
+    assert (found - aligned(depths, outlier=5.0)).abs().max() > 1e-2
+    # Curvature lets the depths' second derivatives keep the scale.
+    assert (found - aligned(depths, curvature=False)).abs().max() > 1e-3
 
 
 def test_three_numbers_a_patch_solve_the_dense_kronecker_equations(generator):
