@@ -1,8 +1,8 @@
-"""What evidence of a whole facet is off by: light is fitted facet by facet, and errs so.
+"""Errors that the evidence of a facet has in common, as its light is fitted facet by facet.
 
 Normals know the fine detail, and positions the coarse shape. The mean difference of the two on
 every facet, blended between facets, is taken out of the normals. Swept heights are found in the
-same light: what they are off by in the mean is not taken out, but told.
+same light: their common error is not taken out, but its variance is given.
 
 Source: Nehab, Rusinkiewicz, Davis, Ramamoorthi: Efficiently combining positions and normals for
 precise 3D geometry, SIGGRAPH 2005, for the idea; facets in place of a smoothing kernel are ours.
@@ -19,10 +19,10 @@ from pimper_torch.fusion.terms import Common, Terms
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.records import Record
 
-# Of the square of unit Gaussian noise.
+# Median of the square of unit Gaussian noise.
 _MEDIAN_SQUARE = 0.4549
 
-# Of the squared length of a vector of two numbers of unit Gaussian noise.
+# Median of the squared length of a vector of two components of unit Gaussian noise.
 MEDIAN_OF_TILT = 2 * math.log(2)
 
 
@@ -76,12 +76,13 @@ def normal_bias(
 
     Large differences, as across a cliff, are cut to a quarter of a radian. Differentiable.
     """
-    apart = torch.where(known[:, None], shape - normals, 0)
-    size = apart.norm(dim=-1, keepdim=True)
-    apart = apart * (0.25 / size.clamp_min(0.25))
-    held = known.to(apart)
-    count = held.new_zeros(len(facets)).index_add(0, subdivision.facet, held)
-    summed = apart.new_zeros(len(facets), 3).index_add(0, subdivision.facet, apart)
+    difference = torch.where(known[:, None], shape - normals, 0)
+    size = difference.norm(dim=-1, keepdim=True)
+    difference = difference * (0.25 / size.clamp_min(0.25))
+    one = known.to(difference)
+    count = one.new_zeros(len(facets)).index_add(0, subdivision.facet, one)
+    summed = difference.new_zeros(len(facets), 3)
+    summed = summed.index_add(0, subdivision.facet, difference)
     return NormalBias(tilt=summed / count.clamp_min(1)[:, None], count=count, known=count > 0)
 
 
@@ -89,15 +90,15 @@ def common_variance(
     found: Terms,
     heights: Float[Tensor, " vertex"],
     facet: Int[Tensor, " vertex"],
-    held: Int[Tensor, " place"],
+    otherwise: Int[Tensor, " term"],
 ) -> Float[Tensor, ""]:
-    """Tell by which variance swept heights of one facet are too high together.
+    """Give the variance of the error that swept heights of one facet have in common.
 
     Args:
         found: The heights; one equation has one unknown.
-        heights: Of the surface. The less part they had in it, the better it judges them.
+        heights: Of the surface, to which swept heights should have contributed little.
         facet: Of each vertex.
-        held: Facets where that surface is known otherwise; elsewhere it cannot judge.
+        otherwise: Facets where the surface is known by other terms, which alone are evaluated.
 
     Differentiable.
     """
@@ -107,14 +108,14 @@ def common_variance(
     weight = found.information.to(off)
     total = off.new_zeros(size).index_add(0, facet[vertex], weight)
     mean = off.new_zeros(size).index_add(0, facet[vertex], weight * off)
-    judged = torch.zeros_like(total, dtype=torch.bool).index_fill(0, held, True) & (total > 0)
-    square = (mean[judged] / total[judged]).square()
+    used = torch.zeros_like(total, dtype=torch.bool).index_fill(0, otherwise, True) & (total > 0)
+    square = (mean[used] / total[used]).square()
     return square.median() / _MEDIAN_SQUARE if len(square) > 0 else off.new_zeros(())
 
 
-def alike(
-    variance: Float[Tensor, ""], facet: Int[Tensor, " vertex"], told: Bool[Tensor, " vertex"]
+def common(
+    variance: Float[Tensor, ""], facet: Int[Tensor, " vertex"], known: Bool[Tensor, " vertex"]
 ) -> Common:
-    """Say that what is told of the vertices of one facet errs by a variance together."""
-    count = torch.bincount(facet[told], minlength=int(facet.max()) + 1)
+    """Give the error that the known vertices of each facet have in common."""
+    count = torch.bincount(facet[known], minlength=int(facet.max()) + 1)
     return Common(variance=variance, count=count[facet].to(variance))

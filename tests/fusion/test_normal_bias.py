@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.normal_bias import alike, common_variance, normal_bias
+from pimper_torch.fusion.normal_bias import common, common_variance, normal_bias
 from pimper_torch.fusion.terms import swept_heights
 from pimper_torch.geometry.subdivision import subdivide
 
@@ -68,7 +68,7 @@ def test_the_variance_of_tilts_is_told_whatever_their_number():
     normals = torch.cat([tilts, torch.ones(600, 1).double()], dim=1)[subdivision.facet]
     known = torch.ones(len(shape), dtype=torch.bool)
     variance = normal_bias(subdivision, facets, normals, shape, known).variance()
-    found = alike(variance, subdivision.facet, known)
+    found = common(variance, subdivision.facet, known)
     assert float(found.variance) == pytest.approx(0.02**2, rel=0.15)
     assert_close(found.count, torch.bincount(subdivision.facet).double()[subdivision.facet])
 
@@ -87,10 +87,10 @@ def test_what_heights_of_a_facet_are_off_by_together_is_told_where_it_can_be():
         nothing, shared[facet] + 0.1 * own, information, torch.ones_like(nothing), 1.0
     )
     variance = common_variance(found, nothing, facet, torch.arange(400).repeat(2))
-    common = alike(variance, facet, information > 0)
-    assert float(common.variance) == pytest.approx(0.3**2, rel=0.15)
-    assert common.count[facet != 399].unique().tolist() == [50]
-    assert common.count[facet == 399].unique().tolist() == [0]
+    shared = common(variance, facet, information > 0)
+    assert float(shared.variance) == pytest.approx(0.3**2, rel=0.15)
+    assert shared.count[facet != 399].unique().tolist() == [50]
+    assert shared.count[facet == 399].unique().tolist() == [0]
 
 
 def test_heights_that_nothing_else_can_judge_are_taken_at_their_word():

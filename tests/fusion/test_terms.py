@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
-from pimper_torch.fusion.contacts import Ground, cloud_points, contour_tangents, passing
+from pimper_torch.fusion.contacts import BaseSurface, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.terms import (
     Common,
     kept_slopes,
@@ -20,9 +20,9 @@ from pimper_torch.records import ContourPoints, FacetPoints
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
-def told_of(contacts, known, ground):
-    """Give what places say of the surface that they are found on."""
-    return passing([contacts(known, ground)], ground)[0]
+def terms_of(contacts, known, surface):
+    """Give the terms of points of a surface."""
+    return passing([contacts(known, surface)], surface)[0]
 
 
 @pytest.fixture
@@ -150,15 +150,15 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivi
     cloud = FacetPoints(
         points_world=points, covariance_world=covariance, facet=torch.zeros(40, dtype=torch.long)
     )
-    ground = Ground(
-        places=subdivision.points,
+    surface = BaseSurface(
+        points=subdivision.points,
         faces=subdivision.faces,
         heights=transferred,
         directions=along,
         reach=1.0,
         finest=1e-9,
     )
-    found = told_of(cloud_points, cloud, ground)
+    found = terms_of(cloud_points, cloud, surface)
     assert len(found.targets) == 40
     assert found.unknowns.shape == (40, 1)
     assert_close(found.coefficients, torch.ones(40, 1).double())
@@ -169,16 +169,16 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivi
     # On a surface that leans, what it is lifted by is what it is off by at the point.
     leaning = subdivision.points + (0.3 * subdivision.points[:, :1]) * UP
     raised = torch.cat([xy, 0.3 * xy[:, :1] + 0.02], dim=1)
-    above = told_of(
+    above = terms_of(
         cloud_points,
         cloud.replace(points_world=raised),
-        ground.replace(places=leaning, heights=leaning[:, 2], directions=UP.expand_as(along)),
+        surface.replace(points=leaning, heights=leaning[:, 2], directions=UP.expand_as(along)),
     )
     assert_close(above.targets - leaning[above.unknowns[:, 0], 2], torch.full((40,), 0.02).double())
     # Uncertain across, sure along: only what is across a slanting line blurs it.
     assert (1 / found.information < 0.05).all()
     assert (1 / found.information >= 1e-4).all()
-    near = told_of(cloud_points, cloud, ground.replace(reach=0.01))
+    near = terms_of(cloud_points, cloud, surface.replace(reach=0.01))
     assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())
 
 
@@ -188,8 +188,8 @@ def test_contours_are_planes_that_touch_the_surface(subdivision, generator):
     tilted = subdivision.points + (slope * subdivision.points[:, :1]) * UP
     normal = normalize(torch.tensor([-slope, 0.0, 1.0]).double(), dim=0)
     along = normalize(torch.tensor([0.2, 0.1, 1.0]).double(), dim=0).expand_as(tilted)
-    ground = Ground(
-        places=tilted,
+    surface = BaseSurface(
+        points=tilted,
         faces=subdivision.faces,
         heights=torch.zeros(len(tilted), dtype=torch.float64),
         directions=along,
@@ -200,21 +200,21 @@ def test_contours_are_planes_that_touch_the_surface(subdivision, generator):
     ray = torch.linalg.cross(normal, normalize(torch.randn(3, generator=generator).double(), dim=0))
     # Where on its ray the place is taken does not matter: 0.04 above the plane, all along.
     shifts = 0.2 * (torch.rand(30, 1, generator=generator, dtype=torch.float64) - 0.5)
-    places = centre + 0.04 * normal + shifts * normalize(ray, dim=0)
+    points_world = centre + 0.04 * normal + shifts * normalize(ray, dim=0)
     contours = ContourPoints(
-        points_world=places,
+        points_world=points_world,
         normals_world=normal.expand(30, 3),
         variance=torch.full((30,), 1e-4).double(),
         view=torch.zeros(30, dtype=torch.long),
         ray=torch.arange(30),
     )
-    found = told_of(contour_tangents, contours, ground)
+    found = terms_of(contour_tangents, contours, surface)
     facing = float(along[0] @ normal)
     assert_close(found.targets, torch.full((30,), 0.04 / facing).double())
     assert_close(1 / found.information, torch.full((30,), 1e-4 / facing**2).double())
     # What a direction runs along cannot be reached by heights: nothing is said.
     beside = contours.replace(normals_world=torch.tensor([0.0, 1.0, 0.0]).double().expand(30, 3))
-    assert len(told_of(contour_tangents, beside, ground).targets) == 0
+    assert len(terms_of(contour_tangents, beside, surface).targets) == 0
 
 
 @pytest.mark.parametrize("kind", ["slopes", "kept_slopes", "kept_steps", "swept_heights"])
@@ -267,29 +267,28 @@ def test_terms_agree_with_finite_differences(subdivision, generator, kind):
 def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(subdivision, generator):
     height = 0.1 * torch.rand(len(subdivision.points), generator=generator, dtype=torch.float64)
     along = UP.expand(len(height), 3)
-    places = subdivision.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
+    points_world = subdivision.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
     cloud = FacetPoints(
-        points_world=places,
-        covariance_world=1e-4 * torch.eye(3).double().expand(len(places), 3, 3),
-        facet=torch.zeros(len(places), dtype=torch.long),
+        points_world=points_world,
+        covariance_world=1e-4 * torch.eye(3).double().expand(len(points_world), 3, 3),
+        facet=torch.zeros(len(points_world), dtype=torch.long),
     )
 
     def target(x):
         raised = x["heights"] + x["all"]
-        surface = subdivision.points + raised[:, None] * along
         points = cloud.replace(points_world=x["points"])
-        ground = Ground(
-            places=surface,
+        surface = BaseSurface(
+            points=subdivision.points + raised[:, None] * along,
             faces=subdivision.faces,
             heights=raised,
             directions=along,
             reach=9.0,
             finest=1e-3,
         )
-        found = told_of(cloud_points, points, ground)
+        found = terms_of(cloud_points, points, surface)
         return {"target": found.targets}
 
-    inputs = {"heights": height, "points": places, "all": torch.zeros(()).double()}
+    inputs = {"heights": height, "points": points_world, "all": torch.zeros(()).double()}
     checks = check_derivatives(target, inputs, generator)
     for check in checks.values():
         assert check.smooth.any()
@@ -302,28 +301,28 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(subdivi
 
 def test_a_contour_stays_where_it_is_as_the_surface_is_raised(subdivision, generator):
     height = 0.1 * torch.rand(len(subdivision.points), generator=generator, dtype=torch.float64)
-    places = subdivision.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
-    leaning = UP + 0.2 * torch.randn(places.shape, generator=generator, dtype=torch.float64)
+    points_world = subdivision.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
+    leaning = UP + 0.2 * torch.randn(points_world.shape, generator=generator, dtype=torch.float64)
     contours = ContourPoints(
-        points_world=places,
+        points_world=points_world,
         normals_world=normalize(leaning, dim=1),
-        variance=torch.full_like(places[:, 0], 1e-4),
-        view=torch.zeros(len(places), dtype=torch.long),
-        ray=torch.arange(len(places)),
+        variance=torch.full_like(points_world[:, 0], 1e-4),
+        view=torch.zeros(len(points_world), dtype=torch.long),
+        ray=torch.arange(len(points_world)),
     )
 
     def term(x):
         along = normalize(x["directions"], dim=1)
         raised = x["heights"] + x["all"]
-        ground = Ground(
-            places=subdivision.points + raised[:, None] * UP,
+        surface = BaseSurface(
+            points=subdivision.points + raised[:, None] * UP,
             faces=subdivision.faces,
             heights=raised,
             directions=along,
             reach=9.0,
             finest=1e-3,
         )
-        found = told_of(contour_tangents, contours, ground)
+        found = terms_of(contour_tangents, contours, surface)
         return {"target": found.targets, "information": found.information}
 
     inputs = {
