@@ -1,9 +1,9 @@
 """The coarse shape of one surface, and the detail of another.
 
-Normals that are trusted singly carry detail, but what is left of the tilts of whole facets bends
-the shape; ones that are known to err alike leave the shape to positions, but are then too weak
-to keep single points from raising pimples. Both surfaces are made, and the first one is given
-the coarse shape of the second.
+Normals of independent errors carry detail, but what remains of the common tilts of facets bends
+the shape; with common errors they leave the shape to positions, but are then too weak to keep
+single points from raising pimples. Both surfaces are solved for, and the first one is given the
+coarse shape of the second.
 
 Source: Nehab, Rusinkiewicz, Davis, Ramamoorthi: Efficiently combining positions and normals for
 precise 3D geometry, SIGGRAPH 2005, for the idea; functions linear on facets are ours.
@@ -16,8 +16,8 @@ from torch import Tensor
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.linalg.systems import prepare
 
-# Weight that a corner is held to zero by, beside 1 for every vertex of the subdivided mesh: it
-# decides nothing.
+# Weight of zero for every corner, beside 1 for every vertex of the subdivided mesh: it only keeps
+# corners without a vertex from being singular.
 _DAMPING = 1e-3
 
 
@@ -42,11 +42,11 @@ class CoarsePart:
                 sums = product.new_zeros(len(facets)).index_add(0, subdivision.facet, product)
                 entries.append(sums)
         each = torch.arange(self._size, device=facets.device)
-        held = torch.full_like(each, _DAMPING, dtype=fraction.dtype)
+        damping = torch.full_like(each, _DAMPING, dtype=fraction.dtype)
         self._normal = prepare(
             torch.cat([each, *rows]),
             torch.cat([each, *cols]),
-            torch.cat([held, *entries]),
+            torch.cat([damping, *entries]),
             self._size,
             "the fusion's coarse shape",
         )

@@ -1,9 +1,9 @@
 """The union of the patches, sampled on the subdivided mesh of the coarse mesh.
 
-A subdivided mesh vertex has one ray: from its place on the flat facet along the coarse mesh's
+A subdivided mesh vertex has one ray: from its position on the flat facet along the coarse mesh's
 smoothed normal, interpolated as Phong does, so that rays are continuous across facets. The
-vertex's own patch and the neighbours whose enlarged triangle the ray passes say how high
-the surface lies along it.
+vertex's own patch and the neighbours whose enlarged triangle the ray passes give the height
+of the surface along it.
 """
 
 from collections.abc import Sequence
@@ -31,29 +31,31 @@ from pimper_torch.records import (
     Templates,
 )
 
-# A ray turned more than this from the patch's own normal (cosine) says nothing of its height.
+# Rays at a flatter angle to the patch (cosine) are not intersected with it: 78 degrees from its
+# normal, a choice.
 _FACING = 0.2
 
-# How far outside the band a ray may cross the facet's plane and still meet its height field inside.
+# How far outside the band a ray may cross the facet's plane and still meet its height field inside:
+# a choice.
 _SLACK_BANDS = 2.0
 
 # Samples at the border of a template whose cells are not whole, so that no ray meets them.
 _RAGGED_SAMPLES = 1.5
 
-# An outlier twice as far away as allowed counts an eleventh.
+# An outlier twice as far away as allowed counts an eleventh: a choice.
 _DISTRUST = 10.0
 
-# Less weight than this is a border that tapered out.
+# Less weight than this is a border that tapered out: a choice.
 _MIN_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Blend(Record):
-    """What the patches together say at every vertex of the subdivided mesh.
+    """The patches' weighted means at every vertex of the subdivided mesh.
 
     Attributes:
         heights: Along the vertex's ray, scene units; 0 where no patch supports the vertex.
-        supported: True where a patch has valid height field.
+        supported: True where a patch has a valid height field.
         normals_world: Photometric, unit; zero where no patch has one.
         albedo: Linear; zero where no patch has one.
         seen: True where normal and albedo are photometric.
@@ -136,7 +138,7 @@ def blend_patches(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Estimates(Record):
-    """What single patches say of single vertices.
+    """Heights, normals, albedo and offsets of single patches at single vertices.
 
     ``albedo`` counts where ``known``. ``normal`` and ``offset`` begin with the information, which
     what follows is multiplied by.
@@ -227,14 +229,14 @@ def _rays_near(
     around: "_Lists",
     vertices: "_Lists",
 ) -> tuple[Int[Tensor, "patch ray"], Bool[Tensor, "patch ray"]]:
-    """List, for each patch, the vertices of its facet and of those around it that it may know.
+    """List, for each patch, the vertices around it whose rays its height field may meet.
 
     Returns:
-        Vertices, padded with 0, and which entries are meant.
+        Vertices, padded with 0, and which entries are no padding.
     """
     patch, facet = around.take(templates.facet)
-    place, vertex = vertices.take(facet)
-    patch = patch[place]
+    index, vertex = vertices.take(facet)
+    patch = patch[index]
     frame, from_patch = templates.patch_from_world, _barycentric_map(corners)
     start = transform(frame[patch], subdivision.points[vertex, None])[:, 0]
     along = rotate(frame[patch], directions[vertex, None])[:, 0]
@@ -251,35 +253,35 @@ def _rays_near(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Lists:
-    """Numbers in lists of different lengths, in a row."""
+    """Indices in lists of different lengths, one after the other."""
 
     start: Int[Tensor, " list"]
     count: Int[Tensor, " list"]
-    number: Int[Tensor, " entry"]
+    index: Int[Tensor, " entry"]
 
     @staticmethod
-    def of(which: Int[Tensor, " entry"], number: Int[Tensor, " entry"], size: int) -> "_Lists":
-        """Put each number into the list that it belongs to."""
+    def of(which: Int[Tensor, " entry"], index: Int[Tensor, " entry"], size: int) -> "_Lists":
+        """Put each index into the list that it belongs to."""
         order = which.argsort(stable=True)
         count = torch.bincount(which, minlength=size)
-        return _Lists(start=count.cumsum(0) - count, count=count, number=number[order])
+        return _Lists(start=count.cumsum(0) - count, count=count, index=index[order])
 
     def take(
         self, which: Int[Tensor, " taken"]
     ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"]]:
-        """Give the numbers of some lists, and at which place of these each stands."""
+        """Give the indices in some lists, and which of these lists each is of."""
         count = self.count[which]
-        place = torch.arange(len(which), device=which.device).repeat_interleave(count)
-        within = torch.arange(len(place), device=which.device) - (count.cumsum(0) - count)[place]
-        return place, self.number[self.start[which][place] + within]
+        taken = torch.arange(len(which), device=which.device).repeat_interleave(count)
+        within = torch.arange(len(taken), device=which.device) - (count.cumsum(0) - count)[taken]
+        return taken, self.index[self.start[which][taken] + within]
 
 
 def _facets_around(faces: Int[Tensor, "facet 3"]) -> _Lists:
     """List, for each facet, itself and the facets that share a corner with it, in order."""
     own = torch.arange(len(faces), device=faces.device)[:, None].expand_as(faces).flatten()
     corner = faces.flatten()
-    place, facet = _Lists.of(corner, own, int(corner.max()) + 1).take(corner)
-    pairs = torch.unique(torch.stack([own[place], facet], dim=1), dim=0)
+    taken, facet = _Lists.of(corner, own, int(corner.max()) + 1).take(corner)
+    pairs = torch.unique(torch.stack([own[taken], facet], dim=1), dim=0)
     return _Lists.of(pairs[:, 0], pairs[:, 1], len(faces))
 
 
@@ -340,17 +342,17 @@ def _agreement(
         by_height = estimates.height.argsort(stable=True)
         order = by_height[estimates.vertex[by_height].argsort(stable=True)]
         vertex, weight = estimates.vertex[order], estimates.weight[order].double()
-        number = torch.bincount(vertex, minlength=count)
+        patches = torch.bincount(vertex, minlength=count)
         total = _sum_at(vertex, weight, count)
         running = weight.cumsum(0)
         before = (total.cumsum(0) - total)[vertex]
         below = _sum_at(vertex, (running - before < total[vertex] / 2).long(), count)
-        centre = (number.cumsum(0) - number + below.clamp_max((number - 1).clamp_min(0)))[vertex]
+        centre = (patches.cumsum(0) - patches + below.clamp_max((patches - 1).clamp_min(0)))[vertex]
         nearest = torch.empty_like(order)
         nearest[order] = order[centre]
     median = estimates.height[nearest]
     away = (estimates.height - median) / (outlier_samples * estimates.scale)
-    many = number[estimates.vertex] >= 3
+    many = patches[estimates.vertex] >= 3
     beyond = (away.abs() - 1).clamp_min(0)
     return torch.where(many, 1 / (1 + _DISTRUST * beyond.square()), 1)
 

@@ -1,4 +1,4 @@
-r"""What is known of some vertices, continued onto the others.
+r"""Values of some vertices, inpainted on the others.
 
 Values vary from vertex to vertex like a random walk, and are known, badly, from elsewhere, so
 that the most likely ones of the others minimize
@@ -16,8 +16,8 @@ from torch import Tensor
 from pimper_torch.geometry.topology import boundary_vertices, vertex_components
 from pimper_torch.linalg.systems import solutions
 
-# The mean counts as much as this fraction of a neighbour at least, so that every vertex has a
-# value.
+# The mean counts as much as this fraction of a neighbour at least, so that the system is not
+# singular: a choice.
 _MIN_DAMPING = 1e-6
 
 
@@ -37,7 +37,7 @@ def continued(
         otherwise: What the others are taken for, far from what is known.
         damping: How many neighbours that counts as, above 0.
 
-    Differentiable in the values that are known, and in the others' ``otherwise`` and ``hold``.
+    Differentiable in the values that are known, and in the others' ``otherwise`` and ``damping``.
 
     >>> chain = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4]])
     >>> known = torch.tensor([True, True, False, True, True])
@@ -49,20 +49,20 @@ def continued(
     if len(unknown) == 0:
         return values
     each = torch.arange(len(unknown), device=known.device)
-    number = known.long().index_copy(0, unknown, each)
+    index = known.long().index_copy(0, unknown, each)
     both = torch.cat([edges, edges.flip(1)])
     own, beside = both[~known[both[:, 0]]].unbind(dim=1)
-    row, fixed = number[own], known[beside]
-    held = damping[unknown].double()
-    side = held[:, None] * otherwise[unknown].double()
+    row, fixed = index[own], known[beside]
+    own_damping = damping[unknown].double()
+    side = own_damping[:, None] * otherwise[unknown].double()
     side = side.index_add(0, row[fixed], values[beside[fixed]].double())
-    around = torch.bincount(row, minlength=len(unknown)).to(held)
+    around = torch.bincount(row, minlength=len(unknown)).to(own_damping)
     (found,) = solutions(
         torch.cat([each, row[~fixed]]),
-        torch.cat([each, number[beside[~fixed]]]),
-        torch.cat([around + held, around.new_full((int((~fixed).sum()),), -1.0)]),
+        torch.cat([each, index[beside[~fixed]]]),
+        torch.cat([around + own_damping, around.new_full((int((~fixed).sum()),), -1.0)]),
         side,
-        what="the continuation of what is known of some vertices",
+        what="the inpainting of vertices",
     )
     return values.index_copy(0, unknown, found.to(values))
 

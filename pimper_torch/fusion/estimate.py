@@ -1,8 +1,8 @@
-r"""Least squares over evidence of several kinds, whose noise is estimated along with the answer.
+r"""Least squares over terms of several kinds, whose noise is estimated along with the solution.
 
 Every kind claims variances that are right up to one factor. The factor is what its squared
 residuals show, robustly, over what they should show: of ``m`` equations,
-:math:`m - \mathrm{tr}(A_k A^{-1})` are left over to tell, with :math:`A_k` what the kind adds to
+their redundancy :math:`m - \mathrm{tr}(A_k A^{-1})` remains, with :math:`A_k` what the kind adds to
 the matrix of the solution. Outliers lose weight by Cauchy's function as the factors settle.
 
 Source: Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten, 1979, for
@@ -26,30 +26,32 @@ from pimper_torch.photometry.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.records import Record
 
 # Of the heights, in the energy norm, relative. With 1e-5 vertices of the demo move by 5e-5 of a
-# spacing, with 1e-3 by 1.6e-3; to judge noise by, that is enough. Gradients ask for more.
-_ACCURATE, _JUDGING, _EXACT = 1e-6, 1e-4, 1e-8
+# spacing, with 1e-3 by 1.6e-3; to estimate noise, that is enough. Gradients ask for more.
+_ACCURATE, _ESTIMATING, _EXACT = 1e-6, 1e-4, 1e-8
 
-# Equations of a kind that tell its noise at least, where there are so many.
-_JUDGES = 500_000
+# Equations of a kind that its noise is estimated from at least, where there are so many: the
+# factor's standard error is then below 0.2 %.
+_SUBSET = 500_000
 
-# No source is more than twice too modest: where one kind is followed blindly its residuals
-# vanish, and would make it surer still.
+# No source claims more than twice its true standard error: residuals of a kind that outweighs all
+# others vanish, which would raise its weight without bound.
 _MIN_FACTOR = 0.25
 
-# Evidence that seems to be used up whole still has this fraction left to judge it by.
-_MIN_LEFT = 0.05
+# Least redundancy of a kind, as a fraction of its equations: its estimate by random signs may be
+# negative.
+_MIN_REDUNDANCY = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Fused(Record):
-    """The heights, how far each kind of evidence was right about itself, and the last system.
+    """The heights, the noise factor of each kind of terms, and the last system.
 
     Attributes:
         heights: Of all vertices, float64.
         factors: What the variances that each kind claims were multiplied by.
-        kinds: Of evidence.
+        kinds: Of terms.
         weights: Of every equation of each kind; outliers have less than 1.
-        damping: Information that vertices keep their start by.
+        damping: Information of the heights that vertices start at.
     """
 
     heights: Float[Tensor, " vertex"]
@@ -75,16 +77,16 @@ def fuse_terms(
     iterations: int,
     near: Float[Tensor, " vertex"] | None = None,
 ) -> Fused:
-    """Solve, judge the noise, and solve again.
+    """Solve, estimate the noise, and solve again.
 
     Args:
-        kinds: Of evidence; those without equations are passed over.
-        start: Heights that vertices keep where nothing is known.
-        damping: Information that they keep them by.
+        kinds: Of terms; those without equations are skipped.
+        start: Heights that vertices keep without other terms.
+        damping: Information of these.
         iterations: Of solves.
         near: Heights that iterations may begin at; they do not change the answer.
 
-    Differentiable in targets, coefficients, information, hold and start, through the weights and
+    Differentiable in targets, coefficients, information, damping and start, through the weights and
     the factors too: every solve answers by the implicit function. That takes as many more solves
     as there were, once gradients are asked for.
 
@@ -99,16 +101,16 @@ def fuse_terms(
     heights = near
     for _ in range(iterations - 1):
         heights, answer = _solved(
-            kinds, weights, found, start, damping, probe, guess=heights, tolerance=_JUDGING
+            kinds, weights, found, start, damping, probe, guess=heights, tolerance=_ESTIMATING
         )
-        for place, kind in enumerate(kinds):
-            if not kind.judged or len(kind.targets) == 0:
+        for index, kind in enumerate(kinds):
+            if not kind.evaluated or len(kind.targets) == 0:
                 continue
-            square, used = _judged(kind, weights[place], heights, probe, answer)
-            left = 1 - used / found[place] / weights[place].sum()
-            square = square / left.clamp_min(_MIN_LEFT)
-            found[place] = noise_factor(square[:: max(1, len(square) // _JUDGES)])
-            weights[place] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[place]))
+            square, used = _evaluated(kind, weights[index], heights, probe, answer)
+            redundancy = 1 - used / found[index] / weights[index].sum()
+            square = square / redundancy.clamp_min(_MIN_REDUNDANCY)
+            found[index] = noise_factor(square[:: max(1, len(square) // _SUBSET)])
+            weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[index]))
     (heights,) = _solved(kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE)
     return Fused(
         heights=heights,
@@ -147,17 +149,17 @@ def _solved(
     return found.unbind(dim=1)
 
 
-def _judged(
+def _evaluated(
     kind: Terms,
     weight: Float[Tensor, " equation"],
     heights: Float[Tensor, " vertex"],
     probe: Float[Tensor, " vertex"],
     answer: Float[Tensor, " vertex"],
 ) -> tuple[Float[Tensor, " equation"], Float[Tensor, ""]]:
-    """Give squared residuals in units of what is claimed, and how much of them is used up.
+    """Give squared residuals in units of the claimed variance, and how many equations are used up.
 
     Args:
-        kind: Of evidence.
+        kind: Of terms.
         weight: Of its equations.
         heights: Of the surface.
         probe: Random signs.
@@ -171,15 +173,15 @@ def _judged(
         real = torch.promote_types(kind.coefficients.dtype, kind.targets.dtype)
         arrays = [as_array(kind.unknowns), *(as_array(part, real) for part in parts)]
         arrays += [as_array(each) for each in (weight, heights, probe, answer, square)]
-        judge: Any = kernels.judge
-        return square, torch.tensor(judge(*arrays), dtype=torch.float64)
+        evaluate: Any = kernels.judge
+        return square, torch.tensor(evaluate(*arrays), dtype=torch.float64)
     square = kind.information.double() * kind.residual(heights).square() * kind.correlated
     used = weight * kind.information * _sum(kind, probe) * _sum(kind, answer)
     return square, used.sum()
 
 
 def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
-    """Tell the variance of Gaussian noise from its squares, outliers apart. Differentiable.
+    """Estimate the variance of Gaussian noise from its squares, robustly. Differentiable.
 
     Args:
         square: Of residuals, in units of the variance that is claimed, over the fraction of the

@@ -1,15 +1,15 @@
-r"""How far the fused surface is expected to be off, vertex by vertex.
+r"""The expected error of every vertex of the fused surface.
 
-The fused heights are linear in the targets of all evidence once weights and factors are found.
+The fused heights are linear in the targets of all terms once weights and factors are found.
 So noise is drawn for every target, of the variance that its residuals showed, and answered by the
 same solves: the root mean square of the answers is the standard error of the heights, over all
-wavelengths and with all that neighbours know. What evidence errs by together, as its light does,
-is drawn together for a few facets that lie side by side. Residuals do not tell all: a surface that
-follows smooth errors of its normals leaves none, so that no kind is taken to be surer than it
-claims; and what nobody measured, such as slopes that are kept or continued, is worse than what
-was, by a factor found on rendered scenes.
+wavelengths and with all correlations. Common errors, such as those of the light, are drawn
+together for a few adjacent facets. Residuals do not show all errors: a surface that follows smooth
+errors of its normals leaves none, so that no kind has less variance than it claims; and slopes
+that were not measured, but kept or continued, have a larger error than measured ones, by a factor
+found on rendered scenes.
 
-It is conditional on the cameras, and knows nothing of a surface that all evidence has wrong.
+It is conditional on the cameras, and does not include errors that all terms share.
 
 Source: Papandreou & Yuille, Gaussian sampling by local perturbations, NIPS 2010, for samples of a
 Gaussian by perturbed least squares. Noise that differs from what the weights say is ours.
@@ -29,16 +29,16 @@ from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.linalg.systems import prepare
 
-# Side of the regions that err alike, in edges of a facet of usual size. Errors of the fused
+# Side of the regions of a common error, in edges of a facet of usual size. Errors of the fused
 # surface of rendered mug, potatoes and jar (16 photographs of 640x480) are correlated by 0.5 to
 # 0.8 over 1.5 to 3 % of the diagonal and by 0.3 to 0.5 over 3 to 6 %; their facets are 2 to 3 %.
-_ALIKE = 2.5
+_REGION = 2.5
 
-# Slopes that nobody measured err by so many times what is doubted of the surface: in the median
+# Errors of slopes that were not measured, over the standard error they are given: in the median
 # 5.0 on the mug, 11.5 on the potatoes and 3.7 on the jar.
 _UNMEASURED = 5.0
 
-# Of the answers, relative, in the energy norm: far below what a dozen draws tell.
+# Of the answers, relative, in the energy norm: far below the sampling error of a dozen draws.
 _ACCURACY = 1e-2
 
 
@@ -64,7 +64,7 @@ def expected_error(
     """
     generator = torch.Generator().manual_seed(0)  # of noise: any will do
     region = regions(subdivision)
-    noises, held = [], []
+    noises, starts = [], []
     for _ in range(draws):
         noises.append(
             [
@@ -74,10 +74,10 @@ def expected_error(
                 )
             ]
         )
-        held.append(_normal(generator, coarse.damping) / coarse.damping.double().sqrt())
-    off = _answers(coarse, noises, held)
+        starts.append(_normal(generator, coarse.damping) / coarse.damping.double().sqrt())
+    off = _answers(coarse, noises, starts)
     if fine is not coarse:
-        detail = _answers(fine, noises, held)
+        detail = _answers(fine, noises, starts)
         off = detail + CoarsePart(subdivision, facets)(off - detail)
     return off.square().mean(dim=1).sqrt()
 
@@ -85,10 +85,10 @@ def expected_error(
 def _answers(
     fused: Fused,
     noises: list[list[Float[Tensor, " _"]]],
-    held: list[Float[Tensor, " vertex"]],
+    starts: list[Float[Tensor, " vertex"]],
 ) -> Float[Tensor, "vertex draw"]:
     """Give the heights' answers to errors of the targets, all draws at once."""
-    sides = [_answerable(fused, *each) for each in zip(noises, held, strict=True)]
+    sides = [_answerable(fused, *each) for each in zip(noises, starts, strict=True)]
     rows, cols, values = fused.matrix()
     what = "the expected error"
     system = prepare(rows, cols, values, len(fused.heights), what, tolerance=_ACCURACY)
@@ -105,7 +105,7 @@ def regions(subdivision: Subdivision) -> Int[Tensor, " facet"]:
     areas = face_normals(points, subdivision.faces).norm(dim=1) / 2
     area = areas.new_zeros(num_facets).index_add(0, subdivision.face_facet, areas)
     edge = (4 / math.sqrt(3) * area[area > 0].median()).sqrt()  # of an equilateral facet
-    _, label = torch.unique((centre / (_ALIKE * edge)).floor(), dim=0, return_inverse=True)
+    _, label = torch.unique((centre / (_REGION * edge)).floor(), dim=0, return_inverse=True)
     return label
 
 
@@ -124,11 +124,11 @@ def _noise(
     depends on where they point.
     """
     claimed = 1 / (weight * kind.information.double() * kind.correlated.double())
-    each = claimed * (max(factor, 1.0) if kind.judged else _UNMEASURED**2)
+    each = claimed * (max(factor, 1.0) if kind.evaluated else _UNMEASURED**2)
     facet = subdivision.facet[kind.unknowns[:, 0]]
     count = torch.bincount(facet, minlength=1)[facet].to(each)
     together = torch.ones_like(each)
-    if kind.judged:
+    if kind.evaluated:
         together = ((kind.correlated.double() - 1) / (count - 1).clamp_min(1)).clamp(0, 1)
     num_regions = int(region.max()) + 1
     if kind.unknowns.shape[1] == 2:
@@ -143,16 +143,16 @@ def _noise(
 
 
 def _answerable(
-    fused: Fused, noise: list[Float[Tensor, " _"]], held: Float[Tensor, " vertex"]
+    fused: Fused, noise: list[Float[Tensor, " _"]], starts: Float[Tensor, " vertex"]
 ) -> Float[Tensor, " vertex"]:
     """Give the right-hand side that errors of the targets make."""
-    rhs = fused.damping.double() * held
+    rhs = fused.damping.double() * starts
     for kind, weight, factor, off in zip(
         fused.kinds, fused.weights, fused.factors, noise, strict=True
     ):
         scaled = (weight * kind.information.double() / factor * off)[:, None]
-        told = (scaled * kind.coefficients.double()).flatten()
-        rhs = rhs.index_add(0, kind.unknowns.flatten(), told)
+        weighted = (scaled * kind.coefficients.double()).flatten()
+        rhs = rhs.index_add(0, kind.unknowns.flatten(), weighted)
     return rhs
 
 

@@ -1,7 +1,7 @@
 """The stage that makes one surface of slopes, swept heights and the cloud's points.
 
-It reads in the order of its ``forward``: what facets err by together is estimated on a coarser
-subdivided mesh, then the surface is solved for at full size, and its expected error drawn.
+It reads in the order of its ``forward``: the errors that facets have in common are estimated on a
+coarser subdivided mesh, then the surface is solved for at full size, and its expected error drawn.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ _COARSER = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FuseConfig:
-    """Which evidence takes part, and how the noise of each is found.
+    """Which terms take part, and how the noise of each kind is estimated.
 
     Attributes:
         samples_per_vertex: Template samples between neighbouring vertices of the surface.
@@ -42,14 +42,14 @@ class FuseConfig:
         heights: Whether swept heights do.
         points: Whether the cloud's points do.
         contours: Whether the rays through the silhouettes do.
-        bias_iterations: How often the tilt that all normals of a facet share, and the height that
-            all swept heights of a facet are off by, are estimated, and the tilt taken out; 0
-            trusts both at all wavelengths.
-        noise_iterations: Solves in which the noise of each kind of evidence is estimated and
+        bias_iterations: How often the tilt that the normals of a facet have in common, and the
+            variance of the error that its swept heights have in common, are estimated; 0 takes
+            all errors for independent.
+        noise_iterations: Solves in which the noise of each kind of terms is estimated and
             outliers lose weight: for each estimate of the tilt and twice after them on a coarser
             subdivided mesh, and twice at full size.
-        error_draws: Of noise, for the expected error of every vertex; the more, the less it is
-            off by chance: 8 by a quarter. 0 gives none.
+        error_draws: Of noise, for the expected error of every vertex; its relative standard error
+            is one over the square root of twice as many, a quarter for 8. 0 gives none.
     """
 
     samples_per_vertex: float = 1.0
@@ -77,7 +77,7 @@ class FuseConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Shared(Record):
-    """Errors that the evidence of a facet has in common, and the solves that they came from.
+    """Errors that the terms of a facet have in common, and the solves that they came from.
 
     Attributes:
         tilt: Of the normals of each facet; ``None`` if no position tells it.
@@ -95,7 +95,7 @@ class _Shared(Record):
 
 
 class Fuse(Stage):
-    """Solve for the surface that agrees best with all evidence, over all facets at once.
+    """Solve for the surface that agrees best with all terms, over all facets at once.
 
     Unknown is the height of every vertex of the subdivided mesh along the coarse mesh's smoothed
     normal. Terms are linear in it: edges are at right angles to photometric normals, the sweep
@@ -180,7 +180,7 @@ class Fuse(Stage):
         return found
 
     def _shared(self, problem: Problem, contacts: list[Contacts]) -> _Shared:
-        """Estimate the noise of each kind of evidence, and the errors that a facet has in common.
+        """Estimate the noise of each kind of terms, and the errors that a facet has in common.
 
         Normals and positions are estimated from each other, in turns.
         """

@@ -1,4 +1,4 @@
-"""Errors that the evidence of a facet has in common, as its light is fitted facet by facet.
+"""Errors that the terms of a facet have in common, as its light is fitted facet by facet.
 
 Normals know the fine detail, and positions the coarse shape. The mean difference of the two on
 every facet, blended between facets, is taken out of the normals. Swept heights are found in the

@@ -1,4 +1,4 @@
-"""One subdivided mesh, and what every kind of evidence says about the heights of its vertices."""
+"""One subdivided mesh, and every kind of terms of the heights of its vertices."""
 
 import math
 from dataclasses import dataclass
@@ -101,13 +101,13 @@ class Problem(Record):
 
     @property
     def damping(self) -> Float[Tensor, " vertex"]:
-        """Information that holds every vertex at its present height."""
+        """Information of every vertex's present height."""
         return (_DAMPING / self.spacing**2).expand_as(self.blend.heights)
 
     def slopes(
         self, normals: Float[Tensor, "vertex 3"], shared: Float[Tensor, ""] | None = None
     ) -> Terms:
-        """Give what normals say where there are any.
+        """Give the terms of photometric normals.
 
         Args:
             normals: Photometric, with or without their bias.
@@ -124,7 +124,7 @@ class Problem(Record):
         )
 
     def heights(self, shared: Float[Tensor, ""] | None = None) -> Terms:
-        """Give what the sweep says.
+        """Give the terms of swept heights.
 
         Args:
             shared: Variance of the error that the heights of a facet have in common.
@@ -162,7 +162,7 @@ class Problem(Record):
         sloped = kept & upright(edges, along, self.normals)
         return [
             slopes(edges[over], flat, along, normals, together).replace(
-                correlated=(together / variance)[edges[over]].mean(dim=1), judged=False
+                correlated=(together / variance)[edges[over]].mean(dim=1), evaluated=False
             ),
             kept_slopes(edges[sloped], flat, along, self.normals, transferred, variance),
             kept_steps(edges[kept & ~sloped], flat, transferred, variance),

@@ -1,7 +1,7 @@
 r"""The residual terms of the fusion: linear equations in the heights of vertices.
 
-A vertex lies at ``x_v = q_v + h_v d_v``: its place on the flat facet, and the height along its
-direction. Every kind of evidence is a set of equations :math:`\sum_k c_k h_{u_k} = t`, each with
+A vertex lies at ``x_v = q_v + h_v d_v``: its position on the flat facet, and the height along its
+direction. Every kind of terms is a set of equations :math:`\sum_k c_k h_{u_k} = t`, each with
 the variance that its source claims.
 """
 
@@ -23,7 +23,7 @@ _UPRIGHT = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Common(Record):
-    """An error that neighbours make alike, as their light and albedo were found together.
+    """An error that neighbours have in common, as their light and albedo were found together.
 
     It does not average out. Neighbours that have it agree with each other, and would outvote
     what is right; ``count`` times its variance, added to that of each, makes all of them
@@ -31,7 +31,7 @@ class Common(Record):
 
     Attributes:
         variance: Of the error.
-        count: Of the neighbours that make it together, for each vertex.
+        count: Of the neighbours that have it, for each vertex.
     """
 
     variance: Float[Tensor, ""]
@@ -47,9 +47,9 @@ class Terms(Record):
         coefficients: Of their heights.
         targets: What these should add up to.
         information: Inverse variance of the target, as its source claims, or what is left of it
-            where neighbours err alike: together they must not count for more than they know.
+            where neighbours have a common error: together they must not count for more.
         correlated: How many times less than the variance so enlarged each target errs by.
-        judged: Whether residuals may tell what the variances are to be multiplied by.
+        evaluated: Whether the noise factor is estimated from residuals.
     """
 
     unknowns: Int[Tensor, "equation term"]
@@ -57,10 +57,10 @@ class Terms(Record):
     targets: Float[Tensor, " equation"]
     information: Float[Tensor, " equation"]
     correlated: Float[Tensor, " equation"]
-    judged: bool = True
+    evaluated: bool = True
 
     def residual(self, heights: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
-        """Give what is left: target less sum."""
+        """Give the residual: target less sum."""
         return self.targets - (self.coefficients * heights[self.unknowns]).sum(dim=1)
 
 
@@ -83,7 +83,7 @@ def slopes(
         directions: ``d``, unit.
         normals: Unit, outward.
         variance: Of the normals, squared radians.
-        common: What neighbours' normals are turned by alike.
+        common: Tilt that neighbours' normals have in common.
     """
     one, other = edges.unbind(dim=1)
     centre = normalize(normals[one] + normals[other], dim=-1)
@@ -112,8 +112,8 @@ def upright(
 ) -> Bool[Tensor, " edge"]:
     """Mark edges whose slope heights can follow.
 
-    Others lie across a contour or a fold as seen along the directions: raising both ends alike
-    would turn the edge. Constant.
+    Others lie across a contour or a fold as seen along the directions: raising both ends by the
+    same height would rotate the edge. Constant.
     """
     centre = normalize(normals[edges].detach().sum(dim=1), dim=-1)
     return ((centre[:, None] * directions[edges].detach()).sum(dim=-1) > _UPRIGHT).all(dim=1)
@@ -140,7 +140,7 @@ def kept_slopes(
     found = slopes(edges, flat, directions, shape, variance * torch.ones_like(transferred))
     return found.replace(
         targets=(found.coefficients * transferred[edges]).sum(dim=1),
-        judged=False,
+        evaluated=False,
     )
 
 
@@ -166,7 +166,7 @@ def kept_steps(
         targets=transferred[other] - transferred[one],
         information=1 / (variance * square),
         correlated=torch.ones_like(square),
-        judged=False,
+        evaluated=False,
     )
 
 
@@ -186,7 +186,7 @@ def swept_heights(
         information: Of the offsets, each vertex's own share; one without says nothing.
         facing: Cosine between normals and directions.
         correlated: Vertices in a window, which have one offset.
-        common: What neighbours are too high by alike, in windows of their own.
+        common: Error that neighbours have in common, beyond their windows.
     """
     known = upright_heights(information, facing).nonzero()[:, 0]
     steep = facing[known]

@@ -72,9 +72,9 @@ def fit_albedo(
 
     Args:
         radiance: Linear.
-        weight: Of each entry, alike for all channels.
-        lights: Alike for all channels.
-        basis: What albedo 1 makes of the normals.
+        weight: Of each entry, the same for all channels.
+        lights: The same for all channels.
+        basis: Harmonics of the normals.
 
     Not negative; zero where nothing is lit. Differentiable.
     """

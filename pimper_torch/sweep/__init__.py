@@ -1,1 +1,1 @@
-"""Heights under the fitted light: multi-view stereo that does not mind the light changing."""
+"""Heights under the fitted light: multi-view stereo under changing light."""

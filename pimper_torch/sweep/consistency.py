@@ -1,8 +1,8 @@
-r"""How well views agree on one place of the surface, under the light that each of them has.
+r"""How well views agree on one point of the surface, under the light of each.
 
 A view ``g`` should show :math:`\rho s_g`, with :math:`s_g` what its light makes of albedo 1
-there. The albedo that suits all views best is found in closed form, and what it leaves is the
-cost of the place.
+there. The albedo that fits all views best is found by re-weighted means, and its robust residual
+is the cost of the point.
 """
 
 import torch
@@ -23,7 +23,7 @@ def inconsistency(
 
     .. math:: C = \sum_g \tfrac12 \log(1 + (x_g - \rho s_g)^2 / c^2)
 
-    with the albedo that is the median of what single views say, then so many re-weighted means.
+    with the albedo that is the median of those of single views, then so many re-weighted means.
 
     Args:
         radiance: What each view shows of the sample if the hypothesis holds.
@@ -33,12 +33,12 @@ def inconsistency(
         scale: ``c``, in units of radiance.
         iterations: Of the albedo.
 
-    Differentiable in radiance, shading and scale, through the rounds of the albedo.
+    Differentiable in radiance, shading and scale, through the iterations of the albedo.
     """
     s = torch.where(seen, shading, 1)[..., None]
     taken, per_scale = seen[..., None].to(radiance), 1 / scale[:, None, None]
-    said = torch.where(seen[..., None], radiance / s, torch.nan)
-    albedo = said.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
+    single = torch.where(seen[..., None], radiance / s, torch.nan)
+    albedo = single.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
     for _ in range(iterations):
         residual = (radiance - albedo * s) * per_scale
         lit = taken * s / (1 + residual.square())

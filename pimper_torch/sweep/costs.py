@@ -36,8 +36,8 @@ def compiled_costs(
         sources: Photographs.
         ladder: Heights that are tried, in samples.
         scale: Of the robust cost, in units of radiance.
-        num_views: At most so many judge a sample.
-        min_views: At least so many judge one that is swept.
+        num_views: Largest number of views that a sample is compared in.
+        min_views: Least number of them for a sample that is swept.
         min_facing: Cosine of the angle from which on footprints shrink no more.
     """
     patch_from_world = templates.patch_from_world.double()

@@ -1,4 +1,4 @@
-"""Which views judge a sample."""
+"""Which views a sample is compared in."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,7 +11,7 @@ def best_views(
     """Choose, for every sample, the usable views of the best scores, ``count`` of them at most.
 
     Returns:
-        The views, and which of them are meant: a sample with fewer usable ones has fewer.
+        The views, and which entries are no padding: a sample with fewer usable ones has fewer.
 
     >>> score = torch.tensor([[0.5, 0.9, 0.7]])
     >>> best_views(score, torch.tensor([[True, True, False]]), 2)

@@ -31,7 +31,7 @@ def square():
     return subdivide(corners, facets, torch.full((32,), 0.1).double()), facets
 
 
-def differences(subdivision, deviation, correlated=1.0, judged=True):
+def differences(subdivision, deviation, correlated=1.0, evaluated=True):
     """Say how heights differ along all edges."""
     edges = face_edges(subdivision.faces)[0]
     length = (subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]]).norm(dim=1)
@@ -41,7 +41,7 @@ def differences(subdivision, deviation, correlated=1.0, judged=True):
         targets=torch.zeros(len(edges)).double(),
         information=1 / (correlated * (deviation * length) ** 2),
         correlated=torch.full_like(length, correlated),
-        judged=judged,
+        evaluated=evaluated,
     )
 
 
@@ -114,7 +114,7 @@ def test_what_a_region_errs_by_together_does_not_average_out(square):
 
 def test_a_tilt_of_a_region_turns_edges_by_where_they_point(square):
     subdivision, facets = square
-    kept = differences(subdivision, 0.1, judged=False)  # all of it is alike
+    kept = differences(subdivision, 0.1, evaluated=False)  # all of it is alike
     fused = solved(subdivision, kept, heights(subdivision, 0.01, vertices=torch.tensor([0])))
     found = expected_error(fused, fused, subdivision, facets, DRAWS)
     # Oracle: one tilt of five times 0.1 a region, along both axes of the plane.

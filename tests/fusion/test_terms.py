@@ -78,7 +78,7 @@ def test_kept_slopes_are_those_of_the_surface_there_is(subdivision, generator):
     found = kept_slopes(edges, subdivision.points, along, along, height, 0.01)
     assert_close(found.residual(height), torch.zeros(len(edges)).double())
     assert_close(found.residual(height + 3), torch.zeros(len(edges)).double(), rtol=0, atol=1e-12)
-    assert not found.judged
+    assert not found.evaluated
 
 
 def test_edges_across_a_contour_are_not_upright(subdivision):
@@ -112,7 +112,7 @@ def test_kept_steps_are_those_of_the_surface_there_is(subdivision, generator):
         0.01,
     )
     assert_close(found.information, flat.information)
-    assert not found.judged
+    assert not found.evaluated
 
 
 def test_offsets_along_slanting_normals_are_longer_along_the_direction():
