@@ -6,6 +6,7 @@ vertex's own patch and the neighbours whose enlarged triangle the ray passes giv
 of the surface along it.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -44,6 +45,10 @@ _RAGGED_SAMPLES = 1.5
 
 # An outlier twice as far away as allowed counts an eleventh: a choice.
 _DISTRUST = 10.0
+
+# Standard deviation of normals that patches do not know from the known ones beside them: a choice,
+# as unknown ones lie in shadows and at contours, where the surface bends.
+_UNKNOWN_NORMAL_DEG = 8.0
 
 # Less weight than this is a border that tapered out: a choice.
 _MIN_WEIGHT = 1e-3
@@ -112,7 +117,9 @@ def blend_patches(
     :math:`\sum w I x / \sum w I`, and the mean has the inverse variance
     :math:`\sum w I / \sum w`: patches see the same photographs, so that their errors are
     correlated and a second one adds nothing. It is never too large, whatever the correlation, as
-    :math:`(\sum w I^{1/2})^2 \le \sum w \sum w I`. A patch that does not know has ``I = 0``.
+    :math:`(\sum w I^{1/2})^2 \le \sum w \sum w I`. A patch that does not know has ``I = 0``. The
+    fraction ``1 - f`` of the weight that is without normals differs from the others by 8 degrees,
+    which adds :math:`(1 - f) / f` times their square to the variance of the mean normal.
 
     Differentiable in templates, depth, normals, albedo, information and swept heights; which
     patches and samples are blended is constant.
@@ -318,10 +325,18 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
         normals_world=normalize(normals, dim=-1) * photometric[:, None],
         albedo=albedo * per_seen[:, None],
         seen=photometric,
-        normal_information=certain * per_support * photometric,
+        normal_information=_beside_unknown(certain * per_support, seen * per_support) * photometric,
         offsets=offsets[:, 0],
         offset_information=swept * per_support,
     )
+
+
+def _beside_unknown(
+    information: Float[Tensor, " vertex"], known: Float[Tensor, " vertex"]
+) -> Float[Tensor, " vertex"]:
+    """Lower the information of mean normals where they are known for a fraction of the weight."""
+    unknown = (1 - known).clamp_min(0) / known.clamp_min(_MIN_WEIGHT)
+    return information / (1 + information * math.radians(_UNKNOWN_NORMAL_DEG) ** 2 * unknown)
 
 
 def _split(

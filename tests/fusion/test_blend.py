@@ -1,5 +1,7 @@
 """What blended patches say of the vertices that they share."""
 
+import math
+
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -82,11 +84,13 @@ def test_the_inverse_variance_of_a_seam_is_the_mean_of_both(blended):
     assert_close(found.offset_information[seam], wanted)
 
 
-def test_a_patch_that_knows_nothing_halves_the_inverse_variance_and_leaves_the_normal(blended):
+def test_a_patch_that_knows_nothing_leaves_the_normal_and_adds_to_its_variance(blended):
     found, seam = blended(known=False)
     first, _ = normals_of_the_facets(blended)
     assert_close(found.normals_world[seam], first.expand(int(seam.sum()), 3))
-    assert_close(found.normal_information[seam], torch.full((int(seam.sum()),), FIRST / 2).double())
+    # Half of the weight has normals: twice the variance, and 8 degrees of the other half.
+    variance = torch.full((int(seam.sum()),), 2 / FIRST + math.radians(8) ** 2).double()
+    assert_close(1 / found.normal_information[seam], variance)
     unknown = found.normal_information == 0
     assert unknown.any()
     assert not found.seen[unknown].any()
