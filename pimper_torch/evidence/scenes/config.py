@@ -24,6 +24,8 @@ class SceneConfig:
         fill: Fraction of the picture that the object takes, along the tighter side.
         fixed_point_light: The point light stands still beside the camera, as where the object
             turns; only with the turntable. Else it goes to another position for every photograph.
+        constant_light: All photographs have the light of the first, as where a lamp stays with the
+            object and the camera alone moves.
         fixed_room: A patterned floor and wall behind the object, which stand still before the
             camera; only with the turntable. Else there is nothing beyond the table.
         fixed_table: The table stands still before the camera, too, and the object alone turns;
@@ -66,6 +68,7 @@ class SceneConfig:
     sway_deg: float = 4.0
     fill: float = 0.94
     fixed_point_light: bool = False
+    constant_light: bool = False
     fixed_room: bool = False
     fixed_table: bool = False
     light: Literal["point", "directional"] = "point"
@@ -112,6 +115,12 @@ class SceneConfig:
                 fixed,
                 f"path turntable instead of {self.path}, for what stands still before the camera",
             )
+        require(
+            not (self.constant_light and self.fixed_point_light),
+            "constant_light",
+            self.constant_light,
+            "no fixed_point_light, under which the light goes round the object",
+        )
         require(
             self.point_light_distance >= 1,
             "point_light_distance",

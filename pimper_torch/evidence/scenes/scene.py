@@ -168,7 +168,9 @@ def _lights(
         flash=config.flash,
         far=config.light == "directional",
     )
-    return fixed_light(lights, rotated_about(aim, azimuths)) if config.fixed_point_light else lights
+    if config.fixed_point_light:
+        return fixed_light(lights, rotated_about(aim, azimuths))
+    return lights.take([0] * len(azimuths)) if config.constant_light else lights
 
 
 def _environments(

@@ -48,12 +48,14 @@ def test_a_room_and_a_point_light_stand_still_on_demand_and_only_where_the_objec
     assert all(settings[name] for name in ("fixed_point_light", "fixed_room", "fixed_table"))
 
 
-def test_an_object_of_one_albedo_stands_on_a_patterned_table_on_demand(ball, tmp_path):
+def test_an_object_of_one_albedo_stands_on_a_patterned_table_in_constant_light_on_demand(ball, tmp_path):
     options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--rotation-deg", "30")
-    assert render(ball, tmp_path / "out", *options) == 0
+    assert render(ball, tmp_path / "out", "--constant-light", *options) == 0
     settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
     assert settings["albedo"] == [0.6, 0.5, 0.4]
     assert settings["table"] == "patterned"
+    lights = json.loads((tmp_path / "out" / "truth" / "lights.json").read_text())
+    assert len({tuple(position) for position in lights["positions_world"]}) == 1
     assert settings["rotation_deg"] == 30
     capture = read_rendered(tmp_path / "out")
     seen = capture.truth.albedo[capture.truth.foreground]

@@ -92,6 +92,16 @@ def test_a_fixed_point_light_stands_still_before_the_camera(egg):
     assert before.std(dim=0).min() > 0.1
 
 
+def test_a_constant_light_is_at_rest_with_the_object(egg):
+    lights = build_scene(egg, settings(constant_light=True)).lights
+    moving = build_scene(egg, settings()).lights
+    assert_close(lights.positions_world, moving.positions_world[:1].expand(5, 3))
+    assert_close(lights.irradiance, moving.irradiance[:1].expand(5))
+    assert_close(lights.target_world, moving.target_world)
+    with pytest.raises(ConfigError, match="constant_light is True.*no fixed_point_light"):
+        settings(constant_light=True, fixed_point_light=True)
+
+
 @pytest.mark.parametrize("name", ["fixed_point_light", "fixed_room", "fixed_table"])
 @pytest.mark.parametrize("path", ["arc", "handheld"])
 def test_only_a_turntable_has_things_that_stand_still(name, path):
