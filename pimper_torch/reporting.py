@@ -229,7 +229,7 @@ def _(depths: DepthPatches) -> dict[str, int | float]:
 def _(surface: Surface) -> dict[str, int | float]:
     return {
         "subdivision_points": len(surface.vertices_world),
-        "supported_fraction": _mean((surface.confidence > 0).float()),
+        "supported_fraction": _mean(surface.supported.float()),
         "relative_residual": _mean(surface.convergence.residual),
     }
 

@@ -145,7 +145,7 @@ def remesh(
             settings.
         config: Settings.
         residual: Of the photometry, one a facet, in any unit; NaN for none.
-        seen: True for facets that have data even without confidence of the surface.
+        seen: True for facets that have data even where the surface has no support.
         inside: False for facets outside the object, which are dropped even with data.
 
     Returns:
@@ -156,7 +156,7 @@ def remesh(
     Raises:
         InputError: The surface is not this mesh's subdivided mesh.
 
-    A surface without confidence anywhere drops no facet. Vertices and normals are differentiable in
+    A surface without support anywhere drops no facet. Vertices and normals are differentiable in
     the surface's and the old mesh's; which facets are split, dropped or moved is constant.
     """
     config = config or RemeshConfig()
@@ -245,14 +245,14 @@ def _with_data(
 ) -> Bool[Tensor, " face"]:
     """Mark facets with data, and small holes that those enclose."""
     everything = torch.ones_like(faces[:, 0], dtype=torch.bool)
-    confident = surface.confidence > 0
+    supported = surface.supported
     inner = (surface.barycentric >= _ON_EDGE).all(dim=1)
-    if not bool(confident.any()):
+    if not bool(supported.any()):
         return everything
     inside = torch.bincount(surface.facet[inner], minlength=len(faces))
-    known = torch.bincount(surface.facet[inner & confident], minlength=len(faces)) > 0
+    known = torch.bincount(surface.facet[inner & supported], minlength=len(faces)) > 0
     # A facet too small to have vertices inside has data when all its corners have.
-    at_corner = (surface.barycentric > 1 - _ON_EDGE).any(dim=1) & confident
+    at_corner = (surface.barycentric > 1 - _ON_EDGE).any(dim=1) & supported
     slot = surface.barycentric[at_corner].argmax(dim=1, keepdim=True)
     at_vertex = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
     at_vertex[faces[surface.facet[at_corner]].gather(1, slot)[:, 0]] = True

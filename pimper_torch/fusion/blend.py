@@ -63,7 +63,8 @@ class Blend(Record):
         supported: True where a patch has a valid height field.
         normals_world: Photometric, unit; zero where no patch has one.
         albedo: Linear; zero where no patch has one.
-        seen: True where normal and albedo are photometric.
+        seen: True where the normal is photometric.
+        observed: True where a patch has albedo.
         normal_information: Inverse variance of the normals, one over squared radians; 0 where not
             supported or not determined by the photographs.
         offsets: How far outside the height fields the sweep has the surface, along their normals;
@@ -76,6 +77,7 @@ class Blend(Record):
     normals_world: Float[Tensor, "vertex 3"]
     albedo: Float[Tensor, "vertex channel"]
     seen: Bool[Tensor, " vertex"]
+    observed: Bool[Tensor, " vertex"]
     normal_information: Float[Tensor, " vertex"]
     offsets: Float[Tensor, " vertex"]
     offset_information: Float[Tensor, " vertex"]
@@ -147,8 +149,8 @@ def blend_patches(
 class _Estimates(Record):
     """Heights, normals, albedo and offsets of single patches at single vertices.
 
-    ``albedo`` counts where ``known``. ``normal`` and ``offset`` begin with the information, which
-    what follows is multiplied by.
+    ``normal`` counts where ``known``, and begins with the information that the rest is multiplied
+    by, as ``offset`` does. ``albedo`` begins with the fraction that it is known of.
     """
 
     vertex: Int[Tensor, " estimate"]
@@ -156,7 +158,7 @@ class _Estimates(Record):
     weight: Float[Tensor, " estimate"]
     scale: Float[Tensor, " estimate"]
     known: Float[Tensor, " estimate"]
-    albedo: Float[Tensor, "estimate channel"]
+    albedo: Float[Tensor, "estimate layer"]
     normal: Float[Tensor, "estimate 4"]
     offset: Float[Tensor, "estimate 2"]
 
@@ -188,13 +190,15 @@ def _estimates(
     found = present & hit & (weight > 0)
     xy = points[..., :2]
     raster = templates.origin, templates.spacing
-    valid = photometry.valid
+    valid, observed = photometry.valid, photometry.observed
     known = sample_raster(valid[:, None].to(height_field.depth), xy, *raster)[:, 0]
     normals_world = photometry.normals_patch @ templates.patch_from_world[:, None, :3, :3]
     certain = photometry.information[..., None]
-    layers = torch.cat([certain, certain * normals_world, photometry.albedo], dim=-1)
-    values = sample_raster(layers.movedim(-1, 1), xy, *raster, valid=valid)
-    offset = values.new_zeros(values.shape[0], 2, values.shape[2])
+    layers = torch.cat([certain, certain * normals_world], dim=-1)
+    normal = sample_raster(layers.movedim(-1, 1), xy, *raster, valid=valid)
+    layers = torch.cat([observed[..., None].to(layers), photometry.albedo], dim=-1)
+    albedo = sample_raster(layers.movedim(-1, 1), xy, *raster)
+    offset = normal.new_zeros(normal.shape[0], 2, normal.shape[2])
     if swept is not None:
         layers = torch.stack([swept.information, swept.information * swept.offset], dim=1)
         offset = sample_raster(layers, xy, *raster)
@@ -204,8 +208,8 @@ def _estimates(
         weight=weight[found],
         scale=templates.spacing[:, None].expand_as(weight)[found],
         known=known[found],
-        normal=values[:, :4].movedim(1, -1)[found],
-        albedo=values[:, 4:].movedim(1, -1)[found],
+        normal=normal.movedim(1, -1)[found],
+        albedo=albedo.movedim(1, -1)[found],
         offset=offset.movedim(1, -1)[found],
     )
 
@@ -317,14 +321,16 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     certain, normals = _split(_sum_at(vertex, seen_weight[:, None] * estimates.normal, count))
     swept, offsets = _split(_sum_at(vertex, weight[:, None] * estimates.offset, count))
     photometric = (seen > _MIN_WEIGHT) & (certain > 0)
-    albedo = _sum_at(vertex, seen_weight[:, None] * estimates.albedo, count)
-    per_seen = torch.where(photometric, 1 / seen.clamp_min(_MIN_WEIGHT), 0)
+    colours = _sum_at(vertex, weight[:, None] * estimates.albedo, count)
+    observed = colours[:, 0] > _MIN_WEIGHT
+    albedo = colours[:, 1:] / torch.where(observed, colours[:, 0], 1)[:, None]
     return Blend(
         heights=_sum_at(vertex, weight * height, count) * per_support,
         supported=supported,
         normals_world=normalize(normals, dim=-1) * photometric[:, None],
-        albedo=albedo * per_seen[:, None],
+        albedo=albedo * observed[:, None],
         seen=photometric,
+        observed=observed,
         normal_information=_beside_unknown(certain * per_support, seen * per_support) * photometric,
         offsets=offsets[:, 0],
         offset_information=swept * per_support,

@@ -156,8 +156,9 @@ class Fuse(Stage):
             facet=subdivision.facet,
             barycentric=subdivision.barycentric,
             normals_world=normals,
-            albedo=about_mean(blend.albedo, blend.seen, fine.edges),
+            albedo=about_mean(blend.albedo, blend.observed, fine.edges),
             information=blend.normal_information,
+            height_information=blend.offset_information,
             expected_error=error,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=moved.device),

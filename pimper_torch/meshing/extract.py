@@ -69,14 +69,14 @@ class Extract(Stage):
     def forward(self, surface: Surface) -> Mesh:
         """Extract the mesh.
 
-        A surface without confidence anywhere, as under one light for all views, is kept
-        whole.
+        A surface without support anywhere, as of photographs without texture under one light, is
+        kept whole.
 
         Raises:
             ReconstructionError: Nothing is left.
         """
         vertices = surface.vertices_world.detach()
-        supported = surface.confidence > 0
+        supported = surface.supported
         if not bool(supported.any()):  # nowhere better than elsewhere
             supported = ~supported
         max_hole = self.config.max_hole * diagonal(vertices)

@@ -75,6 +75,7 @@ class Repair(Stage):
                 beside[:, None], vertex_normals(vertices, faces), surface.normals_world
             ),
             information=torch.where(moved, 0, surface.information),
+            height_information=torch.where(moved, 0, surface.height_information),
         )
 
 

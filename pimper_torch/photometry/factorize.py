@@ -7,7 +7,7 @@ from functools import partial
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.config import require
@@ -63,6 +63,9 @@ LOSSES: dict[str, Callable[[float], Loss]] = {
 # Iterations at most, and tolerance, where gradients are asked for: from there Newton's method took
 # all of 60 patches of a sphere to rounding; from the default tolerance, 37 of them.
 AT_REST = 300, 1e-9
+
+# Weight of coarse normals where light determines none, in units of one view: fixed, to rounding.
+FIXED_NORMALS = 1e3
 
 # A surface is right to so many samples, where it casts shadows.
 SHADOW_SAMPLES = 2.0
@@ -260,7 +263,9 @@ class Factorize(Stage):
             config.min_light_variation,
         )
         raster = bucket.normals.shape[1] * bucket.normals.shape[2]
-        problem = self._problem(rows, anchor, raster)
+        refused = status != int(PatchStatus.DETERMINED)
+        anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
+        problem = self._problem(rows, anchor, refused, raster)
         return _Posed(rows=rows, status=status, problem=problem)
 
     def _conclude(self, bucket: _Bucket, posed: _Posed, factors: Factors) -> Photometry:
@@ -275,7 +280,8 @@ class Factorize(Stage):
         status = torch.where(failed, int(PatchStatus.FAILED), posed.status)
         determined = status == int(PatchStatus.DETERMINED)
         valid = lit & determined[:, None] & sure & (found.normals[..., 2] < 0)
-        lights = torch.where(determined[:, None, None], factors.lights, problem.anchor)
+        fitted = factors.lights.isfinite().flatten(1).all(dim=1) & rows.seen.flatten(1).any(dim=1)
+        lights = torch.where(fitted[:, None, None], factors.lights, problem.anchor)
         lights = lights * rows.seen.any(dim=2)[..., None]
         chosen = torch.where(valid[..., None], found.normals, rows.normals)
         weight = torch.where(determined[:, None, None], factors.weight, problem.weight)
@@ -293,7 +299,13 @@ class Factorize(Stage):
             convergence=factors.convergence,
         )
 
-    def _problem(self, rows: Rows, anchor: Float[Tensor, "patch view 4"], raster: int) -> Bilinear:
+    def _problem(
+        self,
+        rows: Rows,
+        anchor: Float[Tensor, "patch view 4"],
+        refused: Bool[Tensor, " patch"],
+        raster: int,
+    ) -> Bilinear:
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
@@ -308,8 +320,8 @@ class Factorize(Stage):
         views = rows.seen.any(dim=2).sum(dim=1).clamp_min(1)
         level = (anchor**2).sum(dim=(1, 2)) / views
         prior = None
-        if config.geometry_weight > 0:
-            gamma = config.geometry_weight * level
+        gamma = level * torch.where(refused, FIXED_NORMALS, config.geometry_weight)
+        if bool((gamma > 0).any()):
             prior = gamma[:, None, None] * cone.bend(rows.normals.mT)
         return Bilinear(
             radiance=gray,
@@ -371,9 +383,24 @@ def _lit(bucket: _Bucket, light: Illumination) -> Observations:
     return registered.replace(valid=registered.valid & reached)
 
 
+def _exposed(rows: Rows, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:
+    """Scale each view's light to its radiance, coarse normals given and albedo the same in all."""
+    gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
+    predicted = lights @ start_from_mesh(gray, rows.seen, lights, basis) * rows.seen
+    square = predicted.square().sum(dim=2)
+    gain = (predicted * gray).sum(dim=2) / torch.where(square > 0, square, 1)
+    return lights * torch.where((square > 0) & (gain > 0), gain, 1)[..., None]
+
+
 def in_gauge(solved: PhotometricPatches) -> PhotometricPatches:
-    """Set the 99th percentile of gray albedo to 1."""
-    gray = torch.cat([bucket.albedo.mean(dim=-1)[bucket.valid] for bucket in solved.buckets])
+    """Set the 99th percentile of gray albedo to 1, where light determines normals if anywhere."""
+    determined = any(bool(bucket.valid.any()) for bucket in solved.buckets)
+    gray = torch.cat(
+        [
+            bucket.albedo.mean(dim=-1)[bucket.valid if determined else bucket.observed]
+            for bucket in solved.buckets
+        ]
+    )
     if len(gray) == 0:
         return solved
     bright = gray.kthvalue(max(1, math.ceil(0.99 * len(gray)))).values

@@ -257,7 +257,7 @@ class Photometry(Record):
 
     Attributes:
         normals_patch: Unit, facing the viewer (``n_z < 0``).
-        albedo: Linear, up to one scale shared by all patches.
+        albedo: Linear, up to one scale shared by all patches; 0 where no view shows it lit.
         lights_patch: First-order harmonics ``l`` with radiance = albedo * l . (1, n), n in the
             patch frame, constants folded in. A view without samples has zeros.
         valid: True where the sample was determined by the photographs.
@@ -294,6 +294,11 @@ class Photometry(Record):
         information = self.information
         if found := once(information, lambda: outside(information, torch.inf)):
             yield "information", found, "an inverse variance, 0 where unknown"
+
+    @property
+    def observed(self) -> Bool[Tensor, "patch height width"]:
+        """Where views show the sample lit, so that it has albedo, with or without a normal."""
+        return (self.albedo > 0).any(dim=-1)
 
     @property
     def confidence(self) -> Float[Tensor, "patch height width"]:
@@ -465,7 +470,9 @@ class Surface(Record):
         normals_world: Unit, outward; photometric where valid, else of the mesh.
         albedo: Linear, up to one scale; continued from round about where no light tells it.
         information: Inverse variance of the photometric normals, one over squared radians; 0
-            where no view determined the vertex.
+            where light does not determine them.
+        height_information: Inverse variance of the swept heights, one over squared scene units;
+            0 where not swept.
         convergence: Of the refinement, one entry.
         expected_error: Standard error of each vertex across the surface, scene units, given the
             cameras; ``None`` where unknown.
@@ -478,6 +485,7 @@ class Surface(Record):
     normals_world: Float[Tensor, "vertex 3"]
     albedo: Float[Tensor, "vertex channel"]
     information: Float[Tensor, " vertex"]
+    height_information: Float[Tensor, " vertex"]
     convergence: Convergence
     expected_error: Float[Tensor, " vertex"] | None = None
 
@@ -487,6 +495,11 @@ class Surface(Record):
         normals = self.normals_world
         if found := once(normals, lambda: not_unit(normals, None)):
             yield "normals_world", found, "unit, outward"
+
+    @property
+    def supported(self) -> Bool[Tensor, " vertex"]:
+        """Where photographs determine the normal or the height."""
+        return (self.information > 0) | (self.height_information > 0)
 
     @property
     def confidence(self) -> Float[Tensor, " vertex"]:

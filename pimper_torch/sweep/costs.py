@@ -60,7 +60,7 @@ def compiled_costs(
         as_array(photometry.normals_patch, torch.float32),
         as_array(photometry.lights_patch[..., :4], torch.float32),
         as_array(registered.valid),
-        as_array(photometry.valid & templates.inside),
+        as_array(photometry.observed & templates.inside),
         as_array(scale, torch.float32),
         as_array(ladder, torch.float64),
         num_views,

@@ -109,7 +109,8 @@ class Sweep(Stage):
     r"""Find how far along the template's normal every sample has to move for views to agree.
 
     For each of a few heights all views are looked up again, and the light that was fitted, the
-    photometric normal and the best albedo predict them; robust residuals are averaged over a
+    photometric normal, or the coarse one where light determines none, and the best albedo predict
+    them; robust residuals are averaged over a
     small window, which stops at cliffs and at the template's border, and the least cost is
     found to a fraction of a step. This is multi-view stereo under changing light. The inverse
     variance of a height follows from the costs of all heights: it is small with little texture,
@@ -253,7 +254,7 @@ class Sweep(Stage):
     ) -> _Swept:
         """List the samples that enough views have, with these."""
         config, views = self.config, cameras.num_views
-        asked = photometry.valid & templates.inside
+        asked = photometry.observed & templates.inside
         asked = asked & (registered.valid.sum(dim=1) >= config.min_views)
         (index,) = torch.nonzero(asked.flatten(), as_tuple=True)
         patch = index // asked[0].numel()

@@ -39,6 +39,7 @@ def on_facets(vertices, faces, count, generator, normal):
         normals_world=normal(points),
         albedo=torch.ones_like(points),
         information=100 * torch.rand(count, generator=generator, dtype=torch.float64),
+        height_information=torch.zeros(count, dtype=torch.float64),
         convergence=Convergence(
             iterations=torch.ones(1).long(), residual=torch.zeros(1), cause=torch.zeros(1).long()
         ),

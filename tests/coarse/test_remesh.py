@@ -57,6 +57,7 @@ def surface_on(coarse, place, spacing=SPACING, normals=None, information=None):
         normals_world=found,
         albedo=torch.ones_like(points),
         information=certain if information is None else information(subdivision),
+        height_information=torch.zeros_like(certain),
         convergence=Convergence(
             iterations=torch.ones(1).long(), residual=torch.zeros(1), cause=torch.zeros(1).long()
         ),

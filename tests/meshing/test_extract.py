@@ -30,6 +30,7 @@ def sheet(side=SIDE, information=None):
         normals_world=torch.nn.functional.normalize(normals, dim=-1),
         albedo=vertices / side,
         information=torch.ones_like(x) if information is None else information,
+        height_information=torch.zeros_like(x),
         convergence=Convergence(
             iterations=torch.ones(1, dtype=torch.long),
             residual=torch.zeros(1, dtype=torch.float64),
@@ -54,6 +55,16 @@ def test_a_surface_with_support_everywhere_comes_out_as_it_is():
     assert_close(mesh.normals_world, surface.normals_world)
     assert_close(mesh.albedo, surface.albedo)
     assert_close(mesh.confidence, surface.confidence)
+
+
+def test_swept_heights_support_a_surface_without_photometric_normals():
+    surface = sheet()
+    left = columns(surface) <= 5
+    heights = torch.where(left, 0, 1.0).double()
+    surface = surface.replace(information=heights * 0, height_information=heights)
+    mesh = Extract(ExtractConfig(max_hole=0))(surface)
+    assert columns(mesh).min() == 6
+    assert (mesh.confidence == 0).all()
 
 
 def test_small_holes_stay_filled_and_large_ones_open():

@@ -41,6 +41,7 @@ def surface_of(vertices, faces, facet=None):
         normals_world=vertex_normals(vertices, faces),
         albedo=vertices.abs(),
         information=torch.full_like(vertices[:, 0], 1e30),
+        height_information=torch.zeros_like(vertices[:, 0]),
         convergence=Convergence(
             iterations=torch.ones(1, dtype=torch.long),
             residual=torch.zeros(1, dtype=torch.float64),

@@ -115,6 +115,26 @@ def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
         assert (bucket.albedo[templates.inside] > 0).float().mean() > 0.9
 
 
+def test_without_normals_a_patch_still_has_its_own_lights_and_albedo(scene):
+    light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
+    true = scene(bumps=0.0, lights=light.expand(12, 4))
+    first = true.seen.buckets[0]
+    radiance = first.radiance.clone()
+    radiance[2, 3] *= 0.6  # a shadow over one patch in one view, which the field does not know
+    seen = true.seen.replace(buckets=(first.replace(radiance=radiance), *true.seen.buckets[1:]))
+    with pytest.warns(PimperWarning, match="light varies too little"):
+        found = Factorize()(seen)
+    for bucket, templates, one in zip(
+        found.buckets, seen.patches.buckets, seen.buckets, strict=True
+    ):
+        basis = harmonics(coarse_normals(seen.patches.coarse, templates))
+        shading = torch.einsum("pfi,phwi->pfhw", bucket.lights_patch, basis)
+        predicted = shading * bucket.albedo.mean(dim=-1)[:, None]
+        assert_close(predicted[one.valid], one.gray[one.valid], rtol=0.03, atol=0)
+        assert (bucket.convergence.residual < 0.01).all()
+        assert (bucket.observed == one.valid.any(dim=1)).all()
+
+
 def spoil(seen: PatchViews, how: str) -> PatchViews:
     first = seen.buckets[0]
     radiance, valid = first.radiance.clone(), first.valid.clone()

@@ -62,6 +62,26 @@ def test_views_of_another_light_than_fitted_spoil_the_height_less_than_a_step(li
     assert (offsets + lifted.height).abs().median() < 0.3
 
 
+def test_samples_without_photometric_normals_are_swept_alike(lift):
+    lifted = lift(1.2)
+    dark = lifted.photometric.replace(
+        buckets=tuple(
+            found.replace(valid=~found.valid & False, information=0 * found.information)
+            for found in lifted.photometric.buckets
+        )
+    )
+    scene = lifted.scene
+    swept = Sweep()(scene.views, scene.cameras, lifted.seen, dark)
+    for mine, lit in zip(swept.buckets, sweep(lifted).buckets, strict=True):
+        assert_close(mine.offset, lit.offset, rtol=0, atol=0)
+        assert_close(mine.information, lit.information, rtol=0, atol=0)
+    black = dark.replace(
+        buckets=tuple(found.replace(albedo=0 * found.albedo) for found in dark.buckets)
+    )
+    unseen = Sweep()(scene.views, scene.cameras, lifted.seen, black)
+    assert all((bucket.information == 0).all() for bucket in unseen.buckets)
+
+
 def test_fewer_views_suffice_and_too_few_are_none(lift):
     lifted = lift(-1.0)
     offsets, _ = told(sweep(lifted, SweepConfig(num_views=5)))

@@ -92,8 +92,9 @@ class Refine(Stage):
             facet=subdivision.facet,
             barycentric=subdivision.barycentric,
             normals_world=_normals(blend, vertices, subdivision),
-            albedo=about_mean(blend.albedo, blend.seen, face_edges(subdivision.faces)[0]),
+            albedo=about_mean(blend.albedo, blend.observed, face_edges(subdivision.faces)[0]),
             information=blend.normal_information,
+            height_information=blend.offset_information,
             convergence=Convergence(
                 iterations=torch.ones(1, dtype=torch.long, device=points.device),
                 residual=apart.square().sum(dim=-1).mean().sqrt()[None].to(points),

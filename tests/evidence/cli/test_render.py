@@ -48,7 +48,7 @@ def test_a_room_and_a_point_light_stand_still_on_demand_and_only_where_the_objec
     assert all(settings[name] for name in ("fixed_point_light", "fixed_room", "fixed_table"))
 
 
-def test_an_object_of_one_albedo_stands_on_a_patterned_table_in_constant_light_on_demand(ball, tmp_path):
+def test_one_albedo_a_patterned_table_and_a_constant_light_on_demand(ball, tmp_path):
     options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--rotation-deg", "30")
     assert render(ball, tmp_path / "out", "--constant-light", *options) == 0
     settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]

@@ -98,7 +98,7 @@ def test_a_constant_light_is_at_rest_with_the_object(egg):
     assert_close(lights.positions_world, moving.positions_world[:1].expand(5, 3))
     assert_close(lights.irradiance, moving.irradiance[:1].expand(5))
     assert_close(lights.target_world, moving.target_world)
-    with pytest.raises(ConfigError, match="constant_light is True.*no fixed_point_light"):
+    with pytest.raises(ConfigError, match=r"constant_light is True.*no fixed_point_light"):
         settings(constant_light=True, fixed_point_light=True)
 
 
