@@ -149,10 +149,9 @@ def fine_surface(
     counts = view_counts(vertices, faces, level, maps)
     centres = vertices[faces].mean(dim=1)
     support = supports(centres, cloud, contour, counts, REACH_PX * pixel)
-    if contours.confine:
-        inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
-    else:
-        inside = near_points(faces, centres, cloud, support, counts, pixel)
+    inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
+    if not contours.confine:
+        inside &= near_points(faces, centres, cloud, support, counts, pixel)
     kept = seen_surface(vertices, faces, support, counts, inside, pixel, config)
     if not bool(kept.any()):
         raise ReconstructionError(

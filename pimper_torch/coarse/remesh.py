@@ -101,10 +101,9 @@ class Remesh(Stage):
             residual[templates.facet] = known.detach().to(residual)
             misfit[templates.facet] = misfit_of(found).to(misfit)
             seen[templates.facet] = heights.num_views >= (1 if contours.confine else _MIN_VIEWS)
-        inside = None
+        inside = within(contours.hull, surface, patches.num_patches)
         if contours.confine:
             seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
-            inside = within(contours.hull, surface, patches.num_patches)
             if patches.coarse.support is not None:
                 occlusion = ambient_occlusion(mesh.vertices_world, mesh.faces).to(misfit)
                 centers = mesh.vertices_world[mesh.faces].mean(dim=1).detach()

@@ -20,17 +20,32 @@ class Silhouettes(Record):
         reliable: True for views whose silhouette agrees with the hull of the others.
         source: ``masks`` that a person gave, ``found`` in the photographs, or ``everything``: no
             view constrains the object.
+        plane_world: The object is where this has a positive product with ``(x, y, z, 1)``: above
+            the plane that it stands on. ``None`` where silhouettes tell, or no plane is known.
     """
 
     inside: Float[Tensor, "view height width"]
     reliable: Bool[Tensor, " view"]
     source: Literal["masks", "found", "everything"]
+    plane_world: Float[Tensor, "4"] | None = None
 
     @classmethod
-    def everything(cls, views: Views) -> "Silhouettes":
-        """Give silhouettes that leave nothing out."""
+    def everything(
+        cls, views: Views, plane_world: Float[Tensor, "4"] | None = None
+    ) -> "Silhouettes":
+        """Give silhouettes that leave nothing out.
+
+        Args:
+            views: The photographs.
+            plane_world: What lies below it is not the object.
+        """
         reliable = torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device)
-        return cls(inside=views.inside.float(), reliable=reliable, source="everything")
+        return cls(
+            inside=views.inside.float(),
+            reliable=reliable,
+            source="everything",
+            plane_world=None if plane_world is None else plane_world.to(views.images),
+        )
 
     @property
     def masks(self) -> Bool[Tensor, "view height width"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.projection import triangulate_rays
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
-from pimper_torch.silhouettes.hull import Everywhere, Hull, visual_hull
+from pimper_torch.silhouettes.hull import Everywhere, HalfSpace, Hull, visual_hull
 from pimper_torch.silhouettes.rays import RayConfig, contour_rays
 from pimper_torch.silhouettes.tangency import contour_points
 from pimper_torch.stage import Stage
@@ -38,7 +38,7 @@ class Contours(Record):
 
     @classmethod
     def none(cls, silhouettes: Silhouettes, cameras: Cameras) -> "Contours":
-        """Give contours that constrain nothing: no rays, and a hull that holds everything."""
+        """Give contours without rays; the hull holds everything, or what is above a plane."""
         like = cameras.cam_from_world
         rays = ContourRays(
             view=torch.zeros(0, dtype=torch.long, device=like.device),
@@ -47,7 +47,15 @@ class Contours(Record):
             normals_world=like.new_zeros(0, 3),
             sigma_px=like.new_zeros(0),
         )
-        return cls(silhouettes=silhouettes, rays=rays, cameras=cameras, hull=Everywhere.of(cameras))
+        hull, plane = Everywhere.of(cameras), silhouettes.plane_world
+        if plane is not None:
+            hull = HalfSpace(
+                origin_world=hull.origin_world,
+                spacing=hull.spacing,
+                distance=hull.distance,
+                plane_world=plane.to(like),
+            )
+        return cls(silhouettes=silhouettes, rays=rays, cameras=cameras, hull=hull)
 
     @property
     def confine(self) -> bool:

@@ -3,11 +3,13 @@
 import warnings
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
-from pimper_torch.silhouettes.cues import cues_of
+from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import cut_in_iterations
 from pimper_torch.silhouettes.probabilities import silhouettes_of
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
@@ -34,17 +36,16 @@ class FindSilhouettes(Stage):
             scene: Photographs, cameras and cloud.
 
         Returns:
-            Everything where that is asked for, and, with a
-            :class:`~pimper_torch.errors.PimperWarning` that says why, where silhouettes cannot be
-            reliable.
+            Everything where that is asked for. Where silhouettes cannot be reliable, everything
+            above the plane that the object stands on, or everything where none is found, with a
+            :class:`~pimper_torch.errors.PimperWarning` that says why.
 
         Raises:
             InputError: Masks are asked for, and none are given.
         """
         config, masks = self.config, scene.views.masks
-        everything = Silhouettes.everything(scene.views)
         if config.object == "everything":
-            return everything
+            return Silhouettes.everything(scene.views)
         if masks is not None:
             reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
             return Silhouettes(inside=masks.float(), reliable=reliable, source="masks")
@@ -57,14 +58,21 @@ class FindSilhouettes(Stage):
         cuts = None
         if cues.plane is not None or cues.has_points:
             cuts = cut_in_iterations(cues, self.details)
-        if cuts is None:
-            _warn("the views' silhouettes have nothing in common")
-            return everything
-        doubt = self._doubt(agreement_of(cuts))
-        if doubt:
-            _warn(doubt)
-            return everything
+        doubt = "the views' silhouettes have nothing in common"
+        if cuts is not None:
+            doubt = self._doubt(agreement_of(cuts))
+        if cuts is None or doubt:
+            _warn(doubt, cues.plane is not None)
+            return Silhouettes.everything(scene.views, self._top(cues))
         return silhouettes_of(cuts, scene.views, self.details.min_covered)
+
+    def _top(self, cues: Cues) -> Float[Tensor, "4"] | None:
+        """Give the upper side of the supporting plane, as thick as its points are rough."""
+        if cues.plane is None:
+            return None
+        thickness = self.details.plane_tolerance * cues.fixation.distance
+        height = cues.plane.offset + thickness
+        return torch.cat([cues.plane.normal_world, -height.reshape(1)])
 
     def _doubt(self, agreement: Agreement) -> str:
         """Say why silhouettes are unreliable, or nothing."""
@@ -94,9 +102,10 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     return scene.replace(views=scene.views.replace(masks=silhouettes.inside > _USED))
 
 
-def _warn(why: str) -> None:
+def _warn(why: str, on_plane: bool) -> None:
+    what = "above the plane that it stands on" if on_plane else "that the photographs show"
     warnings.warn(
-        f"Everything that the photographs show is taken for the object: {why}. Give masks, or a "
+        f"Everything {what} is taken for the object: {why}. Give masks, or a "
         "box round the object (`silhouettes.region`); `silhouettes.object` everything says that "
         "this is meant.",
         PimperWarning,

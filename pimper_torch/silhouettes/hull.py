@@ -119,6 +119,27 @@ class Everywhere(Hull):
         return torch.full_like(points_world[..., 0], torch.inf)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class HalfSpace(Everywhere):
+    """What is above a plane, where silhouettes tell nothing.
+
+    Points of the plane are as deep inside as all others, and shape the surface with them; surface
+    on the plane is not held.
+
+    Attributes:
+        plane_world: Has a positive product with what it holds, ``(x, y, z, 1)``.
+    """
+
+    plane_world: Float[Tensor, "4"]
+
+    def holds(
+        self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
+    ) -> Bool[Tensor, "*batch"]:
+        """Mark points above the plane; the tolerance is of silhouettes."""
+        plane = self.plane_world.to(points_world)
+        return points_world @ plane[:3] + plane[3] > 0
+
+
 def visual_hull(
     silhouettes: Silhouettes,
     cameras: Cameras,

@@ -90,6 +90,21 @@ def test_masks_keep_the_rest_out():
     assert mesh.vertices_world[:, 1].max() > 0.6
 
 
+def test_what_lies_below_the_supporting_plane_gets_no_facets(whole, round_about):
+    plane = torch.tensor([0.0, 0.6, 0.8, -0.2])
+    silhouettes = Silhouettes.everything(round_about.views, plane)
+    contours = Contours.none(silhouettes, round_about.cameras)
+    mesh = CoarseSurface(*SETTINGS)(round_about, contours).mesh
+    side = 0.15  # of a facet
+    height = mesh.vertices_world.double() @ plane[:3].double() + plane[3]
+    assert -side < height.min() < side
+    everywhere = whole.mesh.vertices_world.double()
+    above = everywhere @ plane[:3].double() + plane[3] > side
+    assert (
+        NearestSurface(mesh).query(everywhere[above].to(mesh.vertices_world)).distance < 0.05
+    ).all()
+
+
 def test_a_given_mesh_is_turned_to_the_cameras_and_simplified(round_about):
     vertices, faces = icosphere(3)
     inside_out = Mesh(vertices_world=vertices, faces=faces.flip(1))

@@ -50,6 +50,16 @@ def test_silhouettes_that_leave_nothing_out_constrain_nothing(cameras):
     assert len(contours.touching(far, far).points_world) == 0
 
 
+def test_above_a_plane_is_held_and_its_points_are_used(cameras):
+    plane = torch.tensor([0.0, 0.0, 1.0, -0.25]).double()
+    silhouettes = silhouettes_of(ball, cameras).replace(source="everything", plane_world=plane)
+    contours = TraceContours()(silhouettes, cameras)
+    assert not contours.confine
+    points = torch.tensor([[5.0, -3, 0.3], [5.0, -3, 0.2], [0.0, 0, 1e6]]).double()
+    assert contours.hull.holds(points, 1.0).tolist() == [True, False, True]
+    assert (contours.hull.depth_of(points) > 0).all()
+
+
 def test_silhouettes_without_a_common_place_are_told_of(cameras):
     silhouettes = silhouettes_of(ball, cameras)
     nothing = silhouettes.replace(inside=torch.zeros_like(silhouettes.inside))

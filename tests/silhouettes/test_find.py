@@ -93,8 +93,14 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
     nonsense = Cuts(masks=masks, margins_px=projections, on_plane=True)
     monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: nonsense)
     overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
-    with pytest.warns(PimperWarning, match=f"by {overlap_percent:.0f}% in the median"):
-        assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
+    with pytest.warns(PimperWarning, match=f"above the plane.*by {overlap_percent:.0f}%"):
+        silhouettes = FindSilhouettes(*SMALL)(staged.scene)
+    assert silhouettes.source == "everything"
+    # The ball stands on z = 0; what is a few hundredths thick is the table.
+    table = torch.tensor([[0.5, 0.5, 0.0, 1.0], [0.5, -0.5, 0.05, 1.0], [0.0, 0.0, -1.0, 1.0]])
+    assert ((table @ silhouettes.plane_world) > 0).tolist() == [False, True, False]
+    meant = FindSilhouettes(SilhouetteConfig(object="everything"))(staged.scene)
+    assert meant.plane_world is None
 
 
 def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
