@@ -10,6 +10,11 @@ from torch import Tensor
 from pimper_torch.errors import caution
 from pimper_torch.records import PatchStatus, Photometry
 
+_DOUBT = (
+    " If the light did move between the photographs, cameras or silhouettes are wrong: look at "
+    "`overview.png`, and give masks or put a plain cloth behind the object."
+)
+
 
 def judge_data(
     shown: Bool[Tensor, " patch"],
@@ -82,8 +87,9 @@ def warn_of_undetermined(
     parts = [text.format(statuses[code]) for code, text in causes.items() if statuses[code]]
     caution(
         f"Factorization: {undetermined} of {total} patches keep the normals of the coarse mesh: "
-        f"{'; '.join(parts)}. Their geometry is delivered without photometric detail. "
+        f"{'; '.join(parts)}. There heights come from texture alone. "
         "Photograph these sides under more positions of the light, or lower "
-        "`factorize.min_views` or `factorize.min_light_variation`.",
+        "`factorize.min_views` or `factorize.min_light_variation`."
+        f"{_DOUBT if 2 * statuses[PatchStatus.CONSTANT_LIGHT] > total else ''}",
         stacklevel=4,
     )
