@@ -1,4 +1,4 @@
-"""Gauss-Newton steps of samples on the photometric cone: twin of ``photometry.bilinear.follow``.
+"""Gauss-Newton steps of samples on the cone: twin of ``photometry.bilinear.update_shading``.
 
 A sample has 14 values: its normal equations ``A``, ten packed entries, and ``b``. They are copied
 to tiles of constant stride: only then can the compiler exclude aliasing, and vectorize.
@@ -22,13 +22,13 @@ Ten = tuple[float, float, float, float, float, float, float, float, float, float
 TILE = 32
 
 # As in ``photometry.bilinear`` and ``photometry.quadratics``.
-LONGEST_STEP = 0.3
-_ROUNDINGS = 8 * float(np.finfo(np.float32).eps)
+MAX_STEP = 0.3
+_ZERO_ROUNDINGS = 8 * float(np.finfo(np.float32).eps)
 _TINY = float(np.finfo(np.float64).tiny) ** 0.5
 
 
 @compiled(fast=True)
-def follow(equations: Floats, shading: Floats, steps: int) -> None:
+def update_shading(equations: Floats, shading: Floats, steps: int) -> None:
     """Take Gauss-Newton steps of every sample on the cone, in place.
 
     Args:
@@ -66,11 +66,11 @@ def _step(tile: Doubles) -> None:
         a, b, s = at(tile, k)
         image = apply(a, s)
         value = objective(s, image, b)
-        moved = step_along(
+        moved = tangent_step(
             a, (b[0] - image[0], b[1] - image[1], b[2] - image[2], b[3] - image[3]), s
         )
         after = objective(moved, apply(a, moved), b)
-        better = after <= value + _ROUNDINGS * abs(value)
+        better = after <= value + _ZERO_ROUNDINGS * abs(value)
         tile[14 * TILE + k] = moved[0] if better else s[0]
         tile[15 * TILE + k] = moved[1] if better else s[1]
         tile[16 * TILE + k] = moved[2] if better else s[2]
@@ -120,7 +120,7 @@ def objective(s: Four, image: Four, b: Four) -> float:
 
 
 @compiled(fast=True, inline=True)
-def step_along(a: Ten, slope: Four, s: Four) -> Four:
+def tangent_step(a: Ten, slope: Four, s: Four) -> Four:
     """Take the step ``(B^T A B)^-1 B^T slope`` along the cone, of bounded length."""
     n, first, second = frame(s)
     m = raised(congruence(a, n, first, second))
@@ -137,7 +137,7 @@ def step_along(a: Ten, slope: Four, s: Four) -> Four:
     y1 = inverse[2] * w1 + inverse[4] * w2
     y2 = inverse[5] * w2
     length = math.sqrt(y0 * y0 + y1 * y1 + y2 * y2)
-    limit = LONGEST_STEP * s[0]
+    limit = MAX_STEP * s[0]
     shrink = limit / max(length, 1e-30)
     shrink = shrink if length > limit else 1.0
     y0, y1, y2 = shrink * y0, shrink * y1, shrink * y2

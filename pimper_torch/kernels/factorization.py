@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pimper_torch.kernels.cholesky import solve_damped
-from pimper_torch.kernels.cone import TILE, follow, whitening
+from pimper_torch.kernels.cone import TILE, update_shading, whitening
 from pimper_torch.kernels.spread import robust_variance
 from pimper_torch.kernels.switch import compiled
 
@@ -23,11 +23,11 @@ Integers = NDArray[np.int64]
 
 # As in ``variable_projection`` and ``bilinear``: damping, steps of the samples, the residual that
 # counts as zero in roundings, minimum spread; and the codes of StopCause.
-_FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 5.0
-_FOLLOWING = 2
-_ROUNDINGS = 30.0
+_INITIAL_DAMPING, _DAMPING_DECREASE, _DAMPING_INCREASE = 1e-2, 0.2, 5.0
+_SHADING_STEPS = 2
+_ZERO_ROUNDINGS = 30.0
 _EPS = float(np.finfo(np.float32).eps)
-_SMALLEST_SPREAD = 1e-4
+_MIN_DEVIATION = 1e-4
 _CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
 
 # Row and column of each entry of a packed matrix.
@@ -158,7 +158,7 @@ def _packed(
         slack=max(slack, 0.0),
         num_views=len(regularization),
         num_spread=num_spread,
-        level=_SMALLEST_SPREAD * size / max(count, 1.0),
+        level=_MIN_DEVIATION * size / max(count, 1.0),
         scale=scale,
     )
 
@@ -177,13 +177,13 @@ def _solve(
     slope, step = np.zeros((len(lights), 4)), np.zeros(size)
     new_slope, new_lights, new_shading = np.zeros_like(slope), lights.copy(), shading.copy()
     curvature, factor = np.zeros((size, size)), np.empty((size, size))
-    spread = _reweigh(patch, lights, shading, 0.0)
+    spread = _robust_weights(patch, lights, shading, 0.0)
     energy = _energy(patch)
     _equations(patch, lights)
-    follow(patch.equations, shading, _FOLLOWING)
+    update_shading(patch.equations, shading, _SHADING_STEPS)
     cost = _evaluate(patch, lights, shading, slope)
     _curvature(patch, lights, shading, curvature_samples, curvature)
-    damping, small = _FIRST_DAMPING, 0
+    damping, small = _INITIAL_DAMPING, 0
     for taken in range(1, max_iterations + 1):
         for f in range(len(lights)):
             for i in range(4):
@@ -197,20 +197,20 @@ def _solve(
             new_shading[:] = shading
             _keep_scale(patch, lights, new_lights, new_shading)
             _equations(patch, new_lights)
-            follow(patch.equations, new_shading, _FOLLOWING)
+            update_shading(patch.equations, new_shading, _SHADING_STEPS)
             after = _evaluate(patch, new_lights, new_shading, new_slope)
         better = after < cost
-        exact = cost <= (_ROUNDINGS * _EPS) ** 2 * energy
+        exact = cost <= (_ZERO_ROUNDINGS * _EPS) ** 2 * energy
         if better:
             small = small + 1 if (cost - after) / max(cost, 1e-38) < tolerance else 0
-        damping *= _LESS if better else _MORE
+        damping *= _DAMPING_DECREASE if better else _DAMPING_INCREASE
         stalled = damping > 1 / _EPS and not exact
         damping = max(damping, _EPS)
         if better:
             lights[:], shading[:], slope[:] = new_lights, new_shading, new_slope
             cost = after
             if patch.scale > 0:
-                spread = _reweigh(patch, lights, shading, spread)
+                spread = _robust_weights(patch, lights, shading, spread)
                 cost = _evaluate(patch, lights, shading, slope)
         if exact or small >= small_steps:
             return taken, _CONVERGED
@@ -223,7 +223,7 @@ def _solve(
 
 
 @compiled(fast=True)
-def _reweigh(patch: Patch, lights: Floats, shading: Floats, start_scale: float) -> float:
+def _robust_weights(patch: Patch, lights: Floats, shading: Floats, start_scale: float) -> float:
     """Update the robust weights; return the scale that the next call starts from."""
     if patch.scale == 0:
         return 0.0
@@ -313,11 +313,11 @@ def _evaluate(patch: Patch, lights: Floats, shading: Floats, slope: Doubles) -> 
             difference = float(light[i]) - float(patch.anchor[f, i])
             total += patch.regularization[f] * difference * difference
             slope[f, i] -= patch.regularization[f] * difference
-    return total + _bent(patch.prior, s, x, y, z)
+    return total + _quadratic_penalty(patch.prior, s, x, y, z)
 
 
 @compiled(fast=True)
-def _bent(p: Floats, s: Floats, x: Floats, y: Floats, z: Floats) -> float:
+def _quadratic_penalty(p: Floats, s: Floats, x: Floats, y: Floats, z: Floats) -> float:
     a, b, c, d, e, f, g, h, i, j = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9]
     total = np.float32(0)
     two = np.float32(2)

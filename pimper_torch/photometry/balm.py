@@ -1,15 +1,15 @@
 r"""Augmented Lagrangian factorization: BALM.
 
-``N`` is split in two: ``S`` free, where the data is, and ``N`` on the manifold. Multipliers and
-a growing penalty :math:`\mu` drive them together,
+``N`` is split in two: ``S``, free, fits the data, and ``N`` is on the manifold. Multipliers ``U``
+and a growing penalty :math:`\mu` make them equal,
 
 .. math::
 
     \lVert \sqrt W (J - L S) \rVert^2 + \mu \lVert S - N + U \rVert^2,
 
-and each step has a closed form: a small system a sample for ``S``, the projection on the
-manifold for ``N``, a small system a view for ``L``. Missing entries need no filling, as their
-weights are 0; robust weights take part the same way.
+and each step has a closed form: a small linear system per sample for ``S``, the projection onto
+the manifold for ``N``, a small linear system per view for ``L``. Missing entries have weight 0;
+robust weights multiply the others.
 
 Source: Del Bue, Xavier, Agapito & Paladini, Bilinear modelling via augmented Lagrange
 multipliers, PAMI 34(8), 2012.
@@ -22,24 +22,24 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.photometry.bilinear import (
-    REWEIGH_EVERY,
+    REWEIGHT_EVERY,
     Bilinear,
     Factors,
     equations_of_samples,
     equations_of_views,
-    finish,
     keep_scale,
-    reweigh,
+    robust_weights,
+    to_factors,
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
 from pimper_torch.photometry.quadratics import diagonal, solve_packed
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record, StopCause
 
-# The penalty starts at this fraction of what the data knows about a sample, per unknown; it
-# grows by the factor below each step up to the cap. A stiff penalty ties lights and shading
-# to each other, and both crawl: of 0.01 to 0.3, this start needed the fewest steps to a
-# residual of 1e-8 with 60 % of the entries missing.
+# The penalty starts at this fraction of the mean eigenvalue of a sample's data term, and grows by
+# the factor below in each step up to the cap. A stiff penalty couples lights and shading, and
+# convergence is slow: of 0.01 to 0.3, this start needed the fewest steps to a residual of 1e-8
+# with 60 % of the entries missing.
 PENALTY_START = 0.03
 PENALTY_GROWTH = 1.01
 PENALTY_CAP = 1.0
@@ -57,22 +57,21 @@ def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Fact
     """Factorize a batch of patches by augmented Lagrangian.
 
     Args:
-        problem: With its start.
+        problem: With its initial values.
         max_iterations: Steps at most.
-        tolerance: A patch is done, and leaves the batch, when in one step neither its
-            shading vectors nor their distance from the manifold changed or remained by more
-            than this fraction of their length.
+        tolerance: A patch has converged when both the last change of its shading vectors and
+            their distance from the manifold are below this fraction of their length.
 
     Returns:
-        Factors with ``N`` exactly on the manifold. Without ``pull`` the scale between albedo
-        and light is kept where it started. A patch without data keeps its start.
+        Factors with ``N`` exactly on the manifold. Lights without ``regularization`` keep their
+        initial scale. A patch without data keeps its initial values.
 
-    Constant to autograd. Patches do not influence one another.
+    Constant to autograd. Patches are independent.
     """
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
         state, change = _step(work, state, step)
-        done = (change <= tolerance) & (step >= REWEIGH_EVERY)
+        done = (change <= tolerance) & (step >= REWEIGHT_EVERY)
         return state, torch.where(done, int(StopCause.CONVERGED), RUNNING)
 
     with torch.no_grad():
@@ -80,19 +79,19 @@ def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Fact
             lights=problem.lights,
             shading=problem.shading,
             multiplier=torch.zeros_like(problem.shading),
-            weight=reweigh(problem, problem.lights, problem.shading),
+            weight=robust_weights(problem, problem.lights, problem.shading),
         )
         state, taken, cause = iterate(problem, start, advance, max_iterations)
-        return finish(problem, state.lights, state.shading, state.weight, taken, cause)
+        return to_factors(problem, state.lights, state.shading, state.weight, taken, cause)
 
 
 def _step(problem: Bilinear, state: _State, step: int) -> tuple[_State, Float[Tensor, " patch"]]:
     weight = state.weight
-    if step and step % REWEIGH_EVERY == 0 and not isinstance(problem.loss, Squares):
-        weight = reweigh(problem, state.lights, state.shading)
+    if step and step % REWEIGHT_EVERY == 0 and not isinstance(problem.loss, Squares):
+        weight = robust_weights(problem, state.lights, state.shading)
     A, b = equations_of_samples(problem, state.lights, weight)
     rank = state.lights.shape[2]
-    # What the data alone knows of a sample: the trace of L^T W L.
+    # The trace of L^T W L, the data term of a sample.
     trace = (weight * state.lights.square().sum(dim=2, keepdim=True)).sum(dim=1)
     seen = trace > 0
     fraction = min(PENALTY_START * PENALTY_GROWTH**step, PENALTY_CAP)

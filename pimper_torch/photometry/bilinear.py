@@ -1,4 +1,4 @@
-r"""The problem all solvers solve: lights and shading vectors whose product is the data.
+r"""The bilinear problem that every solver takes: lights and shading vectors from radiance.
 
 .. math::
 
@@ -8,10 +8,10 @@ r"""The problem all solvers solve: lights and shading vectors whose product is t
     \quad \text{with } n_k \in \mathcal M
 
 for every patch of a batch, with ``M`` the photometric manifold of some order of lighting and
-:math:`\phi` a loss. Without ``c`` and ``P``, with squares and the cone this is the published
-problem; with any vectors, low-rank factorization with missing data.
+:math:`\phi` a loss. With ``c = 0``, ``P = 0``, squares and the cone this is the published
+problem; with a linear manifold it is low-rank factorization with missing data.
 
-A solver is a function of such a problem, a limit of iterations and a tolerance.
+A solver is a function of such a problem, a maximum number of iterations and a tolerance.
 """
 
 from collections.abc import Callable
@@ -32,25 +32,25 @@ from pimper_torch.photometry.quadratics import (
     dot,
     outer,
 )
-from pimper_torch.photometry.robust import Loss, Squares, spread
+from pimper_torch.photometry.robust import Loss, Squares, robust_deviation
 from pimper_torch.records import Convergence, Record, StopCause
 
-# The spread of residuals is never taken to be less than this fraction of a patch's brightness:
-# on exact data all residuals are rounding, and none is an outlier.
-SMALLEST_SPREAD = 1e-4
+# Lower bound of the residuals' standard deviation, as a fraction of a patch's brightness: on
+# exact data all residuals are rounding, and none is an outlier. A choice.
+MIN_DEVIATION = 1e-4
 
-# Robust weights follow the residuals every so many steps: they change slowly, and their
-# medians cost as much as a step.
-REWEIGH_EVERY = 3
+# Steps between updates of the robust weights: they change slowly, and the scale of the residuals
+# costs as much as a step.
+REWEIGHT_EVERY = 3
 
-# Longest step along a curved manifold, as a fraction of albedo (about radians of the normal),
-# within which its quadratic model holds: a choice.
-LONGEST_STEP = 0.3
+# Longest step along a curved manifold, as a fraction of albedo (about radians of the normal): a
+# choice, for the quadratic model holds nearby only.
+MAX_STEP = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Bilinear(Record):
-    """A batch of factorization problems. Samples stand in a row, padded.
+    """A batch of factorization problems, the samples of each patch flattened and padded.
 
     Attributes:
         radiance: ``J``, zero where missing.
@@ -61,7 +61,7 @@ class Bilinear(Record):
         regularization: ``c_f`` per view.
         prior: ``P``, packed: what else is known of the shading vectors, such as normals they
             should not bend away from (:meth:`Cone.bend
-            <pimper_torch.photometry.manifolds.Cone.bend>`); ``None`` for nothing.
+            <pimper_torch.photometry.manifolds.Cone.normal_prior>`); ``None`` for none.
         manifold: What shading vectors can be.
         loss: What residuals cost, their deviation estimated patch by patch.
         stride: The deviation is taken over every so many samples.
@@ -80,7 +80,7 @@ class Bilinear(Record):
 
     @property
     def requires_grad(self) -> bool:
-        """Whether the solution is to carry gradients."""
+        """Whether gradients of the solution are required."""
         data = (self.radiance, self.anchor, self.regularization, self.prior)
         return any(part is not None and part.requires_grad for part in data)
 
@@ -92,7 +92,7 @@ class Factors(Record):
     Attributes:
         lights: ``L``.
         shading: ``N``, columns on the manifold.
-        weight: What each entry counted in the end: ``D`` times the robust weights.
+        weight: ``D`` times the final robust weights.
         convergence: Of each patch.
     """
 
@@ -105,16 +105,16 @@ class Factors(Record):
 Solver = Callable[[Bilinear, int, float], Factors]
 
 
-def reweigh(
+def robust_weights(
     problem: Bilinear,
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch view sample"]:
-    """Give ``D`` times the weights of the loss at the present residuals."""
+    """Give ``D`` times the loss's weights at the current residuals."""
     if isinstance(problem.loss, Squares):
         return problem.weight
     residual = problem.radiance - lights @ shading
-    deviation = deviation_of(problem, residual)
+    deviation = residual_deviation(problem, residual)
     return problem.weight * problem.loss.weights(residual, deviation[:, None, None])
 
 
@@ -135,7 +135,7 @@ def equations_of_views(
     shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
 ) -> tuple[Float[Tensor, "patch packed view"], Float[Tensor, "patch rank view"]]:
-    """Assemble the normal equations for every view's light, pull included."""
+    """Assemble the normal equations for every view's light, its prior included."""
     packed = (weight @ outer(shading).mT).mT.clone()
     packed[:, diagonal(shading.shape[1])] += problem.regularization[:, None, :]
     rhs = (weight * problem.radiance) @ shading.mT + problem.regularization[
@@ -163,7 +163,7 @@ def objective(
     shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
 ) -> Float[Tensor, " patch"]:
-    """Evaluate what is minimised, with the robust loss frozen in ``weight``."""
+    """Evaluate the objective, with the robust weights fixed to ``weight``."""
     return evaluate(problem, lights, shading, weight)[0]
 
 
@@ -175,37 +175,37 @@ def evaluate(
 ) -> tuple[Float[Tensor, " patch"], Float[Tensor, "patch view rank"]]:
     """Give the :func:`objective`, and minus half its gradient by the lights."""
     residual = problem.radiance - lights @ shading
-    heavy = weight * residual
-    cost = torch.linalg.vecdot(heavy.flatten(1), residual.flatten(1))
+    weighted = weight * residual
+    cost = torch.linalg.vecdot(weighted.flatten(1), residual.flatten(1))
     difference = lights - problem.anchor
     cost = cost + (problem.regularization * difference.square().sum(dim=2)).sum(dim=1)
     if problem.prior is not None:
-        bent = shading * apply_packed(problem.prior, shading)
-        cost = cost + bent.sum(dim=(1, 2))
-    return cost, heavy @ shading.mT - problem.regularization[..., None] * difference
+        penalty = shading * apply_packed(problem.prior, shading)
+        cost = cost + penalty.sum(dim=(1, 2))
+    return cost, weighted @ shading.mT - problem.regularization[..., None] * difference
 
 
-def follow(
+def update_shading(
     problem: Bilinear,
     packed: Float[Tensor, "patch packed sample"],
     rhs: Float[Tensor, "patch rank sample"],
     shading: Float[Tensor, "patch rank sample"],
     steps: int = 1,
 ) -> Float[Tensor, "patch rank sample"]:
-    r"""Bring every sample to the minimum of :math:`s^\top A s - 2 b^\top s` on the manifold.
+    r"""Minimize :math:`s^\top A s - 2 b^\top s` over every sample's shading vector on the manifold.
 
-    By Gauss-Newton steps along the manifold, at most as long as their model holds; a sample that
-    a step does not help stays. Exact at once where any vector will do.
+    By Gauss-Newton steps along the tangents, of bounded length; a step that does not lower the
+    objective is rejected. On a linear manifold the first step is exact.
     """
     if problem.manifold.flat:
         return PackedCholesky(packed, shading.shape[1]).solve(rhs)
     image = apply_packed(packed, shading)
     value = dot(shading, image - 2 * rhs)
     for step in range(steps):
-        moved = step_along(problem.manifold, packed, rhs - image, shading)
+        moved = tangent_step(problem.manifold, packed, rhs - image, shading)
         reached = apply_packed(packed, moved)
         after = dot(moved, reached - 2 * rhs)
-        # The last steps are too small for the value to show.
+        # The last steps lower the objective by less than its rounding.
         better = (after <= value + 8 * torch.finfo(value.dtype).eps * value.abs())[:, None]
         shading = torch.where(better, moved, shading)
         if step + 1 < steps:
@@ -214,7 +214,7 @@ def follow(
     return shading
 
 
-def step_along(
+def tangent_step(
     manifold: Manifold,
     packed: Float[Tensor, "patch packed sample"],
     slope: Float[Tensor, "patch rank sample"],
@@ -223,7 +223,7 @@ def step_along(
     r"""Take the step :math:`(B^\top A B)^{-1} B^\top r`, ``B`` the manifold's tangents.
 
     Args:
-        manifold: Along which to go.
+        manifold: Whose tangents are ``B``.
         packed: ``A``.
         slope: ``r = b - A s``.
         shading: ``s``.
@@ -232,7 +232,7 @@ def step_along(
     descent = coordinates(columns, slope)
     step = PackedCholesky(curvature_along(columns, packed), len(columns)).solve(descent)
     length = dot(step, step).detach().sqrt()[:, None]
-    limit = LONGEST_STEP * manifold.split(shading.mT)[0].detach()[:, None]
+    limit = MAX_STEP * manifold.split(shading.mT)[0].detach()[:, None]
     step = step * torch.where(length > limit, limit / length.clamp_min(1e-30), 1)
     return manifold.retract((shading + combination(columns, step)).mT).mT
 
@@ -240,7 +240,7 @@ def step_along(
 def curvature_along(
     columns: list[Tensor], packed: Float[Tensor, "patch packed sample"]
 ) -> Float[Tensor, "patch smaller sample"]:
-    """Give ``B^T A B``, packed, raised a little so that it can be inverted."""
+    """Give ``B^T A B``, packed, its diagonal raised by 1e-9 of its trace to be invertible."""
     curvature = congruence(packed, columns)
     slot = diagonal(len(columns))
     curvature[:, slot] += 1e-9 * curvature[:, slot].sum(dim=1, keepdim=True)
@@ -254,13 +254,15 @@ def keep_scale(
     shading: Float[Tensor, "patch rank sample"],
 ) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch rank sample"]]:
     """Normalize lights without regularization to their former size; rescale shading inversely."""
-    was, size = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
-    loose = (problem.regularization.amax(dim=1) == 0) & (size > 0) & (was > 0)
-    factor = torch.where(loose, (was / torch.where(size > 0, size, 1)).sqrt(), 1)[:, None, None]
+    old, size = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
+    unanchored = (problem.regularization.amax(dim=1) == 0) & (size > 0) & (old > 0)
+    factor = torch.where(unanchored, (old / torch.where(size > 0, size, 1)).sqrt(), 1)[
+        :, None, None
+    ]
     return lights * factor, shading / factor
 
 
-def finish(
+def to_factors(
     problem: Bilinear,
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
@@ -268,13 +270,13 @@ def finish(
     iterations: Int[Tensor, " patch"],
     cause: Int[Tensor, " patch"],
 ) -> Factors:
-    """Put the solution in its record."""
-    some = problem.weight.sum(dim=(1, 2)) > 0
+    """Give a solver's result, with its residuals; patches without data are marked empty."""
+    has_data = problem.weight.sum(dim=(1, 2)) > 0
     empty = torch.full_like(cause, int(StopCause.EMPTY))
     convergence = Convergence(
         iterations=iterations,
         residual=root_mean_square(problem, lights, shading),
-        cause=torch.where(some, cause, empty),
+        cause=torch.where(has_data, cause, empty),
     )
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
 
@@ -284,19 +286,19 @@ def root_mean_square(
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, " patch"]:
-    """Give the root mean square residual over what was observed; 0 where nothing was."""
+    """Give each patch's weighted root mean square residual; 0 without data."""
     residual = problem.radiance - lights @ shading
     count = problem.weight.sum(dim=(1, 2))
     mean = (problem.weight * residual**2).sum(dim=(1, 2)) / torch.where(count > 0, count, 1)
     return torch.where(mean > 0, torch.where(mean > 0, mean, 1).sqrt(), 0)
 
 
-def deviation_of(
+def residual_deviation(
     problem: Bilinear, residual: Float[Tensor, "patch view sample"]
 ) -> Float[Tensor, " patch"]:
     """Estimate the standard deviation of each patch's residuals, robustly."""
-    some = residual[:, :, :: problem.stride].flatten(1)
+    subset = residual[:, :, :: problem.stride].flatten(1)
     seen = problem.weight[:, :, :: problem.stride].flatten(1) > 0
     count = problem.weight.sum(dim=(1, 2)).clamp_min(1)
     level = problem.radiance.abs().sum(dim=(1, 2)) / count
-    return spread(some, seen).maximum(SMALLEST_SPREAD * level)
+    return robust_deviation(subset, seen).maximum(MIN_DEVIATION * level)

@@ -74,20 +74,20 @@ def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
 
     Returns:
         Three arrays of columns: :math:`(1, n)`, which changes albedo, and
-        :math:`(0, t_1), (0, t_2)`, which turn the normal by :math:`1/\rho` a unit.
+        :math:`(0, t_1), (0, t_2)`, which rotate the normal by :math:`1/\rho` radians per unit.
     """
     _, normal = split_shading(shading.mT)
     first, second = tangents(normal)
-    still = torch.zeros_like(first[..., 0])
+    zero = torch.zeros_like(first[..., 0])
     return [
-        torch.stack([still + 1, *normal.unbind(dim=-1)], dim=-2),
-        torch.stack([still, *first.unbind(dim=-1)], dim=-2),
-        torch.stack([still, *second.unbind(dim=-1)], dim=-2),
+        torch.stack([zero + 1, *normal.unbind(dim=-1)], dim=-2),
+        torch.stack([zero, *first.unbind(dim=-1)], dim=-2),
+        torch.stack([zero, *second.unbind(dim=-1)], dim=-2),
     ]
 
 
 def _length(vector: list[Tensor]) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
-    """Give lengths, of vectors without direction any, and which vectors have one."""
+    """Give lengths, 1 for zero vectors, and which vectors are not zero."""
     x, y, z = vector
     square = x * x + y * y + z * z
     directed = square > 0
@@ -96,5 +96,5 @@ def _length(vector: list[Tensor]) -> tuple[Float[Tensor, "*batch"], Bool[Tensor,
 
 
 def _vectors(parts: list[Tensor]) -> Float[Tensor, "..."]:
-    """Put components together, each in one piece of memory, as products with lights want."""
+    """Stack components on the last axis, each contiguous, for products with lights."""
     return torch.stack(parts, dim=-2).mT if parts[0].ndim else torch.stack(parts)

@@ -1,4 +1,4 @@
-"""The stage that factorizes patches into albedo, normals and light."""
+"""Factorization of patches into albedo, normals and light."""
 
 import math
 from collections.abc import Callable
@@ -17,16 +17,16 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
-from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold, start_from_mesh
+from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.photometry.implicit import differentiable
 from pimper_torch.photometry.light_field import LightField, faces_light
 from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, on_raster, rows_of
+from pimper_torch.photometry.sample_estimates import fit_albedo, initial_shading, refine_on_manifold
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
-from pimper_torch.photometry.status import judge_data, warn_of_undetermined
+from pimper_torch.photometry.status import patch_status, warn_of_undetermined
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import (
     Observations,
@@ -39,13 +39,15 @@ from pimper_torch.records import (
 )
 from pimper_torch.stage import Stage
 
-# Samples added to those of each view in the weight of the prior on its light: a choice.
+# Samples added to those of each view in the weight of its light's prior: a choice.
 BORROWED_SAMPLES = 16.0
 
-# Minimum weight of the prior, as a fraction of a view's data: regularizes views with few samples.
+# Minimum weight of the prior, as a fraction of a view's data: a choice, regularizes views with few
+# samples.
 MIN_REGULARIZATION = 1e-6
 
-# The Gauss-Newton matrix of a patch's lights is summed over about this many samples.
+# The Gauss-Newton matrix of a patch's lights is summed over about this many samples: a choice, ten
+# for each of 24 lights' coefficients.
 CURVATURE_SAMPLES = 256
 
 SOLVERS: dict[str, Solver] = {
@@ -60,20 +62,20 @@ LOSSES: dict[str, Callable[[float], Loss]] = {
     "cauchy": Cauchy,
 }
 
-# Iterations at most, and tolerance, where gradients are asked for: from there Newton's method took
-# all of 60 patches of a sphere to rounding; from the default tolerance, 37 of them.
-AT_REST = 300, 1e-9
+# Iterations at most, and tolerance, where gradients are required: from there Newton's method
+# converged to rounding in all of 60 patches of a sphere; from the default tolerance, in 37.
+TO_CONVERGENCE = 300, 1e-9
 
 # Weight of coarse normals where light determines none, in units of one view: fixed, to rounding.
 FIXED_NORMALS = 1e3
 
-# A surface is right to so many samples, where it casts shadows.
+# Assumed error of the surface that casts shadows, in samples: a choice.
 SHADOW_SAMPLES = 2.0
 
-# Entries of J that are factorized together: their working set fits the cache.
+# Entries of J that are factorized together: a choice, their working set fits the cache.
 PART_ENTRIES = 400_000
 
-# The spread of a patch's residuals is read off about this many samples.
+# The deviation of a patch's residuals is estimated from about this many samples: a choice.
 SPREAD_SAMPLES = 512
 
 
@@ -81,30 +83,30 @@ SPREAD_SAMPLES = 512
 class FactorizeConfig:
     """Settings of :class:`Factorize`.
 
-    The published method is ``light="soft"``, ``solver="balm"``, ``loss="squares"``, and all that
-    holds lights and normals 0.
+    The published method is ``light="soft"``, ``solver="balm"``, ``loss="squares"``, and no priors:
+    ``light_prior=0`` and ``geometry_weight=0``.
 
     Attributes:
-        light: What is fitted to the coarse mesh: ``"soft"``, one first-order light a view all
-            over the scene; ``"point light"``, an ambient term and a point light at some place, with
-            attached shadows; ``"auto"``, the one of them that explains the photographs better.
+        light: Model fitted to the coarse mesh: ``"soft"``, first-order harmonics per view,
+            constant over the scene; ``"point_light"``, ambient light and a near point light with
+            attached shadows; ``"auto"``, the one with the smaller residuals.
         solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
             eliminated; ``"balm"``, augmented Lagrangian.
-        light_prior: How strongly each patch's lights hold to those fitted to the mesh, in units
-            of the patch's own data; 0 leaves them free, 1e6 fixes them.
-        geometry_weight: How strongly normals hold to the coarse ones, in units of one view.
-        loss: How highlights and shadows lose weight: ``"cauchy"``, or ``"squares"``, not at
-            all.
-        shadows: Whether samples that the point light cannot reach past the surface are missing.
-            Needs a surface that is nearly right.
-        loss_scale: Of the loss, in standard deviations of the patch's residuals; Cauchy's
-            weight there is a half.
+        light_prior: Weight of the prior of each patch's lights, whose mean is the light field, in
+            units of the patch's own data; 0 leaves them free, 1e6 fixes them.
+        geometry_weight: Weight of the prior of normals, whose mean is the coarse ones, in units
+            of one view.
+        loss: ``"cauchy"``, by which highlights and shadows lose weight, or ``"squares"``.
+        shadows: Whether samples in cast shadow are left out. Needs a surface that is nearly
+            right.
+        loss_scale: Of Cauchy's loss, in standard deviations of the patch's residuals; the weight
+            there is a half.
         min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
             and the lights take their share.
-        min_light_variation: Third singular value of the lights over the first that a patch
-            needs; about the angle, in radians, by which the light moved across its way.
+        min_light_variation: Minimum third singular value of a patch's lights, over the first;
+            about the smaller extent, in radians, of the light's directions.
         max_iterations: Of the solver.
-        tolerance: Relative change at which a patch is done: of its objective with variable
+        tolerance: Relative change at which a patch has converged: of its objective with variable
             projection, of its shading vectors with BALM.
     """
 
@@ -122,7 +124,7 @@ class FactorizeConfig:
 
     def __post_init__(self) -> None:
         models = ("auto", "soft", "point_light")
-        require(self.light in models, "factorize.light", self.light, "auto, soft or point light")
+        require(self.light in models, "factorize.light", self.light, "auto, soft or point_light")
         require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
         require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
         for name in ("light_prior", "geometry_weight"):
@@ -139,11 +141,11 @@ class FactorizeConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Illumination(Record):
-    """What falls on the scene, and what keeps it off.
+    """The light of all views, and the surface that casts shadows.
 
     Attributes:
         field: Light of all views.
-        caster: What casts shadows; ``None`` where none are looked for.
+        caster: Of rays on the surface; ``None`` if cast shadows are not predicted.
     """
 
     field: LightField
@@ -152,7 +154,7 @@ class Illumination(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Bucket(Record):
-    """Patches of like size, ready to be factorized."""
+    """Patches of similar size, their radiance and initial normals."""
 
     templates: Templates
     registered: Observations
@@ -160,8 +162,8 @@ class _Bucket(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Posed(Record):
-    """Their factorization, ready to be solved."""
+class _Prepared(Record):
+    """The factorization problem of a bucket."""
 
     rows: Rows
     status: Int[Tensor, " patch"]
@@ -172,28 +174,28 @@ class Factorize(Stage):
     r"""Separate albedo, normals and light: ``J = L N`` with ``N`` on the photometric cone.
 
     First the light field of every view is fitted to the smoothed normals of the coarse mesh:
-    soft light, or a point light at some place. Then every patch is factorized, its lights held to
-    what the field has there by ``light_prior``; samples that face away from the point light are
-    missing. The last step of each sample is exact, and albedo is fitted to every channel.
+    soft light, or a near point light. Then every patch is factorized, the field being the prior
+    mean of its lights; samples that face away from the point light are left out. Each sample
+    gets a last Gauss-Newton step, and albedo is fitted to every channel.
 
-    In parts, for patches that are never all there at once: :meth:`light` from thinned templates,
-    :meth:`solve` for some patches at a time, and :meth:`conclude` for all that were solved.
+    In parts, for patches that are not all in memory at once: :meth:`light` from thinned
+    templates, :meth:`solve` for some patches at a time, and :meth:`conclude` for all of them.
 
     Gauge: albedo and light share one free factor for the whole scene; it is set so that the
-    99th percentile of gray albedo is 1. With nothing that holds lights each patch has, besides,
-    its own Lorentz ambiguity, which stays at that of the start.
+    99th percentile of gray albedo is 1. With ``light_prior=0`` each patch has its own Lorentz
+    ambiguity besides, fixed by the initial values.
 
-    Where it fails softly: samples lit in fewer than ``min_views`` views, or found to face
-    away, carry the coarse normal, are not ``valid`` and have information 0. Patches that light
-    does not determine carry coarse normals throughout and a status why (see
+    Where it fails softly: samples lit in fewer than ``min_views`` views, or whose normal faces
+    away, keep the coarse normal, are not ``valid`` and have information 0. Patches that light
+    does not determine keep coarse normals, and their status names the cause (see
     :class:`~pimper_torch.records.PatchStatus`); a :class:`PimperWarning` counts them. A view
-    that sees nothing of a patch has the light zero there. NaN and infinity in the radiance
+    that does not see a patch has light zero there. NaN and infinity in the radiance
     count as missing.
 
-    Differentiable in the radiance and in templates and normals that it starts from: light field,
-    lights and samples by the implicit function at the optimum (see
-    :mod:`~pimper_torch.photometry.implicit`), which Newton's method takes them to where gradients
-    are asked for. Which samples count is constant.
+    Differentiable in the radiance and in the initial templates and normals: light field, lights
+    and samples by the implicit function theorem at the optimum (see
+    :mod:`~pimper_torch.photometry.factor_gradients`), to which Newton's method converges where
+    gradients are required. Which samples are valid is constant.
     """
 
     def __init__(self, config: FactorizeConfig | None = None) -> None:
@@ -224,7 +226,7 @@ class Factorize(Stage):
         return Illumination(field=field, caster=RayCaster(mesh.vertices_world, mesh.faces))
 
     def solve(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
-        """Factorize some patches, which need nothing of others.
+        """Factorize some patches, independently of others.
 
         Returns:
             Albedo and lights up to the factor of the scene, which :meth:`conclude` sets.
@@ -233,29 +235,29 @@ class Factorize(Stage):
         for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
             normals = transferred_normals(seen.patches.coarse, templates)
             bucket = _Bucket(templates=templates, registered=registered, normals=normals)
-            lit = bucket.replace(registered=_lit(bucket, light))
-            posed = self._pose(lit, light.field)
-            buckets.append(self._conclude(lit, posed, self._solve(posed.problem)))
+            enough_views = bucket.replace(registered=_without_shadows(bucket, light))
+            prepared = self._prepare(enough_views, light.field)
+            buckets.append(self._photometry(enough_views, prepared, self._solve(prepared.problem)))
         return PhotometricPatches(patches=seen.patches, buckets=tuple(buckets))
 
     def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
-        """Set the scale of albedo over all patches, and say which ones light does not tell."""
+        """Set the scale of albedo over all patches, and warn of those that are undetermined."""
         config = self.config
         warn_of_undetermined(solved.buckets, config.min_views, config.min_light_variation)
         return in_gauge(solved)
 
-    def _pose(self, bucket: _Bucket, field: LightField) -> _Posed:
+    def _prepare(self, bucket: _Bucket, field: LightField) -> _Prepared:
         config = self.config
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
         centre = invert_rigid(patch_from_world)[:, :3, 3]
         anchor = rotate_lights(patch_from_world, field.lights_at(centre))
         point_light = rotate(patch_from_world, field.point_light_at(centre))
         rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
-        shown = bucket.registered.valid & bucket.templates.inside[:, None]
+        observed = bucket.registered.valid & bucket.templates.inside[:, None]
         finite = rows.seen.flatten(1).any(dim=1)
         rows = rows.replace(seen=rows.seen & faces_light(point_light, rows.normals))
-        status = judge_data(
-            shown.flatten(1).any(dim=1),
+        status = patch_status(
+            observed.flatten(1).any(dim=1),
             finite,
             rows.seen,
             anchor,
@@ -266,35 +268,39 @@ class Factorize(Stage):
         refused = status != int(PatchStatus.DETERMINED)
         anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
         problem = self._problem(rows, anchor, refused, raster)
-        return _Posed(rows=rows, status=status, problem=problem)
+        return _Prepared(rows=rows, status=status, problem=problem)
 
-    def _conclude(self, bucket: _Bucket, posed: _Posed, factors: Factors) -> Photometry:
-        rows, normals, problem = posed.rows, bucket.normals, posed.problem
+    def _photometry(self, bucket: _Bucket, prepared: _Prepared, factors: Factors) -> Photometry:
+        rows, normals, problem = prepared.rows, bucket.normals, prepared.problem
         if torch.is_grad_enabled() and problem.requires_grad:
             factors = differentiable(problem, factors)
         found = refine_on_manifold(problem, factors)
-        sure = found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
-        lit = rows.seen.sum(dim=1) >= self.config.min_views
-        sound = factors.lights.isfinite().flatten(1).all(dim=1) & (sure & lit).any(dim=1)
-        failed = (posed.status == int(PatchStatus.DETERMINED)) & ~sound
-        status = torch.where(failed, int(PatchStatus.FAILED), posed.status)
+        finite_normals = (
+            found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
+        )
+        enough_views = rows.seen.sum(dim=1) >= self.config.min_views
+        is_solved = factors.lights.isfinite().flatten(1).all(dim=1) & (
+            finite_normals & enough_views
+        ).any(dim=1)
+        failed = (prepared.status == int(PatchStatus.DETERMINED)) & ~is_solved
+        status = torch.where(failed, int(PatchStatus.FAILED), prepared.status)
         determined = status == int(PatchStatus.DETERMINED)
-        valid = lit & determined[:, None] & sure & (found.normals[..., 2] < 0)
+        valid = enough_views & determined[:, None] & finite_normals & (found.normals[..., 2] < 0)
         fitted = factors.lights.isfinite().flatten(1).all(dim=1) & rows.seen.flatten(1).any(dim=1)
         lights = torch.where(fitted[:, None, None], factors.lights, problem.anchor)
         lights = lights * rows.seen.any(dim=2)[..., None]
         chosen = torch.where(valid[..., None], found.normals, rows.normals)
         weight = torch.where(determined[:, None, None], factors.weight, problem.weight)
         albedo = fit_albedo(rows.radiance, weight, lights, harmonics(chosen).mT)
-        nothing = torch.zeros_like(bucket.registered.valid[:, 0])
+        nowhere = torch.zeros_like(bucket.registered.valid[:, 0])
         blank = torch.zeros_like(normals[..., 0])
         black = blank[..., None].expand(-1, -1, -1, albedo.shape[1])
         return Photometry(
-            normals_patch=on_raster(chosen, rows.position, normals),
-            albedo=on_raster(albedo.mT, rows.position, black),
+            normals_patch=on_raster(chosen, rows.index, normals),
+            albedo=on_raster(albedo.mT, rows.index, black),
             lights_patch=lights,
-            valid=on_raster(valid, rows.position, nothing),
-            information=on_raster(found.information * valid, rows.position, blank),
+            valid=on_raster(valid, rows.index, nowhere),
+            information=on_raster(found.information * valid, rows.index, blank),
             status=status,
             convergence=factors.convergence,
         )
@@ -309,7 +315,7 @@ class Factorize(Stage):
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
-        shading = start_from_mesh(gray, rows.seen, anchor, harmonics(rows.normals).mT)
+        shading = initial_shading(gray, rows.seen, anchor, harmonics(rows.normals).mT)
         square = shading[:, 0] ** 2
         count = (square > 0).sum(dim=1).clamp_min(1)
         seen_square = (weight @ square[..., None])[..., 0]
@@ -322,7 +328,7 @@ class Factorize(Stage):
         prior = None
         gamma = level * torch.where(refused, FIXED_NORMALS, config.geometry_weight)
         if bool((gamma > 0).any()):
-            prior = gamma[:, None, None] * cone.bend(rows.normals.mT)
+            prior = gamma[:, None, None] * cone.normal_prior(rows.normals.mT)
         return Bilinear(
             radiance=gray,
             weight=weight,
@@ -340,12 +346,12 @@ class Factorize(Stage):
         config = self.config
         limits = config.max_iterations, config.tolerance
         if torch.is_grad_enabled() and problem.requires_grad:
-            limits = max(limits[0], AT_REST[0]), min(limits[1], AT_REST[1])
+            limits = max(limits[0], TO_CONVERGENCE[0]), min(limits[1], TO_CONVERGENCE[1])
         return SOLVERS[config.solver](problem.detach(), *limits)
 
 
 def _in_parts(seen: PatchViews, bucket: int) -> list[PatchViews]:
-    """Cut a bucket into batches of bounded size, as views of its memory."""
+    """Split a bucket into batches of bounded size, as views of its memory."""
     templates, registered = seen.patches.buckets[bucket], seen.buckets[bucket]
     count, num_views = registered.valid.shape[:2]
     samples = max(int(templates.inside.sum(dim=(1, 2)).max()), 1) if count else 1
@@ -360,23 +366,23 @@ def _in_parts(seen: PatchViews, bucket: int) -> list[PatchViews]:
     ]
 
 
-def _lit(bucket: _Bucket, light: Illumination) -> Observations:
-    """Leave out what lies in a cast shadow, or may."""
+def _without_shadows(bucket: _Bucket, light: Illumination) -> Observations:
+    """Mark samples in cast shadows, or near their edges, as missing."""
     registered, templates = bucket.registered, bucket.templates
     if light.caster is None:
         return registered
     world_from_patch = invert_rigid(templates.patch_from_world)
     raster = templates.points_patch.shape
-    places = transform(world_from_patch, templates.points_patch.flatten(1, 2))
+    points_world = transform(world_from_patch, templates.points_patch.flatten(1, 2))
     shadows = cast_shadows_on_rasters(
         light.field,
         light.caster,
-        places.reshape(raster),
+        points_world.reshape(raster),
         rotate(world_from_patch, bucket.normals.flatten(1, 2)).reshape(raster),
         templates.spacing,
         tolerance=SHADOW_SAMPLES * templates.spacing.detach(),
         guard=SHADOW_SAMPLES * float(templates.spacing[0].detach()),
-        asked=templates.inside,
+        mask=templates.inside,
         seen=registered.valid,
     )
     reached = (shadows.lit & shadows.sure).movedim(-1, 1)
@@ -386,7 +392,7 @@ def _lit(bucket: _Bucket, light: Illumination) -> Observations:
 def _exposed(rows: Rows, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:
     """Scale each view's light to its radiance, coarse normals given and albedo the same in all."""
     gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
-    predicted = lights @ start_from_mesh(gray, rows.seen, lights, basis) * rows.seen
+    predicted = lights @ initial_shading(gray, rows.seen, lights, basis) * rows.seen
     square = predicted.square().sum(dim=2)
     gain = (predicted * gray).sum(dim=2) / torch.where(square > 0, square, 1)
     return lights * torch.where((square > 0) & (gain > 0), gain, 1)[..., None]

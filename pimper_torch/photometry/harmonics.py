@@ -1,7 +1,7 @@
-r"""First-order lighting: what a Lambertian surface shows under light from all sides.
+r"""First-order spherical harmonics: shading of a Lambertian surface under distributed light.
 
 Under distant light of any distribution the radiance of a convex Lambertian surface is, to
-first order, :math:`x = \rho\, l^\top (1, n)`: albedo, four numbers a light, and the normal.
+first order, :math:`x = \rho\, l^\top (1, n)`: albedo, four coefficients of the light, the normal.
 The constants of the real harmonics are folded into ``l``.
 
 Source: Basri & Jacobs, PAMI 25(2), 2003; Ramamoorthi & Hanrahan, JOSA A 18(10), 2001.
@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """Give ``(1, n)``, the basis that light is linear in.
+    """Give ``(1, n)``, the basis in which shading is linear in the light.
 
     >>> harmonics(torch.tensor([0.0, 0.0, -1.0]))
     tensor([ 1.,  0.,  0., -1.])
@@ -24,7 +24,7 @@ def harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
 def rotate_lights(
     target_from_source: Float[Tensor, "*#batch 4 4"], lights: Float[Tensor, "*#batch view 4"]
 ) -> Float[Tensor, "*batch view 4"]:
-    """Carry lights to another frame: ``l_0`` stays, the vector part turns with the normals.
+    """Transform lights to another frame: ``l_0`` stays, the vector part rotates as normals do.
 
     Shading is the same in every frame: ``l . (1, n)`` with both in the source frame equals
     it with both in the target frame. Only the rotation of the rigid transform matters.

@@ -1,4 +1,4 @@
-"""A batch of problems, each iterated until it is done."""
+"""A solver's loop over a batch of problems, which stop one by one."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,10 +13,11 @@ from pimper_torch.records import Record, StopCause
 
 State = TypeVar("State", bound=Record)
 
-# What a step answers for a patch that is to go on.
+# In place of a cause, for a patch that has not stopped.
 RUNNING = -1
 
-# Patches that are done leave the batch when they are this fraction of it.
+# Patches that have stopped leave the batch when they are this fraction of it: a choice, as
+# copying the rest costs about a step.
 _COMPACT_FRACTION = 0.25
 
 
@@ -26,17 +27,17 @@ def iterate(
     advance: Callable[[Bilinear, State, int], tuple[State, Int[Tensor, " patch"]]],
     max_iterations: int,
 ) -> tuple[State, Int[Tensor, " patch"], Int[Tensor, " patch"]]:
-    """Take steps until every patch is done; what is done leaves the batch.
+    """Iterate until every patch has stopped; those that have leave the batch.
 
     Args:
         problem: All patches.
-        state: Where they start; its tensors all lead with the patch.
-        advance: One step of the patches that are left: problem, state and number of the step
+        state: The initial state; the first axis of all its tensors is the patch.
+        advance: One step of the remaining patches: from problem, state and index of the step
             to the next state and, for each patch, a :class:`StopCause` or ``RUNNING``.
         max_iterations: Steps at most.
 
     Returns:
-        Every patch's state when it was done, its iterations, and the causes.
+        Every patch's last state, its number of steps, and its stop cause.
     """
     patches = torch.arange(len(problem.radiance), device=problem.radiance.device)
     taken = torch.full_like(patches, max_iterations)

@@ -1,4 +1,4 @@
-"""Light that varies over the scene: a point light at some place for every view, and soft light."""
+"""Light that varies over the scene: a point light and first-order harmonics in every view."""
 
 from dataclasses import dataclass
 
@@ -8,27 +8,29 @@ from torch import Tensor
 
 from pimper_torch.records import Record
 
-# Cosine of the angle between normal and point light that a sample needs to be lit beyond doubt.
+# Minimum cosine between normal and direction of the point light for a sample to count as lit: a
+# choice, 3 degrees from grazing, as coarse normals are off by a few degrees.
 _MIN_COSINE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class LightField(Record):
-    r"""What falls on each place of the scene in every view.
+    r"""The light at every point of the scene, in every view.
 
     A surface at ``x`` with normal ``n`` and albedo 1 shows
 
     .. math:: s \cdot (1, n) + \max(0, E(x) \cdot n), \qquad
               E(x) = |e| \frac{e/|e| - c (x - o)}{|e/|e| - c (x - o)|^3}:
 
-    soft light ``s``, and a point light in the direction of ``e``, ``1 / c`` away from the origin
-    ``o``, whose irradiance there is ``|e|`` and falls off with the square of the distance.
+    soft light ``s`` (first-order spherical harmonics), and a point light in direction ``e`` at
+    distance ``1 / c`` from the origin ``o``, whose irradiance there is ``|e|`` and falls off with
+    the square of the distance.
 
     Attributes:
         origin: World.
         soft: First-order harmonics, world.
         point_light: ``e``; zero for none.
-        closeness: ``c``; zero for a point light far away.
+        closeness: ``c``, the inverse distance; zero for a distant light.
     """
 
     origin: Float[Tensor, " 3"]
@@ -37,7 +39,7 @@ class LightField(Record):
     closeness: Float[Tensor, " view"]
 
     def point_light_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 3"]:
-        """Give ``E``: towards the point light, as long as its irradiance."""
+        """Give ``E``, the direction to the point light times its irradiance."""
         strength = self.point_light.norm(dim=1)
         direction = self.point_light / torch.where(strength > 0, strength, 1)[:, None]
         away = direction - self.closeness[:, None] * (points - self.origin)[:, None]
@@ -45,7 +47,7 @@ class LightField(Record):
         return strength[:, None] * away / torch.where(strength[:, None] > 0, distance, 1) ** 3
 
     def lights_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 4"]:
-        """Give the first-order light at places that the point light faces, world frame."""
+        """Give first-order light at points whose normals face the point light; world frame."""
         point_light = self.point_light_at(points)
         soft = self.soft.expand(len(points), -1, -1)
         return torch.cat([soft[..., :1], soft[..., 1:] + point_light], dim=-1)
@@ -54,8 +56,8 @@ class LightField(Record):
 def faces_light(
     point_light: Float[Tensor, "patch view 3"], normals: Float[Tensor, "patch sample 3"]
 ) -> Bool[Tensor, "patch view sample"]:
-    """Tell where the surface faces the point light; everywhere without a point light.
+    """Tell where the surface faces the point light; true everywhere in a view without one.
 
-    What faces away lies in attached shadow, which no light that is linear in ``(1, n)`` casts.
+    Elsewhere it is in attached shadow, where shading is not linear in ``(1, n)``.
     """
     return point_light @ normals.mT >= _MIN_COSINE * point_light.norm(dim=2, keepdim=True)

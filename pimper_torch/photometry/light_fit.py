@@ -1,7 +1,7 @@
-"""Lights and albedo fitted together to radiance under known normals.
+"""Lights and albedo fitted jointly to radiance under known normals.
 
-Damped Gauss-Newton steps on both, the albedos eliminated, under Cauchy's loss; gradients by the
-implicit function at the optimum.
+By damped Gauss-Newton (Levenberg-Marquardt) on both, albedos eliminated by the Schur complement,
+with Cauchy's loss; gradients by the implicit function theorem at the optimum.
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,13 @@ from torch.nn.functional import pad
 
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
+from pimper_torch.photometry.image_samples import ImageSamples
 from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
-from pimper_torch.photometry.shown import Shown
 
-# A fit has converged when a step lowers its cost by less than this fraction; and the iterations
-# and fraction where gradients are required, from which Newton's method continues.
-_MIN_GAIN, _AT_REST = 1e-7, (300, 1e-13)
+# A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
+# is the limit of iterations and the fraction where gradients are required, from which Newton's
+# method converges to rounding (`tests/photometry/test_factor_gradients.py`).
+_MIN_GAIN, _TO_CONVERGENCE = 1e-7, (300, 1e-13)
 
 # Fraction of the diagonal added to the normal equations as a preconditioner, a choice: the free
 # factor of light and albedo makes them singular.
@@ -27,7 +28,7 @@ _PRECONDITIONER_DAMPING = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightFit:
-    """A fit, and its median residual as a fraction of the view's brightness."""
+    """Fitted lights and albedo, and the median residual as a fraction of the view's brightness."""
 
     model: LightModel
     lights: Float[Tensor, "view parameter"]
@@ -35,38 +36,38 @@ class LightFit:
     misfit: float
 
 
-def fit_lights(model: LightModel, shown: Shown, iterations: int) -> LightFit:
+def fit_lights(model: LightModel, samples: ImageSamples, iterations: int) -> LightFit:
     """Fit a model's lights and the samples' albedo; a constant to autograd.
 
-    Where gradients are asked for, the fit goes on to rest: see :func:`with_gradients`.
+    Where gradients are required, it iterates to convergence: see :func:`with_gradients`.
 
     Args:
-        model: Soft light or a point light, on the samples.
-        shown: What they are to explain.
-        iterations: At most, where no gradients are asked for.
+        model: Soft light or a point light, at the samples.
+        samples: Their radiance.
+        iterations: At most, where no gradients are required.
     """
-    limit, min_gain = _AT_REST if _tracked(model, shown) else (iterations, _MIN_GAIN)
+    limit, min_gain = _TO_CONVERGENCE if _requires_grad(model, samples) else (iterations, _MIN_GAIN)
     with torch.no_grad():
-        return _fit(model, shown, limit, min_gain)
+        return _fit(model, samples, limit, min_gain)
 
 
-def _tracked(model: LightModel, shown: Shown) -> bool:
-    parts = (shown.radiance, *model.known())
+def _requires_grad(model: LightModel, samples: ImageSamples) -> bool:
+    parts = (samples.radiance, *model.geometry())
     return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
 
 
-def _fit(model: LightModel, shown: Shown, limit: int, min_gain: float) -> LightFit:
-    lights, albedo = model.start(shown)
-    descend = _descend_by_kernel if compiled_for(shown.radiance) else _descend
-    lights, albedo = descend(model, shown, model.admit(lights), albedo, limit, min_gain)
-    residual = shown.residual(albedo, model.shade(lights))
-    relative = (residual.abs() / shown.level.clamp_min(1e-300))[shown.seen]
+def _fit(model: LightModel, samples: ImageSamples, limit: int, min_gain: float) -> LightFit:
+    lights, albedo = model.initialize(samples)
+    minimize = _minimize_by_kernel if compiled_for(samples.radiance) else _minimize
+    lights, albedo = minimize(model, samples, model.clamp(lights), albedo, limit, min_gain)
+    residual = samples.residual(albedo, model.shade(lights))
+    relative = (residual.abs() / samples.level.clamp_min(1e-300))[samples.seen]
     return LightFit(model=model, lights=lights, albedo=albedo, misfit=float(relative.median()))
 
 
-def _descend_by_kernel(
+def _minimize_by_kernel(
     model: LightModel,
-    shown: Shown,
+    samples: ImageSamples,
     lights: Float[Tensor, "view parameter"],
     albedo: Float[Tensor, " sample"],
     limit: int,
@@ -76,12 +77,12 @@ def _descend_by_kernel(
 
     count = len(albedo)
     lights = lights.clone(memory_format=torch.contiguous_format)
-    whole = (0, -count % TILE)
+    padding = (0, -count % TILE)
     known, radiance, seen = (
-        pad(each.detach().mT.to(albedo), whole).contiguous().numpy()
-        for each in (torch.cat(model.known(), dim=1), shown.radiance, shown.seen)
+        pad(each.detach().mT.to(albedo), padding).contiguous().numpy()
+        for each in (torch.cat(model.geometry(), dim=1), samples.radiance, samples.seen)
     )
-    found, level = pad(albedo, whole), shown.level.detach()
+    found, level = pad(albedo, padding), samples.level.detach()
     fit(
         known,
         radiance,
@@ -96,78 +97,78 @@ def _descend_by_kernel(
     return lights, found[:count]
 
 
-def _descend(
+def _minimize(
     model: LightModel,
-    shown: Shown,
+    samples: ImageSamples,
     lights: Float[Tensor, "view parameter"],
     albedo: Float[Tensor, " sample"],
     limit: int,
     min_gain: float,
 ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
-    """Step on lights and albedo together: alternation crawls along valleys where both mimic."""
+    """Minimize over lights and albedo jointly; alternation converges slowly along their valley."""
     shading = model.shade(lights)
-    residual = shown.residual(albedo, shading)
+    residual = samples.residual(albedo, shading)
     damping = 1e-3
     for step in range(limit):
         widen = max(1.0, 4.0 * 0.7**step)
-        scale = widen * shown.scale(residual)
-        weight = shown.weights(residual, scale)
-        cost = shown.cost(residual, scale)
-        slopes = albedo[:, None, None] * model.slopes(lights)
+        scale = widen * samples.scale(residual)
+        weight = samples.weights(residual, scale)
+        cost = samples.cost(residual, scale)
+        jacobian = albedo[:, None, None] * model.jacobian(lights)
         weighted = weight * residual
-        downhill = (weighted[..., None] * slopes).sum(dim=0)
+        gradient = (weighted[..., None] * jacobian).sum(dim=0)
         # Active bound: the gradient points out of the feasible set.
-        fixed = model.admit(lights + downhill) == lights
-        normal = _normal_equations(shading, torch.where(fixed, 0, slopes), weight, damping)
-        steps = normal.solve(torch.where(fixed, 0, downhill), (weighted * shading).sum(dim=1))
-        moved = model.admit(lights + steps[0])
-        under = model.shade(moved)
-        changed = _best_albedo(shown, under, albedo + steps[1], weight, scale)
-        left = shown.residual(changed, under)
-        after = shown.cost(left, scale)
-        if after < cost:
-            lights, albedo, shading, residual = moved, changed, under, left
+        fixed = model.clamp(lights + gradient) == lights
+        normal = _normal_equations(shading, torch.where(fixed, 0, jacobian), weight, damping)
+        steps = normal.solve(torch.where(fixed, 0, gradient), (weighted * shading).sum(dim=1))
+        new_lights = model.clamp(lights + steps[0])
+        new_shading = model.shade(new_lights)
+        new_albedo = _best_albedo(samples, new_shading, albedo + steps[1], weight, scale)
+        new_residual = samples.residual(new_albedo, new_shading)
+        new_cost = samples.cost(new_residual, scale)
+        if new_cost < cost:
+            lights, albedo, shading, residual = new_lights, new_albedo, new_shading, new_residual
             damping = max(damping / 4, 1e-9)
-            if widen == 1 and after > cost * (1 - min_gain):
+            if widen == 1 and new_cost > cost * (1 - min_gain):
                 break
         else:
             damping = min(damping * 10, 1e6)
     return lights, albedo
 
 
-def with_gradients(found: LightFit, shown: Shown) -> LightFit:
-    """Give the fit gradients to photographs and geometry, if any are asked for.
+def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
+    """Make the fit differentiable in photographs and geometry, if gradients are required.
 
-    By the implicit function, at the nearest stationary point. Light and albedo share a free
-    factor: the largest parameter of the lights is fixed, and so are parameters at a bound or
-    without data.
+    By the implicit function theorem, at the nearest stationary point. Light and albedo share a
+    free factor: the largest parameter of the lights is fixed, and so are parameters at a bound
+    or without data.
     """
-    if not _tracked(found.model, shown):
+    if not _requires_grad(found.model, samples):
         return found
     model, count = found.model, found.lights.numel()
     start = torch.cat([found.lights.flatten(), found.albedo])
 
-    def slopes(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
+    def gradient(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
         lights, albedo = at[:count].reshape(found.lights.shape), at[count:]
         shading = model.shade(lights)
-        residual = shown.residual(albedo, shading)
-        weighted = shown.weights(residual, shown.scale(residual)) * residual
-        by_lights = torch.einsum("sv,s,svp->vp", weighted, albedo, model.slopes(lights))
+        residual = samples.residual(albedo, shading)
+        weighted = samples.weights(residual, samples.scale(residual)) * residual
+        by_lights = torch.einsum("sv,s,svp->vp", weighted, albedo, model.jacobian(lights))
         return torch.cat([by_lights.flatten(), (weighted * shading).sum(dim=1)])
 
     with torch.no_grad():
         shading = model.shade(found.lights)
-        residual = shown.residual(found.albedo, shading)
-        weight = shown.weights(residual, shown.scale(residual))
-        by_lights = found.albedo[:, None, None] * model.slopes(found.lights)
+        residual = samples.residual(found.albedo, shading)
+        weight = samples.weights(residual, samples.scale(residual))
+        by_lights = found.albedo[:, None, None] * model.jacobian(found.lights)
         normal = _normal_equations(shading, by_lights, weight, _PRECONDITIONER_DAMPING)
         observed = (weight * shading**2).sum(dim=1) > 0
-        fixed = ~torch.cat([model.free(found.lights).flatten(), observed])
+        fixed = ~torch.cat([model.inside_bounds(found.lights).flatten(), observed])
         flat = found.lights.abs().flatten()
         fixed[torch.where(fixed[:count], 0, flat).argmax()] = True
 
     def equations(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
-        return torch.where(fixed, start - at, slopes(at))
+        return torch.where(fixed, start - at, gradient(at))
 
     def precondition(side: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
         inner = torch.where(fixed, 0, side)
@@ -185,31 +186,31 @@ def with_gradients(found: LightFit, shown: Shown) -> LightFit:
 
 
 def _best_albedo(
-    shown: Shown,
+    samples: ImageSamples,
     shading: Float[Tensor, "sample view"],
     albedo: Float[Tensor, " sample"],
     weight: Float[Tensor, "sample view"],
     scale: Float[Tensor, " view"],
 ) -> Float[Tensor, " sample"]:
-    """Give the albedo that suits shading best: by the weights there are, then by its own.
+    """Give the albedo that minimizes the loss, by two steps of reweighted least squares.
 
-    Lights and albedo are multiplied, so that after a step of both at once it is not the best.
+    The model is bilinear: after a joint step of lights and albedo it is not the minimum.
     """
     for _ in range(2):
-        best = shown.albedo_under(shading, weight)
+        best = samples.albedo_under(shading, weight)
         albedo = torch.where(best.isfinite(), best, albedo)
-        weight = shown.weights(shown.residual(albedo, shading), scale)
+        weight = samples.weights(samples.residual(albedo, shading), scale)
     return albedo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Normal:
+class _NormalEquations:
     """The normal equations of lights and albedos, albedos eliminated (Schur).
 
     Attributes:
-        cross: Between albedos and the parameters of the lights.
-        inverse: Of the albedos' own part.
-        factor: Of what is left for the lights: ``torch.linalg.lu_factor``'s.
+        cross: Block of albedos and lights' parameters.
+        inverse: Of the diagonal block of the albedos.
+        factor: Of the Schur complement, by ``torch.linalg.lu_factor``.
     """
 
     cross: Float[Tensor, "sample unknown"]
@@ -227,33 +228,35 @@ class _Normal:
 
 def _normal_equations(
     shading: Float[Tensor, "sample view"],
-    slopes: Float[Tensor, "sample view parameter"],
+    jacobian: Float[Tensor, "sample view parameter"],
     weight: Float[Tensor, "sample view"],
     damping: float,
-) -> _Normal:
-    """Set up Gauss-Newton's equations.
+) -> _NormalEquations:
+    """Assemble Gauss-Newton's equations, and factor their Schur complement.
 
     Args:
-        shading: What albedo 1 shows: the derivatives by the albedos.
-        slopes: The derivatives by the parameters of the lights.
+        shading: Radiance of albedo 1, which is the derivative by the albedos.
+        jacobian: The derivatives by the parameters of the lights.
         weight: Of each residual.
         damping: Fraction of the diagonal that is added to it.
     """
-    _, num_views, size = slopes.shape
-    heavy = weight[..., None] * slopes
-    blocks = heavy.permute(1, 2, 0) @ slopes.transpose(0, 1)
+    _, num_views, size = jacobian.shape
+    heavy = weight[..., None] * jacobian
+    blocks = heavy.permute(1, 2, 0) @ jacobian.transpose(0, 1)
     diagonal = blocks.diagonal(dim1=1, dim2=2)
     # A view without data keeps its light: a unit block and a zero right-hand side. So does a
     # parameter without data.
     floor = 1e-9 * diagonal.sum(dim=1, keepdim=True)
     floor = torch.where(floor > 0, floor, 1)
     damped = blocks + torch.diag_embed(damping * diagonal + floor)
-    own = (weight * shading**2).sum(dim=1) * (1 + damping)
-    inverse = torch.where(own > 0, 1 / torch.where(own > 0, own, 1), 0)
+    own_block = (weight * shading**2).sum(dim=1) * (1 + damping)
+    inverse = torch.where(own_block > 0, 1 / torch.where(own_block > 0, own_block, 1), 0)
     cross = (heavy * shading[..., None]).flatten(1)
-    view = torch.arange(num_views, device=slopes.device)
-    spread_out = damped.new_zeros(num_views, size, num_views, size)
-    spread_out[view, :, view, :] = damped
-    schur = spread_out.reshape(size * num_views, -1) - cross.mT @ (inverse[:, None] * cross)
+    view = torch.arange(num_views, device=jacobian.device)
+    blocks_of_views = damped.new_zeros(num_views, size, num_views, size)
+    blocks_of_views[view, :, view, :] = damped
+    schur = blocks_of_views.reshape(size * num_views, -1) - cross.mT @ (inverse[:, None] * cross)
     ridge = 1e-12 * torch.diag(schur.diagonal().abs())
-    return _Normal(cross=cross, inverse=inverse, factor=torch.linalg.lu_factor(schur + ridge))
+    return _NormalEquations(
+        cross=cross, inverse=inverse, factor=torch.linalg.lu_factor(schur + ridge)
+    )

@@ -1,4 +1,4 @@
-"""Models of one view's light, as functions of a few parameters: soft light, and a point light."""
+"""Parametric models of each view's light: first-order harmonics, and a point light."""
 
 from dataclasses import dataclass
 
@@ -6,35 +6,33 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.photometry.image_samples import ImageSamples
 from pimper_torch.photometry.point_light_search import search_point_lights
-from pimper_torch.photometry.shown import Shown
 
-# A point light starts this far away, in mean distances of the samples from their centre, and comes
-# no nearer than the second: inside the scene its light has a pole.
+# Initial and minimum distance of a point light, in mean distances of the samples from their
+# centroid: choices; inside the scene its irradiance has a pole.
 _FIRST_DISTANCE, MIN_DISTANCE = 10.0, 1.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SoftLight:
-    """First-order harmonics, the same all over the scene."""
+    """Soft light: first-order spherical harmonics, constant over the scene."""
 
     basis: Float[Tensor, "sample 4"]
 
-    def known(self) -> tuple[Tensor, ...]:
-        """List what the model is made from."""
+    def geometry(self) -> tuple[Tensor, ...]:
+        """List the tensors that the model is a function of."""
         return (self.basis,)
 
-    def free(self, lights: Float[Tensor, "view 4"]) -> Bool[Tensor, "view 4"]:
-        """Mark parameters that no bound holds."""
+    def inside_bounds(self, lights: Float[Tensor, "view 4"]) -> Bool[Tensor, "view 4"]:
+        """Mark parameters that are not at a bound."""
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:]) > 0], dim=1)
 
-    def start(self, shown: Shown) -> tuple[Float[Tensor, "view 4"], Float[Tensor, " sample"]]:
-        """Give lights along the mean normal under which views are as bright as they are.
-
-        Returns:
-            The lights, and the albedo that goes with them.
-        """
-        gain, albedo = shown.brightness()
+    def initialize(
+        self, samples: ImageSamples
+    ) -> tuple[Float[Tensor, "view 4"], Float[Tensor, " sample"]]:
+        """Give lights along the mean normal with the views' median brightness, and albedo."""
+        gain, albedo = samples.brightness()
         mean = self.basis.mean(dim=0)
         return gain[:, None] * mean / (mean @ mean).clamp_min(1e-12), albedo
 
@@ -42,38 +40,36 @@ class SoftLight:
         """Give the radiance of albedo 1."""
         return self.basis @ lights.mT
 
-    def slopes(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "sample view 4"]:
-        """Give its derivatives by the view's parameters."""
+    def jacobian(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "sample view 4"]:
+        """Give the derivatives of :meth:`shade` by the view's parameters."""
         return self.basis[:, None].expand(-1, len(lights), -1)
 
-    def admit(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "view 4"]:
-        """Give the nearest parameters that make sense: light from everywhere is not negative."""
+    def clamp(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "view 4"]:
+        """Project the parameters on their bounds: ambient light is not negative."""
         return torch.cat([lights[:, :1].clamp_min(0), lights[:, 1:]], dim=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointLight:
-    """Ambient light, the point light's irradiance vector ``e`` at the centre, and its closeness."""
+    """Ambient light, and a point light's irradiance vector and inverse distance at the centroid."""
 
     normals: Float[Tensor, "sample 3"]
-    points: Float[Tensor, "sample 3"]  # about the centre, in units of the scene's size
+    points: Float[Tensor, "sample 3"]  # relative to the centroid, in units of the scene's size
 
-    def known(self) -> tuple[Tensor, ...]:
-        """List what the model is made from."""
+    def geometry(self) -> tuple[Tensor, ...]:
+        """List the tensors that the model is a function of."""
         return self.normals, self.points
 
-    def free(self, lights: Float[Tensor, "view 5"]) -> Bool[Tensor, "view 5"]:
+    def inside_bounds(self, lights: Float[Tensor, "view 5"]) -> Bool[Tensor, "view 5"]:
         """Mark parameters that are not at a bound."""
         inner = (lights[:, 4:] > 0) & (lights[:, 4:] < 1 / MIN_DISTANCE)
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:4]) > 0, inner], dim=1)
 
-    def start(self, shown: Shown) -> tuple[Float[Tensor, "view 5"], Float[Tensor, " sample"]]:
-        """Search distant point lights, as in :mod:`~pimper_torch.photometry.point_light_search`.
-
-        Returns:
-            The lights, and the albedo that goes with them.
-        """
-        lights, albedo = search_point_lights(shown, self.normals)
+    def initialize(
+        self, samples: ImageSamples
+    ) -> tuple[Float[Tensor, "view 5"], Float[Tensor, " sample"]]:
+        """Give lights and albedo from a search over directions; see ``point_light_search``."""
+        lights, albedo = search_point_lights(samples, self.normals)
         near = torch.full_like(lights[:, :1], 1 / _FIRST_DISTANCE)
         return torch.cat([lights, near], dim=1), albedo
 
@@ -83,12 +79,12 @@ class PointLight:
         facing = (self.normals[:, None] * away).sum(dim=-1)
         return lights[:, 0] + strength * facing.clamp_min(0) / distance**3
 
-    def slopes(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "sample view 5"]:
-        """Give its derivatives by the view's parameters."""
+    def jacobian(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "sample view 5"]:
+        """Give the derivatives of :meth:`shade` by the view's parameters."""
         strength, direction, away, distance = self._geometry(lights)
         facing = (self.normals[:, None] * away).sum(dim=-1)
         fall = distance**-3
-        # Of n.v / |v|^3 by v; v = d - c x, and d turns with e across its own direction.
+        # Of n.v / |v|^3 by v; v = d - c x, and d rotates with the part of e across it.
         by_away = fall[..., None] * (
             self.normals[:, None] - 3 * (facing / distance**2)[..., None] * away
         )
@@ -101,8 +97,8 @@ class PointLight:
             [ones, lit[..., None] * by_point_light, (lit * by_closeness)[..., None]], dim=-1
         )
 
-    def admit(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "view 5"]:
-        """Give the nearest parameters that make sense: point lights outside the scene."""
+    def clamp(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "view 5"]:
+        """Project the parameters on their bounds: point lights stay outside the scene."""
         ambient = lights[:, :1].clamp_min(0)
         closeness = lights[:, 4:].clamp(0, 1 / MIN_DISTANCE)
         return torch.cat([ambient, lights[:, 1:4], closeness], dim=1)

@@ -1,8 +1,8 @@
-r"""What shading vectors can be: a photometric manifold, of first-order light the cone.
+r"""Photometric manifolds: the sets of possible shading vectors. First-order light has a cone.
 
-A surface shows :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
-albedo and normal alone: :math:`s = \rho (1, n)` to first order, of rank four, which leaves a
-scaled Lorentz transformation free. Other orders of light, and any low-rank matrix, are in
+Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
+albedo and normal alone: :math:`s = \rho (1, n)` to first order, of rank four, whose ambiguity is
+a scaled Lorentz transformation. Other orders of light, and low-rank matrices, are in
 :mod:`pimper_torch.single_view.factorization.manifolds`.
 
 Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
@@ -26,45 +26,45 @@ from pimper_torch.photometry.harmonics import harmonics
 
 @runtime_checkable
 class Manifold(Protocol):
-    """What shading vectors can be."""
+    """A set of possible shading vectors."""
 
     @property
     def flat(self) -> bool:
-        """Whether any vector will do, so that normal equations give the best at once."""
+        """Whether it is the whole space, so that normal equations give the minimum."""
 
     def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
         """Give the nearest vector of the manifold."""
 
     def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Bring back what a small step along the tangents has left."""
+        """Map the end of a small step along the tangents back to the manifold."""
 
     def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
-        """Span the tangent space at each column: albedo first, then two turns of the normal."""
+        """Span the tangent space at each column: by albedo, then by two rotations of the normal."""
 
     def curvature(
         self,
         shading: Float[Tensor, "*batch rank sample"],
         slope: Float[Tensor, "*batch rank sample"],
     ) -> Float[Tensor, "*batch sample tangent tangent"]:
-        r"""Give the manifold's part of the second derivatives by the tangents' coordinates.
+        r"""Give :math:`g \cdot \partial^2 s` by the tangents' coordinates, ``slope`` being ``g``.
 
-        Of a function with gradient ``slope``, :math:`g \cdot \partial^2 s`.
+        It is the manifold's part of the second derivatives of a function with gradient ``g``.
         """
 
     def split(
         self, shading: Float[Tensor, "*batch rank"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Read albedo and unit normal off the vectors."""
+        """Give albedo and unit normal of the vectors."""
 
     def join(
         self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
     ) -> Float[Tensor, "*batch rank"]:
         """Give the vectors of albedo and normal."""
 
-    def bend(
+    def normal_prior(
         self, normals: Float[Tensor, "*batch 3 sample"]
     ) -> Float[Tensor, "*batch packed sample"]:
-        """Give the quadratic form of bending away from normals, packed."""
+        """Give the quadratic penalty on the distance from known normals, packed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class Cone:
         albedo, normal = self.split(shading.mT)
         first, second = tangents(normal)
         along = [(slope[..., 1:, :].mT * part).sum(dim=-1) for part in (normal, first, second)]
-        return bending(-along[0], along[1], along[2], torch.zeros_like(albedo), albedo)
+        return tangent_curvature(-along[0], along[1], along[2], torch.zeros_like(albedo), albedo)
 
     def join(
         self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
@@ -93,8 +93,10 @@ class Cone:
         """Give the vectors of albedo and normal."""
         return albedo[..., None] * harmonics(normals)
 
-    def bend(self, normals: Float[Tensor, "*batch 3 sample"]) -> Float[Tensor, "*batch 10 sample"]:
-        r"""Give the quadratic form :math:`\lVert b - \rho \bar n \rVert^2`, packed."""
+    def normal_prior(
+        self, normals: Float[Tensor, "*batch 3 sample"]
+    ) -> Float[Tensor, "*batch 10 sample"]:
+        r"""Give the penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
         n = normals
         one, zero = torch.ones_like(n[..., 0, :]), torch.zeros_like(n[..., 0, :])
         x, y, z = n.unbind(dim=-2)
@@ -102,21 +104,21 @@ class Cone:
         return torch.stack(rows, dim=-2)
 
 
-def bending(
+def tangent_curvature(
     square: Float[Tensor, "*batch"],
     first: Float[Tensor, "*batch"],
     second: Float[Tensor, "*batch"],
     across: Float[Tensor, "*batch"],
     albedo: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Put second derivatives by albedo and two turns together, over albedo.
+    """Assemble second derivatives by albedo and two rotations of the normal, over albedo.
 
     Args:
-        square: By each turn twice.
-        first: By albedo and the first turn.
+        square: By each rotation twice.
+        first: By albedo and the first rotation.
         second: By albedo and the second.
-        across: By both turns.
-        albedo: In whose units turns are.
+        across: By both rotations.
+        albedo: The unit of the rotations.
     """
     none = torch.zeros_like(square)
     rows = [[none, first, second], [first, square, across], [second, across, square]]

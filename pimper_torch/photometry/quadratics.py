@@ -1,8 +1,8 @@
-"""Many small symmetric systems at once: weighted least squares, sample by sample.
+"""Batched small symmetric systems in packed form: weighted least squares, sample by sample.
 
-A symmetric n x n matrix travels as its upper triangle, row by row, in the last axis but
-one: 10 numbers for n = 4. Millions of them then cost one matrix product to assemble, and
-elementwise arithmetic, without a call of a library each, to solve.
+A symmetric n x n matrix is stored as its upper triangle, row by row, in the last axis but
+one: 10 entries for n = 4. Millions of them are assembled by one matrix product, and solved by
+elementwise arithmetic, without a library call each.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ def outer(vectors: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch p
 
 
 def diagonal(size: int) -> list[int]:
-    """Tell where the diagonal of a matrix stands in its packed form."""
+    """Give the indices of the diagonal in the packed form."""
     rows, columns = _triangle(size)
     return [slot for slot, pair in enumerate(zip(rows, columns, strict=True)) if len({*pair}) < 2]
 
@@ -32,7 +32,7 @@ def diagonal(size: int) -> list[int]:
 def unpacked(
     packed: Float[Tensor, "*batch packed item"], size: int
 ) -> Float[Tensor, "*batch item size size"]:
-    """Write matrices out, one an item."""
+    """Give the full matrices."""
     rows, columns = _triangle(size)
     index = torch.zeros(size, size, dtype=torch.long, device=packed.device)
     slot = torch.arange(len(rows), device=packed.device)
@@ -59,7 +59,7 @@ def apply_packed(
 def dot(
     first: Float[Tensor, "*batch size item"], second: Float[Tensor, "*batch size item"]
 ) -> Float[Tensor, "*batch item"]:
-    """Multiply vectors; several times as fast as a sum over their axis."""
+    """Give inner products; several times as fast as a sum over the axis."""
     total = torch.zeros_like(second[..., 0, :])
     for a, b in zip(first.unbind(dim=-2), second.unbind(dim=-2), strict=True):
         total = torch.addcmul(total, a, b)
@@ -105,9 +105,8 @@ def solve_packed(
 class PackedCholesky:
     """Factors ``A = C C^T`` of many small symmetric positive matrices, in float64.
 
-    A direction whose pivot is below 1e-12 of the matrix's trace carries no information:
-    its pivot is raised to that, so that answers stay finite; an empty matrix answers zero
-    to a zero right-hand side. Differentiable.
+    Pivots below 1e-12 of the matrix's trace are raised to that, so that solutions of singular
+    systems stay finite; a zero matrix gives zero for a zero right-hand side. Differentiable.
     """
 
     def __init__(self, packed: Float[Tensor, "*batch packed item"], size: int) -> None:
@@ -138,7 +137,7 @@ class PackedCholesky:
         return torch.stack(solution, dim=-2).to(rhs.dtype)
 
     def whiten(self, rows: Sequence[Float[Tensor, "*batch item"]]) -> list[Tensor]:
-        """Give ``C^-1 b`` row by row in float64: products of such vectors are ``b^T A^-1 b'``."""
+        """Give ``C^-1 b`` row by row in float64; inner products of these are ``b^T A^-1 b'``."""
         forward: list[Tensor] = []
         for i, row in enumerate(rows):
             value = row.double()

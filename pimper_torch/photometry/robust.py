@@ -8,24 +8,27 @@ from torch import Tensor
 
 from pimper_torch.config import require
 
-# Cauchy's weights are 95 % efficient on Gaussian noise with a scale of so many standard deviations.
+# Scale of Cauchy's loss in standard deviations, at which it is 95 % efficient on Gaussian noise
+# (Holland & Welsch, 1977).
 CAUCHY_TUNING = 2.385
 
-# The scale of Gaussian noise of unit deviation: the root of the expectation of its equation.
-_OF_GAUSSIAN = 0.6472404
+# The M-estimate of scale of unit Gaussian noise: the root of its equation's expectation, checked in
+# `test_robust.py`.
+_GAUSSIAN_SCALE = 0.6472404
 
-# Newton's steps at most, each at most so long: they halve a scale that outliers made too large.
-_SCALE_STEPS, _LONGEST_GAIN = 40, 1.5
+# Newton's steps at most, and their longest, in logarithms of the squared scale: a choice; started
+# at the mean square, few outliers need more than ten.
+_NEWTON_STEPS, _MAX_STEP = 40, 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class Squares:
-    """Plain least squares: every residual counts by its square."""
+    """Plain least squares."""
 
     def weights(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Weigh all residuals by 1."""
+        """Give weights for iteratively reweighted least squares: 1."""
         return torch.ones_like(residual)
 
     def curvatures(
@@ -37,7 +40,7 @@ class Squares:
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    r"""Cauchy's loss :math:`\tfrac{s^2}{2} \log(1 + (r / s)^2)`: outliers still pull a little.
+    r"""Cauchy's loss :math:`\tfrac{s^2}{2} \log(1 + (r / s)^2)`: outliers keep a small influence.
 
     Attributes:
         scale: ``s`` in standard deviations of the residuals.
@@ -51,7 +54,7 @@ class Cauchy:
     def weights(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Weigh residuals for iterated least squares, by 1 at 0."""
+        """Give weights for iteratively reweighted least squares; 1 for a zero residual."""
         return cauchy_weights(residual, self.scale * deviation)
 
     def curvatures(
@@ -65,19 +68,19 @@ class Cauchy:
 Loss = Squares | Cauchy
 
 
-def median_spread(
+def median_deviation(
     residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
 ) -> Float[Tensor, "*batch"]:
-    """Estimate the standard deviation of residuals from their median size; 0 if none is seen.
+    """Estimate residuals' standard deviation by their median absolute value; 0 if none is seen.
 
-    1.4826 makes the median absolute value of Gaussian noise its standard deviation. Where most
-    residuals are next to nothing it lets the others go more firmly than :func:`spread`.
+    The factor 1.4826 makes it consistent for Gaussian noise. Where most residuals are close to
+    zero it rejects the others more strictly than :func:`robust_deviation`.
     """
     size = torch.where(seen, residual.abs(), torch.nan)
     return 1.4826 * size.nanmedian(dim=-1).values.nan_to_num(nan=0.0)
 
 
-def spread(
+def robust_deviation(
     residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
 ) -> Float[Tensor, "*batch"]:
     r"""Estimate the standard deviation of residuals, robustly and differentiably.
@@ -87,46 +90,45 @@ def spread(
 
     .. math:: \frac1n \sum_i \frac{r_i^4}{r_i^4 + t^4} = \frac12.
 
-    Like the median it bears outliers up to a half of the residuals, and it is as quick to find;
-    unlike the median it changes smoothly with every residual, so that its derivative tells how it
-    goes on.
+    Its breakdown point is a half, like that of the median; unlike the median it is a smooth
+    function of every residual.
 
     Args:
-        residual: Anything where not seen.
-        seen: Which count.
+        residual: Ignored where not seen.
+        seen: False where missing.
 
     Returns:
         0 where none is seen, or half of them are zero. Differentiable by the implicit function.
 
     >>> noise = torch.randn(100_000, generator=torch.Generator().manual_seed(0))
-    >>> torch.allclose(spread(3 * noise, noise < 9), torch.tensor(3.0), rtol=0.01)
+    >>> torch.allclose(robust_deviation(3 * noise, noise < 9), torch.tensor(3.0), rtol=0.01)
     True
 
     Source: Huber, Robust Statistics, 1981, chapter 5, for M-estimates of scale.
     """
     variance = robust_variance(torch.where(seen, residual, 0).square(), seen)
-    some = variance > 0
-    return torch.where(some, torch.where(some, variance, 1).sqrt(), 0)
+    positive = variance > 0
+    return torch.where(positive, torch.where(positive, variance, 1).sqrt(), 0)
 
 
 def robust_variance(
     square: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
 ) -> Float[Tensor, "*batch"]:
-    """Estimate the variance that squared residuals show; see :func:`spread`.
+    """Estimate the variance from squared residuals; see :func:`robust_deviation`.
 
     Args:
         square: Zero where not seen.
-        seen: Which count.
+        seen: False where missing.
     """
     half = seen.sum(dim=-1).to(square) / 2
-    some = (square.detach() > 0).sum(dim=-1) > half
-    scale = _scale_of_squares(square.detach(), torch.where(some, half, 1))[..., None]
-    fraction = _soft_step(square, scale)
+    determined = (square.detach() > 0).sum(dim=-1) > half
+    scale = _scale_of_squares(square.detach(), torch.where(determined, half, 1))[..., None]
+    fraction = _fractions(square, scale)
     slope = 2 * (fraction * (1 - fraction)).detach().sum(dim=-1)
-    off = (fraction.sum(dim=-1) - half) / torch.where(slope > 0, slope, 1)
-    # One more of Newton's steps, next to nothing: the derivative is the implicit function's.
-    variance = (scale[..., 0] * (1 + off)).clamp_min(0)
-    return torch.where(some, variance / _OF_GAUSSIAN**2, 0)
+    correction = (fraction.sum(dim=-1) - half) / torch.where(slope > 0, slope, 1)
+    # One more Newton step, of length about zero: its derivative is the implicit function's.
+    variance = (scale[..., 0] * (1 + correction)).clamp_min(0)
+    return torch.where(determined, variance / _GAUSSIAN_SCALE**2, 0)
 
 
 @torch.no_grad()
@@ -137,17 +139,17 @@ def _scale_of_squares(
     scale = square.mean(dim=-1)
     scale = torch.where(scale > 0, scale, 1)
     close = torch.finfo(square.dtype).eps ** 0.75
-    for _ in range(_SCALE_STEPS):
-        fraction = _soft_step(square, scale[..., None])
+    for _ in range(_NEWTON_STEPS):
+        fraction = _fractions(square, scale[..., None])
         slope = 2 * (fraction.sum(dim=-1) - fraction.square().sum(dim=-1))
-        gain = (fraction.sum(dim=-1) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
-        scale = scale * gain.clamp(-_LONGEST_GAIN, _LONGEST_GAIN).exp()
-        if bool((gain.abs() < close).all()):
+        step = (fraction.sum(dim=-1) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
+        scale = scale * step.clamp(-_MAX_STEP, _MAX_STEP).exp()
+        if bool((step.abs() < close).all()):
             break
     return scale
 
 
-def _soft_step(
+def _fractions(
     square: Float[Tensor, "*batch item"], scale: Float[Tensor, "*batch one"]
 ) -> Float[Tensor, "*batch item"]:
     ratio = (square / scale).clamp_max(1e9).square()
@@ -157,9 +159,9 @@ def _soft_step(
 def cauchy_weights(
     residual: Float[Tensor, "*batch"], scale: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*batch"]:
-    """Weigh residuals by ``1 / (1 + (r / scale)^2)``; where the scale is 0, all by 1.
+    """Give the weights ``1 / (1 + (r / scale)^2)``; 1 where the scale is 0.
 
-    Iterating least squares with these weights minimises the sum of
+    Iteratively reweighted least squares with them minimizes the sum of
     ``scale^2 / 2 * log(1 + (r / scale)^2)``.
 
     Source: Holland & Welsch, Communications in Statistics 6(9), 1977.

@@ -1,4 +1,4 @@
-"""Rasters to rows of samples and back: padding outside the templates costs nothing."""
+"""Gather the samples inside templates from rasters into rows, and scatter them back."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ from pimper_torch.records import Observations, Record, Templates
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Rows(Record):
-    """The samples inside the templates of some patches, in a row, padded to the longest.
+    """The samples inside each patch's template, flattened and padded to the longest.
 
     Attributes:
-        position: Index of each sample in the flattened raster; padding indexes samples outside
+        index: Of each sample in the flattened raster; padding indexes samples outside
             the template.
         radiance: Linear; zero where missing.
         seen: ``D``; false where radiance is not finite.
-        normals: Of what the template carries, patch frame.
+        normals: Initial normals of the template, patch frame.
     """
 
-    position: Int[Tensor, "patch sample"]
+    index: Int[Tensor, "patch sample"]
     radiance: Float[Tensor, "patch view channel sample"]
     seen: Bool[Tensor, "patch view sample"]
     normals: Float[Tensor, "patch sample 3"]
@@ -30,31 +30,31 @@ class Rows(Record):
 def rows_of(
     templates: Templates, registered: Observations, normals: Float[Tensor, "patch height width 3"]
 ) -> Rows:
-    """Put the samples inside each template in a row."""
+    """Gather the samples inside each template."""
     inside = templates.inside.flatten(1)
     longest = max(int(inside.sum(dim=1).max()), 1) if len(inside) else 1
-    position = torch.argsort((~inside).to(torch.uint8), dim=1, stable=True)[:, :longest]
-    within = inside.gather(1, position)
+    index = torch.argsort((~inside).to(torch.uint8), dim=1, stable=True)[:, :longest]
+    within = inside.gather(1, index)
     num_views, num_channels = registered.radiance.shape[1:3]
-    by_view = position[:, None].expand(-1, num_views, -1)
+    by_view = index[:, None].expand(-1, num_views, -1)
     by_channel = by_view[:, :, None].expand(-1, -1, num_channels, -1)
     radiance = registered.radiance.flatten(3).gather(3, by_channel)
     seen = registered.valid.flatten(2).gather(2, by_view) & within[:, None]
-    # A sum is finite where all its terms are; short of the largest numbers there are.
+    # A sum is finite where all its terms are, but for overflow.
     seen = seen & radiance.sum(dim=2).isfinite()
     return Rows(
-        position=position,
+        index=index,
         radiance=torch.where(seen[:, :, None], radiance, 0),
         seen=seen,
-        normals=normals.flatten(1, 2).gather(1, position[..., None].expand(-1, -1, 3)),
+        normals=normals.flatten(1, 2).gather(1, index[..., None].expand(-1, -1, 3)),
     )
 
 
 def on_raster(
     row: Float[Tensor, "patch sample *channel"] | Bool[Tensor, "patch sample"],
-    position: Int[Tensor, "patch sample"],
+    index: Int[Tensor, "patch sample"],
     background: Float[Tensor, "patch height width *channel"] | Bool[Tensor, "patch height width"],
 ) -> Float[Tensor, "patch height width *channel"] | Bool[Tensor, "patch height width"]:
-    """Put a row back on its raster, over a background."""
-    index = position if row.ndim == 2 else position[..., None].expand_as(row)
-    return background.flatten(1, 2).scatter(1, index, row).reshape(background.shape)
+    """Scatter a row to its raster, over a background."""
+    expanded = index if row.ndim == 2 else index[..., None].expand_as(row)
+    return background.flatten(1, 2).scatter(1, expanded, row).reshape(background.shape)

@@ -1,4 +1,4 @@
-"""Cast shadows: what the point light of a view reaches, from light and surface."""
+"""Cast shadows of the point light of each view, by ray casting on the surface."""
 
 import math
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.photometry.light_field import LightField
 from pimper_torch.records import Record
 
-# Rays round a sample that look for an edge of a shadow near it.
+# Rays around a sample that detect a shadow edge near it: a choice.
 _RING = 6
 
-# Rays that are cast together; bounds memory to about 100 MB.
+# Rays that are cast together: a choice, about 100 MB of memory.
 _RAYS_AT_ONCE = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Shadows(Record):
-    """What point lights reach.
+    """Where point lights reach the surface.
 
     Attributes:
-        lit: True where nothing stands between the point light and the surface, which faces it;
+        lit: True where the surface faces the point light and nothing occludes it;
             true everywhere in a view without a point light.
         sure: True where no edge of a cast shadow is nearer than the guard.
     """
@@ -40,7 +40,7 @@ def cast_shadows(
     normals: Float[Tensor, "*batch 3"],
     tolerance: float | Float[Tensor, "*#batch"],
     guard: float | Float[Tensor, "*#batch"] = 0.0,
-    asked: Bool[Tensor, "*batch view"] | None = None,
+    mask: Bool[Tensor, "*batch view"] | None = None,
 ) -> Shadows:
     """Cast a ray from every sample to the point light of every view.
 
@@ -49,45 +49,44 @@ def cast_shadows(
         caster: The surface that casts the shadows.
         points: World; on that surface or near it.
         normals: Unit, outward.
-        tolerance: How far points may lie off the surface, scene units: rays start so far
-            along the normal, and as far again towards the point light. A body thinner than that
-            casts no shadow on what it touches.
-        guard: How far, along the surface, the edge of a cast shadow may lie from where it is
-            predicted; scene units. Above 0, six rays more are cast round each lit or shadowed
-            sample that faces the point light, and one that disagrees makes it unsure: no straight
-            edge that near is missed.
-        asked: Where an answer is wanted; elsewhere everything is lit and sure.
+        tolerance: Maximum distance of the points from the surface, scene units: rays start so far
+            along the normal, and as far again towards the point light. An object thinner than
+            that casts no shadow on what it touches.
+        guard: Maximum error, along the surface, of the predicted edge of a cast shadow; scene
+            units. Above 0, six more rays are cast around each sample that faces the point light,
+            and one that disagrees makes it unsure: no straight edge that near is missed.
+        mask: Where rays are cast; elsewhere everything is lit and sure.
 
     Returns:
-        A sample that can be trusted to be lit is ``lit & sure``. What faces away from the point
-        light lies in attached shadow: not lit, and sure.
+        A sample that is reliably lit is ``lit & sure``. One that faces away from the point
+        light is in attached shadow: not lit, and sure.
 
     A constant to autograd. Ray casting is float32 on the CPU.
     """
     shape, like = points.shape[:-1], points
     flat, up = points.detach().reshape(-1, 3), normals.detach().reshape(-1, 3)
-    slack = torch.as_tensor(tolerance).to(like).expand(shape).reshape(-1)
+    offset = torch.as_tensor(tolerance).to(like).expand(shape).reshape(-1)
     margin = torch.as_tensor(guard).to(like).expand(shape).reshape(-1)
-    ring = _ring(up, margin) if bool((margin > 0).any()) else None
+    ring = _hexagon(up, margin) if bool((margin > 0).any()) else None
     views = len(field.point_light)
     lit = torch.ones(len(flat), views, dtype=torch.bool, device=like.device)
     sure = torch.ones_like(lit)
     shines = field.point_light.norm(dim=1) > 0
-    wanted = lit & shines if asked is None else asked.reshape(-1, views) & shines
+    needed = lit & shines if mask is None else mask.reshape(-1, views) & shines
     at_once = max(1, _RAYS_AT_ONCE // (1 if ring is None else 1 + _RING))
-    for some in torch.split(wanted.mT.nonzero(), at_once):
-        view, sample = some.unbind(dim=1)
+    for batch in torch.split(needed.mT.nonzero(), at_once):
+        view, sample = batch.unbind(dim=1)
         towards, _ = _direction_to_light(field, view, flat[sample])
         facing = (towards * up[sample]).sum(dim=-1) > 0
         lit[sample, view] = facing
         view, sample = view[facing], sample[facing]
-        free = _free(field, view, caster, flat[sample], up[sample], slack[sample])
-        lit[sample, view] = free
+        unblocked = _unblocked(field, view, caster, flat[sample], up[sample], offset[sample])
+        lit[sample, view] = unblocked
         if ring is not None:
             around = flat[sample, None] + ring[sample]
             outward = up[sample, None].expand_as(around)
-            same = _free(field, view[:, None], caster, around, outward, slack[sample, None])
-            sure[sample, view] = (same == free[:, None]).all(dim=1)
+            same = _unblocked(field, view[:, None], caster, around, outward, offset[sample, None])
+            sure[sample, view] = (same == unblocked[:, None]).all(dim=1)
     return Shadows(lit=lit.reshape(*shape, views), sure=sure.reshape(*shape, views))
 
 
@@ -101,13 +100,13 @@ def cast_shadows_on_rasters(
     tolerance: float | Float[Tensor, " patch"],
     guard: float = 0.0,
     stride: int = 4,
-    asked: Bool[Tensor, "patch height width"] | None = None,
+    mask: Bool[Tensor, "patch height width"] | None = None,
     seen: Bool[Tensor, "patch view height width"] | None = None,
 ) -> Shadows:
     """Predict shadows on templates from a sparse raster of rays.
 
-    See :func:`cast_shadows`. A sample that no ray was cast for takes the answer of the nearest
-    one that was; with a guard, the way between the two is added to it.
+    See :func:`cast_shadows`. A sample without a ray takes the result of the nearest ray; the
+    guard, if any, grows by the distance between the two.
 
     Args:
         field: Point lights.
@@ -118,23 +117,23 @@ def cast_shadows_on_rasters(
         tolerance: Scene units.
         guard: Scene units.
         stride: Samples between rays.
-        asked: Where an answer is wanted; elsewhere everything is lit and sure.
-        seen: In which views; no answer is wanted in others.
+        mask: Where rays are cast; elsewhere everything is lit and sure.
+        seen: In which views rays are cast, sample by sample.
 
     Returns:
         Of shape ``patch height width view``.
     """
     height, width = points.shape[1:3]
-    rows, columns = _ray_places(height, stride, points), _ray_places(width, stride, points)
-    wanted = points.new_ones(points.shape[:3], dtype=torch.bool) if asked is None else asked
-    chosen = _in_blocks(wanted[:, None], stride)[:, 0]
-    views = None if seen is None else _in_blocks(seen, stride).movedim(1, -1)[chosen]
+    rows, columns = _ray_indices(height, stride, points), _ray_indices(width, stride, points)
+    needed = points.new_ones(points.shape[:3], dtype=torch.bool) if mask is None else mask
+    chosen = _any_in_blocks(needed[:, None], stride)[:, 0]
+    views = None if seen is None else _any_in_blocks(seen, stride).movedim(1, -1)[chosen]
     patch, row, column = chosen.nonzero(as_tuple=True)
-    place = patch, rows[row], columns[column]
-    slack = torch.as_tensor(tolerance).to(points).expand(len(points))
+    index = patch, rows[row], columns[column]
+    offset = torch.as_tensor(tolerance).to(points).expand(len(points))
     margin = guard + 2**0.5 * (stride // 2) * spacing if guard > 0 else torch.zeros_like(spacing)
-    found = cast_shadows(
-        field, caster, points[place], normals[place], slack[patch], margin[patch], views
+    cast = cast_shadows(
+        field, caster, points[index], normals[index], offset[patch], margin[patch], views
     )
 
     def spread_out(sparse: Bool[Tensor, "ray view"]) -> Bool[Tensor, "patch height width view"]:
@@ -143,18 +142,18 @@ def cast_shadows_on_rasters(
         dense = blocks.repeat_interleave(stride, dim=1).repeat_interleave(stride, dim=2)
         return dense[:, :height, :width]
 
-    return Shadows(lit=spread_out(found.lit), sure=spread_out(found.sure))
+    return Shadows(lit=spread_out(cast.lit), sure=spread_out(cast.sure))
 
 
-def _in_blocks(
-    some: Bool[Tensor, "patch view height width"], stride: int
+def _any_in_blocks(
+    valid: Bool[Tensor, "patch view height width"], stride: int
 ) -> Bool[Tensor, "patch view rows columns"]:
-    """Tell which blocks of ``stride`` samples have any of some."""
-    return max_pool2d(some.float(), stride, ceil_mode=True) > 0
+    """Tell which blocks of ``stride`` by ``stride`` samples have any true sample."""
+    return max_pool2d(valid.float(), stride, ceil_mode=True) > 0
 
 
-def _ray_places(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tensor, " ray"]:
-    """Give the sample in each block of ``stride`` that the ray is cast from."""
+def _ray_indices(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tensor, " ray"]:
+    """Give the index, in each block of ``stride`` samples, that a ray is cast from."""
     first = torch.arange(0, size, stride, device=like.device)
     return (first + stride // 2).clamp_max(size - 1)
 
@@ -162,7 +161,7 @@ def _ray_places(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tenso
 def _direction_to_light(
     field: LightField, view: Int[Tensor, "*#batch"], points: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
-    """Give the unit direction to the point light and its distance, infinite for one far away."""
+    """Give the unit direction to the point light, and its distance, infinite if distant."""
     direction = normalize(field.point_light, dim=1).to(points)[view]
     closeness = field.closeness.to(points)[view]
     away = direction - closeness[..., None] * (points - field.origin.to(points))
@@ -171,29 +170,29 @@ def _direction_to_light(
     return away / length.clamp_min(1e-30)[..., None], far
 
 
-def _free(
+def _unblocked(
     field: LightField,
     view: Int[Tensor, "*#batch"],
     caster: RayCaster,
     points: Float[Tensor, "*batch 3"],
     normals: Float[Tensor, "*batch 3"],
-    slack: Float[Tensor, "*#batch"],
+    offset: Float[Tensor, "*#batch"],
 ) -> Bool[Tensor, "*batch"]:
-    lifted = points + slack[..., None] * normals
+    lifted = points + offset[..., None] * normals
     towards, reach = _direction_to_light(field, view, lifted)
-    return ~caster.blocked(lifted + slack[..., None] * towards, towards, reach - slack)
+    return ~caster.blocked(lifted + offset[..., None] * towards, towards, reach - offset)
 
 
-def _ring(
+def _hexagon(
     normals: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"]
 ) -> Float[Tensor, "sample ring 3"]:
-    """Give steps in the tangent plane, on a hexagon outside the circle of that radius."""
-    # The axis that is least along the normal: their cross product does not vanish.
+    """Give offsets in the tangent plane: the corners of a hexagon around a circle."""
+    # The axis least aligned with the normal: their cross product does not vanish.
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
-    one = normalize(torch.linalg.cross(axis, normals), dim=1)
-    other = torch.linalg.cross(normals, one)
-    rotation = 2 * math.pi * torch.arange(_RING).to(normals) / _RING
+    first_axis = normalize(torch.linalg.cross(axis, normals), dim=1)
+    second_axis = torch.linalg.cross(normals, first_axis)
+    angle = 2 * math.pi * torch.arange(_RING).to(normals) / _RING
     reach = radius[:, None, None] / math.cos(math.pi / _RING)
     return reach * (
-        rotation.cos()[:, None] * one[:, None] + rotation.sin()[:, None] * other[:, None]
+        angle.cos()[:, None] * first_axis[:, None] + angle.sin()[:, None] * second_axis[:, None]
     )

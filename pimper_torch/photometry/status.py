@@ -1,4 +1,4 @@
-"""Whether light determines the shape of a patch, and the cause if not."""
+"""The status of patches: whether their light determines normals, and the cause if not."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -16,26 +16,23 @@ _DOUBT = (
 )
 
 
-def judge_data(
-    shown: Bool[Tensor, " patch"],
+def patch_status(
+    observed: Bool[Tensor, " patch"],
     finite: Bool[Tensor, " patch"],
     seen: Bool[Tensor, "patch view sample"],
     lights: Float[Tensor, "patch view rank"],
     min_views: int,
     min_light_variation: float,
 ) -> Int[Tensor, " patch"]:
-    """Tell which patches can be factorized.
+    """Give each patch's :class:`~pimper_torch.records.PatchStatus` before it is factorized.
 
     Args:
-        shown: Whether a view has a sample there at all.
-        finite: Whether one of them is finite.
-        seen: Samples that are finite, and face the point light.
-        lights: The field's.
+        observed: Whether any view has a valid sample.
+        finite: Whether any of them is finite.
+        seen: Samples that are finite and face the point light.
+        lights: First-order light in each view, from the light field.
         min_views: Views a sample must be lit in.
         min_light_variation: See :func:`light_varies`.
-
-    Returns:
-        A :class:`~pimper_torch.records.PatchStatus` each.
     """
     count = seen.sum(dim=2)
     fraction = count / count.amax(dim=1, keepdim=True).clamp_min(1)
@@ -44,31 +41,31 @@ def judge_data(
     status[~varies] = int(PatchStatus.CONSTANT_LIGHT)
     status[~(seen.sum(dim=1) >= min_views).any(dim=1)] = int(PatchStatus.FEW_VIEWS)
     status[~finite] = int(PatchStatus.NOT_FINITE)
-    status[~shown] = int(PatchStatus.UNSEEN)
+    status[~observed] = int(PatchStatus.UNSEEN)
     return status
 
 
 def light_varies(
     lights: Float[Tensor, "patch view rank"],
     fraction: Float[Tensor, "patch view"],
-    least: float,
+    min_ratio: float,
 ) -> Bool[Tensor, " patch"]:
-    r"""Tell in which patches the light changed enough between the views that see them.
+    r"""Tell in which patches the light changes enough between the views.
 
-    The lights, each scaled to length 1 so that exposure does not count, are weighed by the
-    fraction of the patch that their view sees. A shading vector has three degrees of freedom:
-    the third singular value of the weighted lights, over the first, must reach ``least``.
+    A shading vector has three degrees of freedom: the third singular value of the matrix of
+    lights, over the first, must reach ``min_ratio``. Lights are normalized, so that exposure does
+    not matter, and weighted by the fraction of the patch that their view sees.
     """
     unit = (lights / lights.norm(dim=2, keepdim=True).clamp_min(1e-30)).double()
     moment = unit.mT @ (fraction.double()[..., None] * unit)
     values = torch.linalg.eigvalsh(moment).clamp_min(0)
-    return (values[:, -3] > 0) & (values[:, -3] >= least**2 * values[:, -1])
+    return (values[:, -3] > 0) & (values[:, -3] >= min_ratio**2 * values[:, -1])
 
 
 def warn_of_undetermined(
     buckets: Sequence[Photometry], min_views: int, min_light_variation: float
 ) -> None:
-    """Say once how many patches light could not determine, and why."""
+    """Warn once, with the number of patches whose light does not determine normals, by cause."""
     statuses = Counter(code for bucket in buckets for code in bucket.status.tolist())
     total = sum(statuses.values())
     undetermined = total - statuses[PatchStatus.DETERMINED]
@@ -76,13 +73,13 @@ def warn_of_undetermined(
         return
     causes = {
         PatchStatus.UNSEEN: "{} have no valid sample in any view",
-        PatchStatus.NOT_FINITE: "in {} all that views have is NaN or infinite",
-        PatchStatus.FEW_VIEWS: f"{{}} are nowhere seen lit in {min_views} views",
+        PatchStatus.NOT_FINITE: "in {} all radiance is NaN or infinite",
+        PatchStatus.FEW_VIEWS: f"{{}} have no sample lit in {min_views} views",
         PatchStatus.CONSTANT_LIGHT: (
-            "in {} the light varies too little between the views to tell shape from shading "
+            "in {} the light varies too little between the views to determine normals "
             f"(variation below {min_light_variation})"
         ),
-        PatchStatus.FAILED: "in {} the solver found no finite answer",
+        PatchStatus.FAILED: "in {} the solver found no finite solution",
     }
     parts = [text.format(statuses[code]) for code, text in causes.items() if statuses[code]]
     caution(

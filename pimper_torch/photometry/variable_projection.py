@@ -1,18 +1,18 @@
 r"""Damped variable projection: shading eliminated, Gauss-Newton on the lights.
 
-With :math:`N(L)` the best shading vectors for the lights, :math:`f(L) = \lVert \sqrt W (J - L
-N(L)) \rVert^2` has far fewer unknowns and far fewer bad minima than the joint problem. Its
+With :math:`N(L)` the optimal shading vectors for the lights, :math:`f(L) = \lVert \sqrt W (J - L
+N(L)) \rVert^2` has far fewer unknowns and local minima than the joint problem. Its
 Gauss-Newton matrix, in Ruhe and Wedin's second approximation, is
 
 .. math:: H = \sum_k (n_k n_k^\top) \otimes
           (W_k - W_k L B_k (B_k^\top L^\top W_k L B_k)^{-1} B_k^\top L^\top W_k)
 
 for samples k, with ``B`` the tangents of their manifold: all directions in low-rank
-factorization, three on the photometric cone. What a factorization leaves free (an invertible
-matrix, a Lorentz transformation) is its null space, and left to the damping.
+factorization, three on the photometric cone. The ambiguity of the factorization (an invertible
+matrix, a Lorentz transformation) is its null space, which the damping regularizes.
 
 Source: Ruhe & Wedin, SIAM Review 22(3), 1980; Okatani, Yoshida & Deguchi, ICCV 2011; Hong &
-Fitzgibbon, ICCV 2015. That it runs on the tangents of the cone is ours.
+Fitzgibbon, ICCV 2015. Its use on the tangents of the cone is ours.
 """
 
 from dataclasses import dataclass
@@ -29,10 +29,10 @@ from pimper_torch.photometry.bilinear import (
     curvature_of_views,
     equations_of_samples,
     evaluate,
-    finish,
-    follow,
     keep_scale,
-    reweigh,
+    robust_weights,
+    to_factors,
+    update_shading,
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
 from pimper_torch.photometry.manifolds import Cone
@@ -40,19 +40,19 @@ from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Convergence, Record, StopCause
 
-# The damping starts at this fraction of the mean curvature; it falls and rises by the factors
-# below. Of starts from 1e-4 to 1e-2 and factors from 3 to 10 these led most random starts to the
-# best minimum known (9 of 10 on dino_trimmed; 10 and 1e-3 led 5 there).
-_FIRST_DAMPING = 1e-2
-_LESS, _MORE = 0.2, 5.0
+# Initial damping, as a fraction of the mean curvature, and the factors by which it falls and
+# rises. Of initial values from 1e-4 to 1e-2 and factors from 3 to 10 these led most random starts
+# to the best minimum known (9 of 10 on dino_trimmed; 10 and 1e-3 led 5 there).
+_INITIAL_DAMPING = 1e-2
+_DAMPING_DECREASE, _DAMPING_INCREASE = 0.2, 5.0
 
-# Steps of the samples along their manifold after each step of the lights.
-_FOLLOWING = 2
+# Gauss-Newton steps of the shading vectors after each step of the lights: a choice.
+_SHADING_STEPS = 2
 
-# Residuals of so many roundings of the data are zero.
-_ROUNDINGS = 30.0
+# Residuals below this many roundings of the data count as zero: a choice.
+_ZERO_ROUNDINGS = 30.0
 
-# Products of views, over all samples of a patch, that are held at once.
+# Products of pairs of views, over all samples, that are in memory at once: a choice.
 _GROUP_ENTRIES = 100_000
 
 
@@ -80,23 +80,23 @@ def solve_variable_projection(
     """Factorize a batch of patches by damped variable projection.
 
     Args:
-        problem: With its start. In low-rank factorization only the lights matter, which must
+        problem: With its initial values. Low-rank factorization uses the lights only, which must
             be of full rank.
         max_iterations: Steps at most.
-        tolerance: A step that lowered a patch's objective by less than this fraction is small.
-        small_steps: A patch is done after so many of them in a row: one may be the end of a
-            bend in the valley.
+        tolerance: A step that lowers a patch's objective by less than this fraction is small.
+        small_steps: A patch has converged after so many small steps in a row: one alone may be
+            followed by longer ones.
         curvature_samples: The Gauss-Newton matrix, most of the work, is summed over about so
-            many samples of a patch, and over all if ``None``. It steers the steps only: where
-            they end does not depend on it.
+            many samples of a patch, or over all if ``None``. It changes the steps, but not the
+            minimum.
 
     Returns:
-        A minimum, which may be a bad one: start well, or from several places. Without pull
-        low-rank lights are orthonormal, and others keep their size.
+        A local minimum: initialize well, or restart. Low-rank lights without regularization are
+        orthonormal, and others keep their initial norm.
 
-    Constant to autograd. Patches do not influence one another. First-order light in float32 is
-    solved by a compiled kernel (:mod:`pimper_torch.kernels.factorization`), which gives the same
-    up to rounding; there, samples without weight keep their start.
+    Constant to autograd. Patches are independent. First-order light in float32 is
+    solved by a compiled kernel (:mod:`pimper_torch.kernels.factorization`), with the same result
+    up to rounding; there, samples without weight keep their initial values.
     """
     if _has_kernel(problem):
         return _solve_by_kernel(problem, max_iterations, tolerance, small_steps, curvature_samples)
@@ -107,7 +107,7 @@ def solve_variable_projection(
     with torch.no_grad():
         state = _start(problem, curvature_samples)
         state, taken, cause = iterate(problem, state, advance, max_iterations)
-        return finish(problem, state.lights, state.shading, state.weight, taken, cause)
+        return to_factors(problem, state.lights, state.shading, state.weight, taken, cause)
 
 
 def curvature_of_lights(
@@ -117,26 +117,26 @@ def curvature_of_lights(
     weight: Float[Tensor, "patch view sample"],
     samples: int | None = None,
 ) -> Float[Tensor, "patch unknown unknown"]:
-    """Give the Gauss-Newton matrices ``H``, unknowns view by view, pull included.
+    """Give the Gauss-Newton matrices ``H``, unknowns view by view, regularization included.
 
     Args:
-        problem: Its manifold, pull and prior.
-        lights: At which to linearise.
-        shading: The best for the lights.
+        problem: Gives manifold, regularization and prior.
+        lights: Where to linearize.
+        shading: The minimum for the lights.
         weight: Of each entry.
-        samples: Sum over about so many, evenly chosen, in place of all.
+        samples: Sum over about so many, evenly spaced, in place of all.
     """
     rank = lights.shape[2]
     stride = max(1, shading.shape[2] // samples) if samples else 1
     shading, weight = shading[:, :, ::stride], weight[:, :, ::stride]
-    some = problem.replace(
+    subset = problem.replace(
         radiance=problem.radiance[:, :, ::stride],
         weight=weight,
         shading=shading,
         prior=None if problem.prior is None else problem.prior[:, :, ::stride],
     )
-    own = curvature_of_views(shading, weight)
-    normal = own - _explained(_whitened(some, lights, shading, weight), shading)
+    per_view = curvature_of_views(shading, weight)
+    normal = per_view - _eliminated(_whitened(subset, lights, shading, weight), shading)
     regularization = problem.regularization[..., None].expand(-1, -1, rank).flatten(1)
     return stride * normal + torch.diag_embed(regularization)
 
@@ -148,22 +148,22 @@ def _step(
     small_steps: int,
     curvature_samples: int | None,
 ) -> tuple[_State, Int[Tensor, " patch"]]:
-    moved = state.lights + _move(state)
+    moved = state.lights + _damped_step(state)
     shading = state.shading
     if _is_free(problem):
         moved = torch.linalg.qr(moved).Q
     else:
         moved, shading = keep_scale(problem, state.lights, moved, shading)
     equations = equations_of_samples(problem, moved, state.weight)
-    shading = follow(problem, *equations, shading, _FOLLOWING)
+    shading = update_shading(problem, *equations, shading, _SHADING_STEPS)
     after, slope = evaluate(problem, moved, shading, state.weight)
     better = after < state.cost
     gain = (state.cost - after) / state.cost.clamp_min(torch.finfo(after.dtype).tiny)
     small = torch.where(gain < tolerance, state.small + 1, 0)
     small = torch.where(better, small, state.small)
     limit = torch.finfo(after.dtype).eps
-    damping = state.damping * torch.where(better, _LESS, _MORE).to(after)
-    exact = state.cost <= (_ROUNDINGS * limit) ** 2 * state.energy
+    damping = state.damping * torch.where(better, _DAMPING_DECREASE, _DAMPING_INCREASE).to(after)
+    exact = state.cost <= (_ZERO_ROUNDINGS * limit) ** 2 * state.energy
     stalled = (damping > 1 / limit) & ~exact
     state = state.replace(small=small, damping=damping.clamp_min(limit))
     if bool(better.any()):
@@ -174,7 +174,7 @@ def _step(
             cost=torch.where(better, after, state.cost),
             slope=torch.where(keep, slope, state.slope),
         )
-        state = _reweighed(problem, state)
+        state = _with_robust_weights(problem, state)
         state = state.replace(curvature=_curvature(problem, state, curvature_samples))
     cause = torch.where(stalled, int(StopCause.STALLED), RUNNING)
     return state, torch.where(exact | (small >= small_steps), int(StopCause.CONVERGED), cause)
@@ -182,9 +182,9 @@ def _step(
 
 def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
     lights = torch.linalg.qr(problem.lights).Q if _is_free(problem) else problem.lights
-    weight = reweigh(problem, lights, problem.shading)
+    weight = robust_weights(problem, lights, problem.shading)
     equations = equations_of_samples(problem, lights, weight)
-    shading = follow(problem, *equations, problem.shading, _FOLLOWING)
+    shading = update_shading(problem, *equations, problem.shading, _SHADING_STEPS)
     cost, slope = evaluate(problem, lights, shading, weight)
     seen = (weight * problem.radiance).flatten(1)
     state = _State(
@@ -195,7 +195,7 @@ def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
         cost=cost,
         slope=slope,
         curvature=lights.new_zeros(len(lights), 0, 0),
-        damping=torch.full_like(cost, _FIRST_DAMPING),
+        damping=torch.full_like(cost, _INITIAL_DAMPING),
         small=torch.zeros_like(cost).long(),
     )
     return state.replace(curvature=_curvature(problem, state, curvature_samples))
@@ -207,11 +207,11 @@ def _curvature(
     return curvature_of_lights(problem, state.lights, state.shading, state.weight, samples)
 
 
-def _reweighed(problem: Bilinear, state: _State) -> _State:
-    """Let robust weights follow the residuals, and the objective them."""
+def _with_robust_weights(problem: Bilinear, state: _State) -> _State:
+    """Update the robust weights, and evaluate the objective with them."""
     if isinstance(problem.loss, Squares):
         return state
-    weight = reweigh(problem, state.lights, state.shading)
+    weight = robust_weights(problem, state.lights, state.shading)
     cost, slope = evaluate(problem, state.lights, state.shading, weight)
     return state.replace(weight=weight, cost=cost, slope=slope)
 
@@ -234,14 +234,14 @@ def _whitened(
     return [rows.to(lights) for rows in white]
 
 
-def _explained(
+def _eliminated(
     white: list[Float[Tensor, "patch view sample"]],
     shading: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch unknown unknown"]:
-    """Sum what eliminating each sample takes away: ``(n n^T) (x) (white^T white)``.
+    """Sum the samples' Schur terms ``(n n^T) (x) (white^T white)``.
 
-    The product by views comes first, the small one by ``n n^T`` after it: several times less
-    arithmetic than their Kronecker product would take.
+    Products of views come first, then the matrix product with ``n n^T``: several times less
+    arithmetic than Kronecker products.
     """
     batch, views, samples = white[0].shape
     rank = shading.shape[1]
@@ -258,12 +258,12 @@ def _explained(
         blocks[:, some, view:] = summed.reshape(*shared.shape[:3], -1)
     upper = unpacked(blocks.flatten(1, 2).mT, rank).reshape(batch, views, views, rank, rank)
     upper = upper.transpose(2, 3).reshape(batch, views * rank, views * rank)
-    place = torch.arange(views * rank, device=shading.device) // rank
-    return torch.where(place[:, None] <= place, upper, upper.mT)
+    view_of = torch.arange(views * rank, device=shading.device) // rank
+    return torch.where(view_of[:, None] <= view_of, upper, upper.mT)
 
 
-def _move(state: _State) -> Float[Tensor, "patch view rank"]:
-    """Solve for the damped step."""
+def _damped_step(state: _State) -> Float[Tensor, "patch view rank"]:
+    """Give the damped Gauss-Newton step."""
     normal = state.curvature.double()
     diagonals = normal.diagonal(dim1=1, dim2=2)
     ridge = state.damping[:, None] * diagonals.mean(dim=1, keepdim=True).clamp_min(1e-300)
@@ -273,12 +273,12 @@ def _move(state: _State) -> Float[Tensor, "patch view rank"]:
 
 
 def _is_free(problem: Bilinear) -> bool:
-    """Tell whether lights are free up to any invertible matrix."""
+    """Tell whether the ambiguity is any invertible matrix."""
     return problem.manifold.flat and not bool((problem.regularization > 0).any())
 
 
 def _has_kernel(problem: Bilinear) -> bool:
-    """Tell whether the compiled twin solves such problems: first-order light in float32."""
+    """Tell whether the compiled kernel applies: first-order light in float32."""
     return (
         compiled_for(problem.radiance)
         and problem.radiance.dtype == torch.float32

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.fusion.estimate import _judged
+from pimper_torch.fusion.estimate import _evaluated
 from pimper_torch.fusion.terms import Terms
 from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
@@ -22,9 +22,9 @@ def test_compressed_rows_are_those_of_the_entries(real):
         weights = torch.rand(count, generator=generator, dtype=torch.float64)
         kinds.append((unknowns, coefficients, targets, weights))
         wide = unknowns, coefficients.double(), targets.double(), weights
-        rows, cols, values, told = normal_equations(*wide, size)
+        rows, cols, values, side_part = normal_equations(*wide, size)
         dense = dense.index_put((rows, cols), values, accumulate=True)
-        side = side + told
+        side = side + side_part
     matrix, found = compressed_equations(kinds, damping, start)
     assert_close(torch.from_numpy(matrix.toarray()), dense)
     assert_close(found, side)
@@ -33,7 +33,7 @@ def test_compressed_rows_are_those_of_the_entries(real):
 
 
 @pytest.mark.parametrize("real", [torch.float32, torch.float64])
-def test_evidence_is_judged_as_in_torch(real):
+def test_evidence_is_evaluated_as_in_torch(real):
     generator = torch.Generator().manual_seed(5)
 
     def draw(*shape, dtype=real):
@@ -48,8 +48,8 @@ def test_evidence_is_judged_as_in_torch(real):
     )
     weight = draw(200, dtype=torch.float64)
     heights, probe, answer = (draw(30, dtype=torch.float64) - 0.6 for _ in range(3))
-    square, used = _judged(kind, weight, heights, probe, answer)
+    square, used = _evaluated(kind, weight, heights, probe, answer)
     with using("torch"):
-        expected, told = _judged(kind, weight, heights, probe, answer)
+        expected, degrees = _evaluated(kind, weight, heights, probe, answer)
     assert_close(square, expected.double(), rtol=1e-5, atol=1e-6)
-    assert_close(used, told.double(), rtol=1e-5, atol=1e-6)
+    assert_close(used, degrees.double(), rtol=1e-5, atol=1e-6)

@@ -29,7 +29,7 @@ def noisy(problem, generator, **settings):
     return given.replace(
         radiance=given.weight * (given.radiance + off),
         regularization=torch.full_like(given.regularization, 5.0),
-        prior=0.3 * given.manifold.bend(normals.mT),
+        prior=0.3 * given.manifold.normal_prior(normals.mT),
         loss=Cauchy(),
     ).to(torch.float32)
 

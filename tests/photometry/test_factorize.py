@@ -94,7 +94,7 @@ def test_a_patch_that_few_views_see_is_told_from_one_that_none_sees(scene):
     valid = first.valid.clone()
     valid[1, 3:] = False
     seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
-    with pytest.warns(PimperWarning, match="1 are nowhere seen lit in 4 views"):
+    with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
         found = Factorize()(seen).buckets[0]
     assert found.status.tolist() == [0, PatchStatus.FEW_VIEWS, 0, 0, 0]
     assert (found.lights_patch[1, 3:] == 0).all()

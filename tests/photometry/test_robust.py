@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.robust import spread
+from pimper_torch.photometry.robust import robust_deviation
 
 
 def drawn(generator, *shape):
@@ -11,16 +11,16 @@ def drawn(generator, *shape):
 def test_the_spread_scales_with_the_residuals(generator):
     noise = drawn(generator, 3, 400)
     seen = torch.rand(3, 400, generator=generator) > 0.2
-    once = spread(noise, seen)
-    assert_close(spread(7 * noise, seen), 7 * once)
+    once = robust_deviation(noise, seen)
+    assert_close(robust_deviation(7 * noise, seen), 7 * once)
     # What is not seen does not matter.
-    assert_close(spread(torch.where(seen, noise, 1e6), seen), once)
+    assert_close(robust_deviation(torch.where(seen, noise, 1e6), seen), once)
 
 
 def test_the_spread_solves_its_equation(generator):
     noise = drawn(generator, 2, 300)
     everything = torch.ones_like(noise, dtype=torch.bool)
-    scale = 0.6472404 * spread(noise, everything)[:, None]
+    scale = 0.6472404 * robust_deviation(noise, everything)[:, None]
     fraction = noise**4 / (noise**4 + scale**4)
     assert_close(fraction.mean(dim=1), torch.full((2,), 0.5, dtype=torch.float64))
 
@@ -28,7 +28,7 @@ def test_the_spread_solves_its_equation(generator):
 def test_outliers_up_to_a_half_are_borne(generator):
     noise = drawn(generator, 20_000)
     noise[:8_000] *= 1e8
-    found = spread(noise, torch.ones_like(noise, dtype=torch.bool))
+    found = robust_deviation(noise, torch.ones_like(noise, dtype=torch.bool))
     # 8 in 20 of them lie beyond any scale: the median absolute value gives 2.05.
     assert 1 < found < 3
 
@@ -37,10 +37,10 @@ def test_the_spread_of_exact_data_and_of_nothing_is_zero():
     residual = torch.zeros(2, 9)
     residual[0, :4] = 1
     seen = torch.tensor([[True], [False]]).expand(2, 9)
-    assert_close(spread(residual, seen), torch.zeros(2))
+    assert_close(robust_deviation(residual, seen), torch.zeros(2))
 
 
 def test_the_spread_has_the_gradient_of_its_differences(generator):
     noise = drawn(generator, 2, 30).requires_grad_()
     seen = torch.rand(2, 30, generator=generator) > 0.2
-    assert torch.autograd.gradcheck(lambda residual: spread(residual, seen), noise)
+    assert torch.autograd.gradcheck(lambda residual: robust_deviation(residual, seen), noise)

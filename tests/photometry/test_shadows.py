@@ -151,15 +151,15 @@ def test_sparse_rays_answer_for_their_neighbours_except_near_edges(ball_over_pla
 def test_rays_are_cast_only_where_asked(ball_over_plane, plane):
     points, normals = plane
     field = point_lights([(0, 0, 3.0)])
-    asked = torch.zeros(1, *points.shape[:2], dtype=torch.bool)
-    asked[0, 90:110] = True
+    mask = torch.zeros(1, *points.shape[:2], dtype=torch.bool)
+    mask[0, 90:110] = True
     spacing = torch.tensor([0.02]).double()
     settings = {"tolerance": 1e-4, "stride": 4}
     raster = points[None], normals[None], spacing
-    found = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings, asked=asked)
+    found = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings, mask=mask)
     whole = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings)
-    assert (found.lit == whole.lit)[asked].all()
-    assert not found.lit[asked].all()
+    assert (found.lit == whole.lit)[mask].all()
+    assert not found.lit[mask].all()
     assert found.lit[0, :80].all()
 
 

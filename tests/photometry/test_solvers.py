@@ -6,11 +6,11 @@ from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import (
     equations_of_samples,
     evaluate,
-    follow,
     objective,
+    update_shading,
 )
-from pimper_torch.photometry.certainty import refine_on_manifold
 from pimper_torch.photometry.robust import Cauchy
+from pimper_torch.photometry.sample_estimates import refine_on_manifold
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.single_view.factorization.alternation import solve_alternation
 from pimper_torch.single_view.factorization.ambiguity import align_factorizations
@@ -62,7 +62,7 @@ def test_balm_and_descent_agree_on_clean_data(problem):
     )  # a hold on the gauge, so that factors compare
     _, normals = given.manifold.split(given.shading.mT)
     given = given.replace(
-        regularization=regularization, prior=0.1 * given.manifold.bend(normals.mT)
+        regularization=regularization, prior=0.1 * given.manifold.normal_prior(normals.mT)
     )
     balm, descent = solve_balm(given, 800, 1e-8), solve_descent(given, 800, 1e-8)
     assert_close(balm.shading, descent.shading, rtol=0, atol=2e-4)
@@ -78,19 +78,19 @@ def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
     given = given.replace(
         regularization=torch.full_like(given.regularization, 3.0),
         anchor=given.anchor + 0.1,
-        prior=0.1 * given.manifold.bend(normals.mT),
+        prior=0.1 * given.manifold.normal_prior(normals.mT),
     )
     noise = torch.randn(given.radiance.shape, generator=generator, dtype=torch.float64)
     given = given.replace(radiance=given.radiance + 0.1 * noise)
     lights = given.lights.clone().requires_grad_()
     # The shading is the best for the lights: its own change does not matter to first order.
     equations = equations_of_samples(given, given.lights, given.weight)
-    shading = follow(given, *equations, given.shading, 60)
+    shading = update_shading(given, *equations, given.shading, 60)
     (eliminated,) = torch.autograd.grad(
         objective(
             given,
             lights,
-            follow(given, *equations_of_samples(given, lights, given.weight), shading),
+            update_shading(given, *equations_of_samples(given, lights, given.weight), shading),
             given.weight,
         ).sum(),
         lights,

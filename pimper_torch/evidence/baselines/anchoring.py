@@ -17,7 +17,7 @@ from pimper_torch.evidence.baselines.template import Template
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.geometry.surfaces import side_lengths
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import CoarseMesh
 
 # A point of the cloud further than this from the coarse mesh along z, in the mesh's median
@@ -98,7 +98,7 @@ def bas_relief_through(
     found = design.new_zeros(4)
     for step in range(ITERATIONS):
         residual = target - design @ found
-        scale = CAUCHY_TUNING * spread(residual, known > 0)
+        scale = CAUCHY_TUNING * robust_deviation(residual, known > 0)
         weight = known if step == 0 else known * cauchy_weights(residual, scale)
         normal = (weight[:, None] * design).mT @ design + ridge
         found = torch.linalg.solve(normal, design.mT @ (weight * target))

@@ -33,10 +33,10 @@ from pimper_torch.paper.integrate import integrate_normals
 from pimper_torch.patches.warp import WarpConfig
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Factors
-from pimper_torch.photometry.certainty import refine_on_manifold, start_from_mesh
 from pimper_torch.photometry.cone import split_shading
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.lights import fit_light_field
+from pimper_torch.photometry.sample_estimates import initial_shading, refine_on_manifold
 from pimper_torch.records import CoarseMesh, Convergence, Estimate, Record, SparseScene
 from pimper_torch.records.patches import confidence_of
 from pimper_torch.single_view.factorization.ambiguity import align_factorizations
@@ -324,7 +324,7 @@ def _best_shading(matrix: Matrix, lights: Float[Tensor, "view 4"]) -> Float[Tens
     parts = []
     for part in chunks(matrix.seen.shape[1]):
         some = matrix.columns(part)
-        shading = start_from_mesh(
+        shading = initial_shading(
             some.radiance[None], some.seen[None], lights[None], harmonics(some.normals).mT[None]
         )
         parts.append(shading[0])

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pimper_torch.evidence.baselines.one_matrix import chunks
 from pimper_torch.photometry.quadratics import diagonal, outer, solve_packed
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
 
 # Filling in the missing entries comes near; the alternation after it is exact.
@@ -177,7 +177,7 @@ def _descended(
     for round_ in range(iterations):
         residual, slope = _residual(matrix, b, fraction, step, known)
         if round_ % 5 == 0:
-            scale = CAUCHY_TUNING * spread(residual, known)
+            scale = CAUCHY_TUNING * robust_deviation(residual, known)
         weight = known * cauchy_weights(residual, scale)
         normal = (weight[:, None] * slope).mT @ slope
         ridge = damping * normal.diagonal().clamp_min(1e-12 * normal.diagonal().max() + 1e-30)

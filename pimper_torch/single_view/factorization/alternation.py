@@ -11,16 +11,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.photometry.bilinear import (
-    REWEIGH_EVERY,
+    REWEIGHT_EVERY,
     Bilinear,
     Factors,
     equations_of_samples,
     equations_of_views,
-    finish,
-    follow,
     keep_scale,
     objective,
-    reweigh,
+    robust_weights,
+    to_factors,
+    update_shading,
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
 from pimper_torch.photometry.quadratics import solve_packed
@@ -51,19 +51,19 @@ def solve_alternation(problem: Bilinear, max_iterations: int, tolerance: float) 
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
         weight, cost = state.weight, state.cost
-        if step % REWEIGH_EVERY == 0 and step and not isinstance(work.loss, Squares):
-            weight = reweigh(work, state.lights, state.shading)
+        if step % REWEIGHT_EVERY == 0 and step and not isinstance(work.loss, Squares):
+            weight = robust_weights(work, state.lights, state.shading)
             cost = objective(work, state.lights, state.shading, weight)
         lights = solve_packed(*equations_of_views(work, state.shading, weight)).mT
         lights, shading = keep_scale(work, state.lights, lights, state.shading)
-        shading = follow(work, *equations_of_samples(work, lights, weight), shading)
+        shading = update_shading(work, *equations_of_samples(work, lights, weight), shading)
         after = objective(work, lights, shading, weight)
-        done = (cost - after <= tolerance * cost) & (step >= REWEIGH_EVERY)
+        done = (cost - after <= tolerance * cost) & (step >= REWEIGHT_EVERY)
         cause = torch.where(done, int(StopCause.CONVERGED), RUNNING)
         return _State(lights=lights, shading=shading, weight=weight, cost=after), cause
 
     with torch.no_grad():
-        weight = reweigh(problem, problem.lights, problem.shading)
+        weight = robust_weights(problem, problem.lights, problem.shading)
         start = _State(
             lights=problem.lights,
             shading=problem.shading,
@@ -71,4 +71,4 @@ def solve_alternation(problem: Bilinear, max_iterations: int, tolerance: float) 
             cost=objective(problem, problem.lights, problem.shading, weight),
         )
         state, taken, cause = iterate(problem, start, advance, max_iterations)
-        return finish(problem, state.lights, state.shading, state.weight, taken, cause)
+        return to_factors(problem, state.lights, state.shading, state.weight, taken, cause)

@@ -14,14 +14,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.photometry.bilinear import (
-    REWEIGH_EVERY,
+    REWEIGHT_EVERY,
     Bilinear,
     Factors,
     equations_of_samples,
     equations_of_views,
-    finish,
     objective,
-    reweigh,
+    robust_weights,
+    to_factors,
 )
 from pimper_torch.photometry.iteration import RUNNING, iterate
 from pimper_torch.photometry.quadratics import (
@@ -68,8 +68,8 @@ def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> F
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
         state, better = _step(work, state)
-        if not isinstance(work.loss, Squares) and step % REWEIGH_EVERY == REWEIGH_EVERY - 1:
-            weight = reweigh(work, state.lights, state.shading)
+        if not isinstance(work.loss, Squares) and step % REWEIGHT_EVERY == REWEIGHT_EVERY - 1:
+            weight = robust_weights(work, state.lights, state.shading)
             cost = objective(work, state.lights, state.shading, weight)
             state = state.replace(weight=weight, cost=cost)
         size = state.shading.norm(dim=(1, 2)).clamp_min(torch.finfo(weight_type).tiny ** 0.5)
@@ -81,7 +81,7 @@ def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> F
 
     lights, shading = problem.lights.detach(), problem.shading.detach()
     weight_type = lights.dtype
-    weight = reweigh(problem, lights, shading)
+    weight = robust_weights(problem, lights, shading)
     one = torch.ones_like(weight[:, 0, 0])
     start = _State(
         lights=lights,
@@ -94,7 +94,7 @@ def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> F
         stride=one / 2,
     )
     state, taken, cause = iterate(problem, start, advance, max_iterations)
-    return finish(problem, state.lights, state.shading, state.weight, taken, cause)
+    return to_factors(problem, state.lights, state.shading, state.weight, taken, cause)
 
 
 def _step(problem: Bilinear, state: _State) -> tuple[_State, Tensor]:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.robust import cauchy_weights, spread
+from pimper_torch.photometry.robust import cauchy_weights, robust_deviation
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import Response
 from pimper_torch.records import Record
@@ -142,6 +142,6 @@ def freedom(used: Bool[Tensor, "view sample"], rank: int) -> int:
 def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
     """Give the robust standard deviation of the residuals, for the freedom that is left."""
     residual = (problem.encoded - fit.predicted)[problem.used]
-    size = float(spread(residual, torch.ones_like(residual, dtype=torch.bool)))
+    size = float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
     free = max(freedom(problem.used, problem.rank), 1)
     return size * (int(problem.used.sum()) / free) ** 0.5

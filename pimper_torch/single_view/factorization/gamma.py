@@ -21,7 +21,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.robust import spread
+from pimper_torch.photometry.robust import robust_deviation
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Srgb
 from pimper_torch.records import PatchViews, Record, Views
 from pimper_torch.single_view.factorization.encoded import (
@@ -300,7 +300,7 @@ def _chosen_by_fit(
     if int(used.any(dim=0).sum()) <= 4 * problem.rank:
         used = problem.used
     residual = (encoded - predicted)[used]
-    scale = _CAUCHY * float(spread(residual, torch.ones_like(residual, dtype=torch.bool)))
+    scale = _CAUCHY * float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
     return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.cone import split_shading, tangents
-from pimper_torch.photometry.manifolds import Cone, bending
+from pimper_torch.photometry.manifolds import Cone, tangent_curvature
 from pimper_torch.photometry.quadratics import outer
 
 # Newton's iteration for the nearest second-order vector doubles its digits each step.
@@ -80,7 +80,9 @@ class Free:
         self._only_three()
         return albedo[..., None] * normals
 
-    def bend(self, normals: Float[Tensor, "*batch 3 sample"]) -> Float[Tensor, "*batch 6 sample"]:
+    def normal_prior(
+        self, normals: Float[Tensor, "*batch 3 sample"]
+    ) -> Float[Tensor, "*batch 6 sample"]:
         r"""Give the quadratic form :math:`\lVert b - (b \cdot \bar n) \bar n \rVert^2`, packed."""
         self._only_three()
         one, zero = torch.ones_like(normals[..., 0, :]), torch.zeros_like(normals[..., 0, :])
@@ -171,11 +173,11 @@ class SecondOrder:
             (a, b): (g[..., 4:] * _differential(rotations[a], rotations[b])).sum(dim=-1)
             for a, b in ((0, 0), (0, 1), (1, 1))
         }
-        flat = bending(-outward, mixed[0], mixed[1], twice[0, 1], albedo)
+        flat = tangent_curvature(-outward, mixed[0], mixed[1], twice[0, 1], albedo)
         safe = torch.where(albedo > 0, albedo, 1)
-        bend = torch.zeros_like(flat)
-        bend[..., 1, 1], bend[..., 2, 2] = twice[0, 0] / safe, twice[1, 1] / safe
-        return flat + bend
+        normal_prior = torch.zeros_like(flat)
+        normal_prior[..., 1, 1], normal_prior[..., 2, 2] = twice[0, 0] / safe, twice[1, 1] / safe
+        return flat + normal_prior
 
     def split(
         self, shading: Float[Tensor, "*batch 9"]
@@ -189,9 +191,11 @@ class SecondOrder:
         """Give the vectors of albedo and normal."""
         return albedo[..., None] * second_order(normals)
 
-    def bend(self, normals: Float[Tensor, "*batch 3 sample"]) -> Float[Tensor, "*batch 45 sample"]:
+    def normal_prior(
+        self, normals: Float[Tensor, "*batch 3 sample"]
+    ) -> Float[Tensor, "*batch 45 sample"]:
         r"""Give the quadratic form :math:`\lVert b - \rho \bar n \rVert^2`, packed."""
-        small = Cone().bend(normals)
+        small = Cone().normal_prior(normals)
         wide = small.new_zeros(*small.shape[:-2], 45, small.shape[-1])
         # Row i of the packed triangle of nine begins after 9 + 8 + ...; of four, 4 + 3 + ...
         nine, four = (0, 9, 17, 24), (0, 4, 7, 9)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.single_view.photometric_stereo.factors import (
@@ -105,7 +105,7 @@ def resolve_by_colour_profiles(
             found = _resolved(relief.on_shading(b / log_ratio.exp()), joined).after(relief)
             log_albedo = _log_albedo(b, found)
         off = _residual(b / log_ratio.exp(), joined, found)
-        left = float(spread(off, torch.ones_like(joined, dtype=torch.bool)))
+        left = float(robust_deviation(off, torch.ones_like(joined, dtype=torch.bool)))
         if left > _UNEVEN:
             warnings.warn(
                 f"within groups of one colour albedo still varies by {100 * left:.0f} %; the "
@@ -244,7 +244,7 @@ def _descended(
     everywhere = torch.ones_like(labels, dtype=torch.bool)
     for _ in range(_STEPS):
         residual = _residual(b, labels, relief)
-        scale = CAUCHY_TUNING * spread(residual, everywhere)
+        scale = CAUCHY_TUNING * robust_deviation(residual, everywhere)
         weight = cauchy_weights(residual, scale)
         slope = _slope(b, labels, relief, weight)
         normal = (weight[:, None] * slope).mT @ slope

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.quadratics import diagonal, outer
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median_spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.relief import convex
 
@@ -176,7 +176,7 @@ def _form(
                 )
             entries = torch.linalg.lstsq((root * monomials).mT, root[:, None]).solution[:, 0]
             residual = entries @ monomials - 1
-            scale = CAUCHY_TUNING * median_spread(residual, given > 0)
+            scale = CAUCHY_TUNING * median_deviation(residual, given > 0)
             heavy = given * cauchy_weights(residual, scale)
         rows, columns = torch.triu_indices(3, 3)
         form = vectors.new_zeros(3, 3, dtype=torch.float64)
@@ -216,7 +216,7 @@ def _fitted(
         eye = torch.eye(4).to(begin)
         for _ in range(_STEPS):
             residual = 1 - values
-            scale = CAUCHY_TUNING * median_spread(residual, (given > 0).expand_as(residual))
+            scale = CAUCHY_TUNING * median_deviation(residual, (given > 0).expand_as(residual))
             scale = scale.clamp_min(1e-6)[:, None]
             heavy = given * cauchy_weights(residual, scale)
             normal = slopes.mT @ (heavy[..., None] * slopes)
@@ -231,7 +231,7 @@ def _fitted(
             slopes = torch.where(better[:, None, None], steeper, slopes)
             damping = (damping * torch.where(better, 0.2, 5.0)).clamp(1e-12, 1e12)
         # One scale for all, or each start would be judged by its own.
-        scale = CAUCHY_TUNING * median_spread(1 - values, (given > 0).expand_as(values)).amin()
+        scale = CAUCHY_TUNING * median_deviation(1 - values, (given > 0).expand_as(values)).amin()
         return at[int(_loss(1 - values, given, scale.clamp_min(1e-6)).argmin())]
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
 
 # Differences are taken over cells of 1/64 of the object's size, and equations averaged over blocks
@@ -239,7 +239,7 @@ def reweighed(equations: Curls, solution: Float[Tensor, " both"]) -> Float[Tenso
     """Give equations the weights that their sums deserve under a solution."""
     both = torch.cat([equations.across, equations.down], dim=1)
     residual = both @ solution
-    scale = CAUCHY_TUNING * spread(residual, equations.weight > 0)
+    scale = CAUCHY_TUNING * robust_deviation(residual, equations.weight > 0)
     return equations.weight * cauchy_weights(residual, scale)
 
 

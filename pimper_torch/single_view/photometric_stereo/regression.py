@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.photometry.quadratics import PackedCholesky, diagonal, outer
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
 
 # Of the rounds of re-weighting: the scale starts this many times too wide and narrows to its own
@@ -114,7 +114,7 @@ def reweigh(
     residual = torch.where(lit, radiance - predicted, radiance)
     seen = (weight > 0) & lit
     level = radiance[seen].abs().mean() if seen.any() else radiance.new_ones(())
-    scale = CAUCHY_TUNING * spread(residual.flatten(), seen.flatten())
+    scale = CAUCHY_TUNING * robust_deviation(residual.flatten(), seen.flatten())
     return weight * cauchy_weights(residual, widen * scale.maximum(_MIN_SCALE * level)), lit
 
 

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.bilinear import equations_of_samples, follow
+from pimper_torch.photometry.bilinear import equations_of_samples, update_shading
 from pimper_torch.photometry.variable_projection import (
     curvature_of_lights,
     solve_variable_projection,
@@ -22,7 +22,7 @@ def factorize(matrix, weight, start):
 
 def best_right(problem):
     equations = equations_of_samples(problem, problem.lights, problem.weight)
-    return follow(problem, *equations, problem.shading)
+    return update_shading(problem, *equations, problem.shading)
 
 
 @pytest.fixture

@@ -81,7 +81,7 @@ def test_tangents_are_derivatives_of_albedo_and_of_turns_of_the_normal(manifold,
 def test_what_bends_away_from_a_normal_costs_its_square(manifold, generator):
     vectors, albedo, normals = some(manifold, 20, generator)
     other = normalize(draw(generator, 20, 3), dim=-1)
-    form = manifold.bend(other.mT)
+    form = manifold.normal_prior(other.mT)
     cost = (vectors.mT * apply_packed(form, vectors.mT)).sum(dim=0)
     if manifold.rank == 3:
         across = torch.linalg.cross(normals, other).square().sum(dim=1)

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.photometry.bilinear import Factors, equations_of_samples, follow
-from pimper_torch.photometry.certainty import fit_albedo, refine_on_manifold
+from pimper_torch.photometry.bilinear import Factors, equations_of_samples, update_shading
+from pimper_torch.photometry.sample_estimates import fit_albedo, refine_on_manifold
 from pimper_torch.records import Convergence
 
 
@@ -12,7 +12,7 @@ def solved_under(problem, lights):
     patches = torch.zeros(len(lights))
     return Factors(
         lights=lights,
-        shading=follow(problem, *equations, problem.shading, steps=4),
+        shading=update_shading(problem, *equations, problem.shading, steps=4),
         weight=problem.weight,
         convergence=Convergence(
             iterations=patches.long(), residual=patches.double(), cause=patches.long()

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.photometry.bilinear import Bilinear
-from pimper_torch.photometry.implicit import differentiable
+from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
@@ -34,7 +34,7 @@ def noisy(generator):
             anchor=lights + 0.05 * draw(*lights.shape),
             shading=shading,
             regularization=torch.full((patches, views), 2.0, dtype=torch.float64),
-            prior=0.5 * manifold.bend(normals.mT),
+            prior=0.5 * manifold.normal_prior(normals.mT),
             manifold=manifold,
             loss=loss or Squares(),
         )

@@ -1,4 +1,4 @@
-"""Sample by sample: albedo under given normals, the minimum on the manifold, and its variance."""
+"""Albedo, normal and variance of each sample, lights given."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from pimper_torch.photometry.bilinear import (
     Factors,
     curvature_along,
     equations_of_samples,
-    step_along,
+    tangent_step,
 )
 from pimper_torch.photometry.quadratics import apply_packed, solve_packed
 from pimper_torch.records import Record
 
-# A sample's own residuals are few; the patch's variance joins as if it were so many views. A
-# choice: with it the mean claimed variance is right to 2 % (`test_certainty.py`).
+# Weight, in views, of the patch's residual variance in that of a sample, whose own residuals are
+# few. A choice: with it the mean estimated variance is right to 2 % (`test_sample_estimates.py`).
 BORROWED_VIEWS = 4.0
 
 # Standard error of a normal without residuals, radians: the rounding of single precision.
@@ -25,14 +25,13 @@ _ROUNDING = 1e-7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Certain(Record):
-    """Samples at the minimum.
+class SampleEstimates(Record):
+    """Each sample's estimates.
 
     Attributes:
         albedo: Gray.
         normals: Unit.
-        information: Inverse variance of the normals, one over squared radians; 0 where the
-            equations do not determine them.
+        information: Inverse variance of the normals, 1 / rad^2; 0 where they are not determined.
     """
 
     albedo: Float[Tensor, "patch sample"]
@@ -40,13 +39,13 @@ class Certain(Record):
     information: Float[Tensor, "patch sample"]
 
 
-def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
-    r"""Take each sample's Newton step along the manifold, with lights and weights given.
+def refine_on_manifold(problem: Bilinear, factors: Factors) -> SampleEstimates:
+    r"""Take a last Gauss-Newton step of each sample, and give its normal's inverse variance.
 
     With ``A`` and ``b`` the sample's normal equations and ``B`` the manifold's tangents,
     :math:`\delta = (B^\top A B)^{-1} B^\top (b - A n)`. At a converged solution the step is
-    next to nothing, and so is its derivative if the factors carry gradients by the implicit
-    function (:mod:`~pimper_torch.photometry.implicit`).
+    close to zero, and so is its derivative if the factors carry gradients by the implicit
+    function (:mod:`~pimper_torch.photometry.factor_gradients`).
 
     The same matrix gives the variance of the normal, the mean square of its angular error:
     :math:`\sigma^2 = s^2 (C_{11} + C_{22}) / \rho^2` with ``C`` the inverse of
@@ -55,11 +54,11 @@ def refine_on_manifold(problem: Bilinear, factors: Factors) -> Certain:
     """
     A, b = equations_of_samples(problem, factors.lights, factors.weight)
     slope = b - apply_packed(A, factors.shading)
-    moved = step_along(problem.manifold, A, slope, factors.shading)
+    moved = tangent_step(problem.manifold, A, slope, factors.shading)
     albedo, normals = problem.manifold.split(moved.mT)
     curvature = curvature_along(problem.manifold.tangents(factors.shading), A)
     information = _information(problem, factors, curvature)
-    return Certain(albedo=albedo, normals=normals, information=information)
+    return SampleEstimates(albedo=albedo, normals=normals, information=information)
 
 
 def fit_albedo(
@@ -68,7 +67,7 @@ def fit_albedo(
     lights: Float[Tensor, "patch view rank"],
     basis: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch channel sample"]:
-    """Give every channel's albedo in closed form, lights and normals given.
+    """Give every channel's least-squares albedo, lights and normals given.
 
     Args:
         radiance: Linear.
@@ -76,23 +75,23 @@ def fit_albedo(
         lights: The same for all channels.
         basis: Harmonics of the normals.
 
-    Not negative; zero where nothing is lit. Differentiable.
+    Not negative; zero where no view is lit. Differentiable.
     """
     shading = lights @ basis
-    lit = weight * shading
-    square = (lit * shading).sum(dim=1)[:, None]
-    product = torch.einsum("pfk,pfck->pck", lit, radiance)
+    weighted = weight * shading
+    square = (weighted * shading).sum(dim=1)[:, None]
+    product = torch.einsum("pfk,pfck->pck", weighted, radiance)
     some = square > torch.finfo(square.dtype).tiny ** 0.5
     return torch.where(some, product / torch.where(some, square, 1), 0).clamp_min(0)
 
 
-def start_from_mesh(
+def initial_shading(
     radiance: Float[Tensor, "patch view sample"],
     seen: Bool[Tensor, "patch view sample"],
     lights: Float[Tensor, "patch view rank"],
     basis: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch rank sample"]:
-    """Give shading vectors along a basis, that of the mesh's normals, with the best albedo."""
+    """Give shading vectors in the directions of ``basis``, with the least-squares albedo."""
     weight = seen.to(radiance.dtype)
     return fit_albedo(radiance[:, :, None], weight, lights, basis) * basis
 
@@ -109,12 +108,15 @@ def _information(
     variance = (square + BORROWED_VIEWS * pooled[:, None]) / (
         (count - 3).clamp_min(0) + BORROWED_VIEWS
     )
-    spread = torch.zeros_like(square)
+    robust_deviation = torch.zeros_like(square)
     for angle in (1, 2):
         unit = torch.zeros_like(factors.shading[:, :3])
         unit[:, angle] = 1
-        spread = spread + solve_packed(curvature, unit)[:, angle]
+        robust_deviation = robust_deviation + solve_packed(curvature, unit)[:, angle]
     albedo, _ = problem.manifold.split(factors.shading.mT)
-    determined = (albedo > 0) & (spread > 0) & variance.isfinite()
-    error = torch.where(determined, variance * spread, 1) / torch.where(determined, albedo, 1) ** 2
+    determined = (albedo > 0) & (robust_deviation > 0) & variance.isfinite()
+    error = (
+        torch.where(determined, variance * robust_deviation, 1)
+        / torch.where(determined, albedo, 1) ** 2
+    )
     return torch.where(determined, 1 / error.clamp_min(_ROUNDING**2), 0)

@@ -1,4 +1,4 @@
-"""What the views show of some samples, and what a model of it leaves over."""
+"""Radiance of samples in all views, and residuals of a model under Cauchy's loss."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, spread
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shown:
-    """What the views show of the samples.
+class ImageSamples:
+    """Radiance of samples in all views.
 
     Attributes:
         radiance: Gray, linear; zero where not seen.
@@ -30,18 +30,18 @@ class Shown:
     def residual(
         self, albedo: Float[Tensor, " sample"], shading: Float[Tensor, "sample view"]
     ) -> Float[Tensor, "sample view"]:
-        """Give what albedo under this shading leaves to explain."""
+        """Give the residuals of a model of albedo and shading; zero where not seen."""
         return torch.where(self.seen, self.radiance - albedo[:, None] * shading, 0)
 
     def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
         """Give the scale of Cauchy's loss for each view."""
         least = 1e-4 * self.level
-        return CAUCHY_TUNING * spread(residual.mT, self.seen.mT).maximum(least)
+        return CAUCHY_TUNING * robust_deviation(residual.mT, self.seen.mT).maximum(least)
 
     def weights(
         self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]
     ) -> Float[Tensor, "sample view"]:
-        """Weigh what is seen by Cauchy's function."""
+        """Give Cauchy's weights; zero where not seen."""
         return self.seen * cauchy_weights(residual, scale)
 
     def cost(self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]) -> float:
@@ -50,7 +50,7 @@ class Shown:
         return float((self.seen * scale**2 * torch.log1p(relative**2)).sum())
 
     def brightness(self) -> tuple[Float[Tensor, " view"], Float[Tensor, " sample"]]:
-        """Give robust brightnesses of views, and of samples relative to their views."""
+        """Give median radiance of each view, and of each sample relative to its views."""
         missing = torch.where(self.seen, self.radiance, torch.nan)
         gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
         known = self.seen & (gain > 0)
@@ -61,7 +61,7 @@ class Shown:
     def albedo_under(
         self, shading: Float[Tensor, "sample view"], weight: Float[Tensor, "sample view"]
     ) -> Float[Tensor, " sample"]:
-        """Give the albedo that suits shading best in weighted least squares; NaN if none does."""
+        """Give the weighted least-squares albedo under a shading; NaN without weight."""
         square = (weight * shading**2).sum(dim=1)
         product = (weight * shading * self.radiance).sum(dim=1)
         return torch.where(square > 0, product / torch.where(square > 0, square, 1), torch.nan)
