@@ -71,26 +71,26 @@ def smooth_ones(
 
 
 @compiled(f"void({_MATRIX}, float64[::1], float64[::1], float64[::1], float64[::1], {_ROWS})")
-def ties(
+def couplings(
     starts: Array,
     columns: Array,
     entries: Array,
-    units: Array,
+    scale: Array,
     largest: Array,
-    tied: Array,
+    coupled: Array,
     excess: Array,
     first: int,
     last: int,
 ) -> None:
     """Write each row's largest coupling, the sum of couplings over the diagonal, and the row sum.
 
-    A coupling is the negative of a negative entry off the diagonal, the matrix scaled by units.
+    Couplings are the negated negative entries off the diagonal of the scaled matrix.
     """
     for row in range(first, last):
         most, total, center, row_sum = 0.0, 0.0, 0.0, 0.0
         for index in range(starts[row], starts[row + 1]):
             column = columns[index]
-            entry = units[row] * entries[index] * units[column]
+            entry = scale[row] * entries[index] * scale[column]
             row_sum += entry
             if column == row:
                 center += entry
@@ -98,7 +98,7 @@ def ties(
                 total -= entry
                 most = max(most, -entry)
         largest[row] = most
-        tied[row] = total / center
+        coupled[row] = total / center
         excess[row] = row_sum
 
 
@@ -106,15 +106,15 @@ def ties(
     f"void({_MATRIX}, float64[::1], float64[::1], float64[::1], float64, float64, boolean[::1], "
     f"{_ROWS})"
 )
-def strong_ties(
+def strong_connections(
     starts: Array,
     columns: Array,
     entries: Array,
-    units: Array,
+    scale: Array,
     largest: Array,
-    tied: Array,
+    coupled: Array,
     min_strength: float,
-    min_tied: float,
+    min_coupled: float,
     strong: Array,
     first: int,
     last: int,
@@ -125,11 +125,11 @@ def strong_ties(
         starts: Of the rows.
         columns: Of the entries.
         entries: Of the matrix.
-        units: Scale of each unknown.
+        scale: Of each unknown.
         largest: Coupling of each row.
-        tied: Sum of each row's couplings over its diagonal.
+        coupled: Sum of each row's couplings over its diagonal.
         min_strength: Of an entry over the largest coupling of both rows.
-        min_tied: Of an unknown; below it, smoothing alone solves for it.
+        min_coupled: Of an unknown; below it, smoothing alone solves for it.
         strong: Written.
         first: Row.
         last: Row after those.
@@ -137,12 +137,12 @@ def strong_ties(
     for row in range(first, last):
         for index in range(starts[row], starts[row + 1]):
             column = columns[index]
-            coupling = -units[row] * entries[index] * units[column]
+            coupling = -scale[row] * entries[index] * scale[column]
             strong[index] = (
                 coupling > 0
                 and column != row
-                and tied[row] > min_tied
-                and tied[column] > min_tied
+                and coupled[row] > min_coupled
+                and coupled[column] > min_coupled
                 and coupling >= min_strength * max(largest[row], largest[column])
             )
 
@@ -172,11 +172,11 @@ def roots(starts: Array, columns: Array, strong: Array, order: Array, label: Arr
 
 
 @compiled(f"void({_MATRIX}, float64[::1], boolean[::1], int32[::1], int32[::1], {_ROWS})")
-def joined(
+def assigned(
     starts: Array,
     columns: Array,
     entries: Array,
-    units: Array,
+    scale: Array,
     strong: Array,
     label: Array,
     found: Array,
@@ -192,7 +192,7 @@ def joined(
         for index in range(starts[row], starts[row + 1]):
             column = columns[index]
             if strong[index] and label[column] >= 0:
-                coupling = -units[row] * entries[index] * units[column]
+                coupling = -scale[row] * entries[index] * scale[column]
                 if coupling >= most:
                     most = coupling
                     found[row] = label[column]
@@ -202,14 +202,14 @@ def joined(
     f"boolean({_MATRIX}, float64[::1], float64[::1], float64[::1], float64, int32[::1], "
     f"int32[::1], {_ROWS})"
 )
-def followed(
+def assigned_by_coupling(
     starts: Array,
     columns: Array,
     entries: Array,
-    units: Array,
+    scale: Array,
     largest: Array,
-    tied: Array,
-    min_tied: float,
+    coupled: Array,
+    min_coupled: float,
     label: Array,
     found: Array,
     first: int,
@@ -222,12 +222,12 @@ def followed(
     changed = False
     for row in range(first, last):
         found[row] = label[row]
-        if label[row] >= 0 or tied[row] <= min_tied or largest[row] <= 0:
+        if label[row] >= 0 or coupled[row] <= min_coupled or largest[row] <= 0:
             continue
         strongest = -1
         for index in range(starts[row], starts[row + 1]):
             column = columns[index]
-            if column != row and -units[row] * entries[index] * units[column] == largest[row]:
+            if column != row and -scale[row] * entries[index] * scale[column] == largest[row]:
                 strongest = column
         if strongest >= 0 and label[strongest] >= 0:
             found[row] = label[strongest]
@@ -239,11 +239,11 @@ def followed(
     f"{_FOUND}({_MATRIX}, float64[::1], float64[::1], float64[::1], int32[::1], float64, float64, "
     f"{_ROWS})"
 )
-def spread(
+def prolongation(
     starts: Array,
     columns: Array,
     entries: Array,
-    units: Array,
+    scale: Array,
     largest: Array,
     excess: Array,
     label: Array,
@@ -252,7 +252,7 @@ def spread(
     first: int,
     last: int,
 ) -> tuple[Array, Array, Array]:
-    """Give rows of the prolongation: aggregates, smoothed by one averaging step, in units.
+    """Give rows of the prolongation: aggregates, smoothed by one averaging step.
 
     Returns:
         Entries per row, their columns, and the entries.
@@ -271,7 +271,7 @@ def spread(
             column = columns[index]
             if column == row:
                 continue
-            coupling = -units[row] * entries[index] * units[column]
+            coupling = -scale[row] * entries[index] * scale[column]
             if not (coupling > 0 and coupling > min_strength * largest[row]):
                 continue
             total += coupling
@@ -286,9 +286,9 @@ def spread(
             values[slot] += coupling
         fraction = damping / total if total > 0 else 0.0
         for slot in range(begin, count):
-            values[slot] *= fraction * units[row]
+            values[slot] *= fraction * scale[row]
         if label[row] >= 0:
-            values[begin] += (1 - damping) * units[row]
+            values[begin] += (1 - damping) * scale[row]
         counts[row - first] = count - begin
     return counts, aggregates[:count].copy(), values[:count].copy()
 
@@ -298,12 +298,12 @@ def coarser(
     starts: Array,
     columns: Array,
     entries: Array,
-    spread_starts: Array,
-    spread_columns: Array,
-    spread_entries: Array,
-    gather_starts: Array,
-    gather_columns: Array,
-    gather_entries: Array,
+    prolong_starts: Array,
+    prolong_columns: Array,
+    prolong_entries: Array,
+    restrict_starts: Array,
+    restrict_columns: Array,
+    restrict_entries: Array,
     first: int,
     last: int,
 ) -> tuple[Array, Array, Array]:
@@ -313,16 +313,16 @@ def coarser(
         starts: Of the rows of A.
         columns: Of its entries.
         entries: Of A.
-        spread_starts: Of P.
-        spread_columns: Of P.
-        spread_entries: Of P.
-        gather_starts: Of P^T.
-        gather_columns: Of P^T.
-        gather_entries: Of P^T.
+        prolong_starts: Of P.
+        prolong_columns: Of P.
+        prolong_entries: Of P.
+        restrict_starts: Of P^T.
+        restrict_columns: Of P^T.
+        restrict_entries: Of P^T.
         first: Row.
         last: Row after those.
     """
-    size = len(gather_starts) - 1
+    size = len(restrict_starts) - 1
     counts = np.empty(last - first, np.int32)
     marker, touched, sums = np.full(size, -1, np.int32), np.empty(size, np.int32), np.empty(size)
     capacity = 16 * (last - first)
@@ -330,17 +330,17 @@ def coarser(
     filled = 0
     for row in range(first, last):
         count = 0
-        for i in range(gather_starts[row], gather_starts[row + 1]):
-            fine, weight = np.uint32(gather_columns[i]), gather_entries[i]
+        for i in range(restrict_starts[row], restrict_starts[row + 1]):
+            fine, weight = np.uint32(restrict_columns[i]), restrict_entries[i]
             for j in range(starts[fine], starts[fine + 1]):
                 neighbour, coupling = np.uint32(columns[j]), weight * entries[j]
-                for k in range(spread_starts[neighbour], spread_starts[neighbour + 1]):
-                    aggregate = np.uint32(spread_columns[k])
+                for k in range(prolong_starts[neighbour], prolong_starts[neighbour + 1]):
+                    aggregate = np.uint32(prolong_columns[k])
                     if marker[aggregate] == row:
-                        sums[aggregate] += coupling * spread_entries[k]
+                        sums[aggregate] += coupling * prolong_entries[k]
                     else:
                         marker[aggregate] = row
-                        sums[aggregate] = coupling * spread_entries[k]
+                        sums[aggregate] = coupling * prolong_entries[k]
                         touched[count] = aggregate
                         count += 1
         if filled + count > capacity:

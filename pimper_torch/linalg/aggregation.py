@@ -1,26 +1,23 @@
-r"""Coarser unknowns for a sparse symmetric matrix, from nothing but its entries.
+r"""Prolongation of algebraic multigrid by smoothed aggregation.
 
-A level of algebraic multigrid by smoothed aggregation: unknowns that strong entries tie
-together become one coarse unknown, and one averaging step spreads it over its neighbours.
-What makes it hold where entries jump by ten orders is the reading of *strong*:
+Strongly connected unknowns are aggregated to one coarse unknown, and one averaging step smooths
+the piecewise constant prolongation. Two rules make it robust where entries vary by ten orders:
 
-- Two unknowns may *found* an aggregate together only if their entry is large beside the
-  largest of both rows. A light unknown between two heavy ones must not tie them together.
-- An unknown without such an entry *follows* the one it is tied to most. Left out instead, it
-  would stay behind when its heavy neighbour moves, and pollute the coarse energy.
+- Two unknowns may root an aggregate together only if their entry is large relative to the
+  largest of both rows. A light unknown between two heavy ones must not connect them.
+- An unknown without such an entry is assigned to the aggregate of its largest coupling. Left out
+  instead, it would stay behind when its heavy neighbour moves, and add to the coarse energy.
 
-What moves together need not move equally far: heights along two directions, one of them nearly
-in the surface, differ by a factor. So unknowns are measured in units of a vector that the matrix
-hardly sees (ones, smoothed), in which what coarse unknowns spread is constant.
+The near-kernel need not be constant: heights along two directions, one of them nearly in the
+surface, differ by a factor. So unknowns are scaled by a near-kernel vector (ones, smoothed).
 
 On a raster with equal weights the aggregates are patches of about 3 x 3 pixels; along a
 strip between two cuts they are pieces of the strip; a hole has none.
 
 Source: Vanek, Mandel & Brezina, Computing 56, 1996, for smoothed aggregation; Bell, Dalton &
-Olson, SIAM J. Sci. Comput. 34(4), 2012, for founding aggregates in parallel; Brezina, Falgout,
-MacLachlan, Manteuffel, McCormick & Ruge, SIAM J. Sci. Comput. 25(6), 2004, for smoothing what
-is to be spread. The following of light unknowns is ours, measured in
-``benchmarks/linear_systems.py``.
+Olson, SIAM J. Sci. Comput. 34(4), 2012, for parallel aggregation; Brezina, Falgout, MacLachlan,
+Manteuffel, McCormick & Ruge, SIAM J. Sci. Comput. 25(6), 2004, for the adaptive near-kernel. The
+assignment of light unknowns is ours, measured in ``benchmarks/linear_systems.py``.
 """
 
 import numpy as np
@@ -34,41 +31,40 @@ from pimper_torch.parallel import over_rows
 # iterations on weights that vary over 0 to 10 orders, where 0.1 takes up to 1.6 times as many.
 _STRONG = 0.25
 
-# An unknown whose neighbours make up less than this fraction of its diagonal is determined by its
-# own anchor: smoothing alone solves for it.
-_TIED = 0.05
+# An unknown whose couplings add up to less than this fraction of its diagonal is determined by its
+# own anchor: smoothing alone solves for it. A choice.
+_COUPLED = 0.05
 
-# Smoothing steps by which ones become the vector that the matrix hardly sees. The fusion of
-# potatoes took 25 cycles without, 18 with two, 17 with five and with more.
-_UNIT_STEPS = 5
+# Smoothing steps from ones to the near-kernel vector. The fusion of potatoes took 25 cycles
+# without, 18 with two, 17 with five and with more.
+_KERNEL_STEPS = 5
 
-# Where an anchor or a fold would have that vector vanish it keeps this much.
-_MIN_UNIT = 0.1
+# Lower bound of that vector, which an anchor or a fold would make vanish: a choice.
+_MIN_KERNEL = 0.1
 
 # Of the averaging step that smooths the aggregates' edges; 2/3 damps the highest frequencies
 # of an M-matrix best.
 _DAMPING = 2 / 3
 
-# Unknowns that are asked in any order among themselves, and after all before them: they and what
-# they are tied to fit the cache.
-_NEAR = 4096
+# Roots are chosen in blocks of so many unknowns, in random order within each: a choice, a block
+# and its neighbours fit the cache.
+_BLOCK = 4096
 
 
 def prolongation(matrix: csr_array) -> csr_array:
-    """Give the map from coarse unknowns to those of ``matrix``.
+    """Give the prolongation from coarse unknowns to those of ``matrix``.
 
     Args:
         matrix: Symmetric, its diagonal positive; best with few positive entries off it.
 
     Returns:
-        One column a coarse unknown, not negative. Rows of unknowns that no entry ties to others
-        are empty, the others add up to their unit where no anchor (excess of the diagonal)
-        holds them.
+        One column per coarse unknown, not negative. Rows of isolated unknowns are empty; the
+        others add up to the near-kernel vector where there is no anchor (excess of the diagonal).
     """
     if compiled_for():
         return _compiled(matrix)
-    units = diags_array(_units(matrix))
-    found: csr_array = (units @ _averaged((units @ matrix @ units).tocsr())).tocsr()
+    scale = diags_array(_near_kernel(matrix))
+    found: csr_array = (scale @ _averaged((scale @ matrix @ scale).tocsr())).tocsr()
     return found
 
 
@@ -88,58 +84,62 @@ def dominant_diagonal(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
 
 
 def _compiled(matrix: csr_array) -> csr_array:
-    """Give the same map by compiled kernels."""
+    """Give the prolongation by compiled kernels."""
     from pimper_torch.kernels import aggregation as kernels
 
     parts, size = parts_of(matrix), matrix.shape[0]
-    dominant, units = dominant_diagonal(matrix), np.ones(size)
+    dominant, scale = dominant_diagonal(matrix), np.ones(size)
     smoother = np.empty(size)
-    for _ in range(_UNIT_STEPS):
-        over_rows(kernels.smooth_ones, size, *parts, dominant, units, smoother, _DAMPING)
-        units, smoother = smoother, units
-    units = np.maximum(np.abs(units, out=units), _MIN_UNIT, out=units)
-    largest, tied, excess = dominant, smoother, np.empty(size)  # memory that is free
-    over_rows(kernels.ties, size, *parts, units, largest, tied, excess)
+    for _ in range(_KERNEL_STEPS):
+        over_rows(kernels.smooth_ones, size, *parts, dominant, scale, smoother, _DAMPING)
+        scale, smoother = smoother, scale
+    scale = np.maximum(np.abs(scale, out=scale), _MIN_KERNEL, out=scale)
+    largest, coupled, excess = dominant, smoother, np.empty(size)  # reused memory
+    over_rows(kernels.couplings, size, *parts, scale, largest, coupled, excess)
     strong, label = np.empty(len(parts[1]), np.bool_), np.empty(size, np.int32)
-    tying = units, largest, tied
-    over_rows(kernels.strong_ties, size, *parts, *tying, _STRONG, _TIED, strong)
+    connections = scale, largest, coupled
+    over_rows(kernels.strong_connections, size, *parts, *connections, _STRONG, _COUPLED, strong)
     count = kernels.roots(*parts[:2], strong, _order(size), label)
     other = np.empty_like(label)
     for _ in range(2):
-        over_rows(kernels.joined, size, *parts, units, strong, label, other)
+        over_rows(kernels.assigned, size, *parts, scale, strong, label, other)
         label, other = other, label
-    while any(over_rows(kernels.followed, size, *parts, *tying, _TIED, label, other)):
+    while any(
+        over_rows(kernels.assigned_by_coupling, size, *parts, *connections, _COUPLED, label, other)
+    ):
         label, other = other, label
     found = over_rows(
-        kernels.spread, size, *parts, units, largest, excess, label, _STRONG, _DAMPING
+        kernels.prolongation, size, *parts, scale, largest, excess, label, _STRONG, _DAMPING
     )
-    return _joined(found, count)
+    return _concatenated(found, count)
 
 
-def coarser(matrix: csr_array, spread: csr_array, gather: csr_array) -> csr_array:
-    """Give the matrix of the coarse unknowns.
+def coarser(matrix: csr_array, prolong: csr_array, restrict: csr_array) -> csr_array:
+    """Give the Galerkin matrix of the coarse unknowns.
 
     Args:
         matrix: Of the fine ones.
-        spread: As :func:`prolongation` gives it.
-        gather: Its transpose.
+        prolong: From :func:`prolongation`.
+        restrict: Its transpose.
     """
     if compiled_for():
         from pimper_torch.kernels import aggregation as kernels
 
-        parts = [part for each in (matrix, spread, gather) for part in parts_of(each)]
-        return _joined(over_rows(kernels.coarser, gather.shape[0], *parts), gather.shape[0])
-    found: csr_array = gather @ (matrix @ spread)
+        parts = [part for each in (matrix, prolong, restrict) for part in parts_of(each)]
+        return _concatenated(
+            over_rows(kernels.coarser, restrict.shape[0], *parts), restrict.shape[0]
+        )
+    found: csr_array = restrict @ (matrix @ prolong)
     return found
 
 
 def parts_of(matrix: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give a matrix as kernels take it: where rows start, columns and entries."""
+    """Give the arrays of a compressed matrix: starts of rows, columns and entries."""
     return matrix.indptr, matrix.indices, matrix.data
 
 
-def _joined(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int) -> csr_array:
-    """Make one matrix of some rows after others: how many entries they have, columns, entries."""
+def _concatenated(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int) -> csr_array:
+    """Concatenate blocks of rows, each as counts of entries, columns and entries, to a matrix."""
     counts, columns, entries = (np.concatenate(parts) for parts in zip(*found, strict=True))
     starts = np.zeros(len(counts) + 1, np.int32)
     np.cumsum(counts, out=starts[1:])
@@ -147,90 +147,92 @@ def _joined(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int) 
 
 
 def _order(size: int) -> Int[np.ndarray, " unknown"]:
-    """Give the order in which unknowns are asked to be roots: any, but near ones together."""
-    within = np.random.default_rng(0).permutation(min(size, _NEAR))
-    order = (np.arange(0, size, _NEAR)[:, None] + within).ravel() if size else within
+    """Give the order in which roots are chosen: random within blocks."""
+    within = np.random.default_rng(0).permutation(min(size, _BLOCK))
+    order = (np.arange(0, size, _BLOCK)[:, None] + within).ravel() if size else within
     return order[order < size]
 
 
-def _units(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
-    """Smooth ones until the matrix hardly sees them."""
+def _near_kernel(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
+    """Give the near-kernel vector: ones, smoothed."""
     found, diagonal = np.ones(matrix.shape[0]), dominant_diagonal(matrix)
-    for _ in range(_UNIT_STEPS):
+    for _ in range(_KERNEL_STEPS):
         found = found - _DAMPING * (matrix @ found) / diagonal
-    return np.maximum(np.abs(found), _MIN_UNIT)
+    return np.maximum(np.abs(found), _MIN_KERNEL)
 
 
 def _averaged(matrix: csr_array) -> csr_array:
-    """Give the map from coarse unknowns to those of a matrix that hardly sees constants."""
+    """Give the prolongation for a matrix whose near-kernel is constant."""
     size = matrix.shape[0]
     rows = np.repeat(np.arange(size, dtype=matrix.indices.dtype), np.diff(matrix.indptr))
-    ties = np.where(rows == matrix.indices, 0, np.maximum(-matrix.data, 0))
-    largest = _over_rows(matrix.indptr, ties, np.maximum)
-    tied = _over_rows(matrix.indptr, ties, np.add) > _TIED * matrix.diagonal()
+    couplings = np.where(rows == matrix.indices, 0, np.maximum(-matrix.data, 0))
+    largest = _over_rows(matrix.indptr, couplings, np.maximum)
+    coupled = _over_rows(matrix.indptr, couplings, np.add) > _COUPLED * matrix.diagonal()
 
-    label = _aggregates(matrix, rows, ties, largest, tied)
+    label = _aggregates(matrix, rows, couplings, largest, coupled)
     member = label >= 0
     aggregate = csr_array(
         (np.ones(int(member.sum())), (np.flatnonzero(member), label[member])),
         shape=(size, int(label.max(initial=-1)) + 1),
     )
-    kept = ties > np.maximum(_STRONG * largest[rows], 0)
-    near = _selected(matrix, rows, kept, ties)
-    total = near.sum(axis=1) + np.maximum(matrix.sum(axis=1), 0)
+    kept = couplings > np.maximum(_STRONG * largest[rows], 0)
+    neighbourhood = _selected(matrix, rows, kept, couplings)
+    total = neighbourhood.sum(axis=1) + np.maximum(matrix.sum(axis=1), 0)
     fraction = np.divide(_DAMPING, total, out=np.zeros(size), where=total > 0)
-    near.data *= np.repeat(fraction, np.diff(near.indptr))
-    smoothed: csr_array = (near @ aggregate) + (1 - _DAMPING) * aggregate
+    neighbourhood.data *= np.repeat(fraction, np.diff(neighbourhood.indptr))
+    smoothed: csr_array = (neighbourhood @ aggregate) + (1 - _DAMPING) * aggregate
     return smoothed.tocsr()
 
 
 def _aggregates(
     matrix: csr_array,
     rows: Int[np.ndarray, " entry"],
-    ties: Float[np.ndarray, " entry"],
+    couplings: Float[np.ndarray, " entry"],
     largest: Float[np.ndarray, " unknown"],
-    tied: Bool[np.ndarray, " unknown"],
+    coupled: Bool[np.ndarray, " unknown"],
 ) -> Int[np.ndarray, " unknown"]:
-    """Label the unknowns by aggregate; -1 for those that need none."""
+    """Label the unknowns by aggregate; -1 for those without."""
     cols = matrix.indices
-    strong = (ties > 0) & (ties >= _STRONG * np.maximum(largest[rows], largest[cols]))
-    strong &= tied[rows] & tied[cols]
-    graph = _selected(matrix, rows, strong, ties)
-    label = _founded(graph)
-    leader = np.full(len(tied), -1)
-    at_most = (ties > 0) & (ties == largest[rows])
-    leader[rows[at_most]] = cols[at_most]
-    # Ties grow along leaders by 1 / _STRONG a step at least, so that chains are short.
-    late = np.flatnonzero((label < 0) & tied & (leader >= 0))
-    while len(late):
-        label[late] = label[leader[late]]
-        remaining = late[label[late] < 0]
-        if len(remaining) == len(late):
+    strong = (couplings > 0) & (couplings >= _STRONG * np.maximum(largest[rows], largest[cols]))
+    strong &= coupled[rows] & coupled[cols]
+    graph = _selected(matrix, rows, strong, couplings)
+    label = _aggregated(graph)
+    leader = np.full(len(coupled), -1)
+    strongest = (couplings > 0) & (couplings == largest[rows])
+    leader[rows[strongest]] = cols[strongest]
+    # Couplings grow along leaders by 1 / _STRONG a step at least, so that chains are short.
+    unassigned = np.flatnonzero((label < 0) & coupled & (leader >= 0))
+    while len(unassigned):
+        label[unassigned] = label[leader[unassigned]]
+        remaining = unassigned[label[unassigned] < 0]
+        if len(remaining) == len(unassigned):
             break
-        late = remaining
+        unassigned = remaining
     return label
 
 
-def _founded(graph: csr_array) -> Int[np.ndarray, " unknown"]:
-    """Label what lies within two steps of roots that are more than two steps apart."""
+def _aggregated(graph: csr_array) -> Int[np.ndarray, " unknown"]:
+    """Label unknowns within two steps of roots, which are more than two steps apart."""
     size = graph.shape[0]
     rank = np.empty(size, dtype=int)
     rank[_order(size)] = np.arange(size)[::-1]
     root = np.zeros(size, dtype=bool)
-    open_ = np.diff(graph.indptr) > 0
-    while open_.any():
-        key = np.where(root, size + rank, np.where(open_, rank, -1))
-        near = np.maximum(key, _over_rows(graph.indptr, key[graph.indices], np.maximum))
-        near = np.maximum(near, _over_rows(graph.indptr, near[graph.indices], np.maximum))
-        root |= open_ & (near == key)
-        open_ &= ~root & (near < size)
+    free = np.diff(graph.indptr) > 0
+    while free.any():
+        key = np.where(root, size + rank, np.where(free, rank, -1))
+        neighbourhood = np.maximum(key, _over_rows(graph.indptr, key[graph.indices], np.maximum))
+        neighbourhood = np.maximum(
+            neighbourhood, _over_rows(graph.indptr, neighbourhood[graph.indices], np.maximum)
+        )
+        root |= free & (neighbourhood == key)
+        free &= ~root & (neighbourhood < size)
     label = np.full(size, -1)
     label[root] = np.arange(int(root.sum()))
     rows = np.repeat(np.arange(size, dtype=graph.indices.dtype), np.diff(graph.indptr))
     for _ in range(2):
-        regularization = np.where(label[graph.indices] >= 0, graph.data, 0)
-        most = _over_rows(graph.indptr, regularization, np.maximum)
-        joins = (regularization > 0) & (regularization == most[rows]) & (label[rows] < 0)
+        coupling = np.where(label[graph.indices] >= 0, graph.data, 0)
+        most = _over_rows(graph.indptr, coupling, np.maximum)
+        joins = (coupling > 0) & (coupling == most[rows]) & (label[rows] < 0)
         label[rows[joins]] = label[graph.indices[joins]]
     return label
 

@@ -30,16 +30,15 @@ def conjugate_gradients(
         precondition: Approximates the inverse of A, symmetric and positive definite too.
         rhs: ``b``.
         start: Where to begin; zero if not given.
-        dims: Over which the unknowns of one system run; each place along the others is a
-            system of its own.
-        tolerance: Of the error's energy norm, as ``precondition`` estimates it, next to that
-            of the solution. Scaling A, or any unknown's unit, changes nothing.
-        max_iterations: Limit. All systems go on until the last has converged, or none goes down.
+        dims: Of the unknowns of one system; the others are those of the batch.
+        tolerance: Of the error's energy norm, as ``precondition`` estimates it, relative to that
+            of the solution. Invariant to the scale of A and of any unknown.
+        max_iterations: Limit. All systems iterate until the last has converged, or none descends.
 
     Returns:
-        The solutions, products taken on the way, and whether all systems converged.
+        The solutions, the number of iterations, and whether all systems converged.
 
-    Constant to autograd; see :mod:`~pimper_torch.linalg.adjoint` for gradients of a solution.
+    Constant to autograd; see :mod:`~pimper_torch.linalg.prepared` for gradients of a solution.
 
     Source: Hestenes & Stiefel, Journal of Research of the NBS 49(6), 1952.
     """
@@ -49,12 +48,12 @@ def conjugate_gradients(
 
     found = torch.zeros_like(rhs) if start is None else start.clone()
     residual = rhs.clone() if start is None else rhs - product(found)
-    better = precondition(residual)
-    decrease = inner(residual, better)
+    preconditioned = precondition(residual)
+    decrease = inner(residual, preconditioned)
     size = decrease if start is None else inner(rhs, precondition(rhs))
     goal = tolerance**2 * size
-    direction, steps = better.clone(), 0
-    # Written so that what is not a number stops the loop and has not converged.
+    direction, steps = preconditioned.clone(), 0
+    # Written so that NaN stops the loop, and has not converged.
     while bool((decrease > goal).any()) and steps < max_iterations:
         image = product(direction)
         curvature = inner(direction, image)
@@ -64,10 +63,10 @@ def conjugate_gradients(
         length = torch.where(descends, decrease / curvature, 0)
         found.addcmul_(length, direction)
         residual.addcmul_(length, image, value=-1)
-        better = precondition(residual)
-        previous, decrease = decrease, inner(residual, better)
+        preconditioned = precondition(residual)
+        previous, decrease = decrease, inner(residual, preconditioned)
         growth = torch.where(previous > 0, decrease / previous, 0)
-        direction.mul_(growth).add_(better)
+        direction.mul_(growth).add_(preconditioned)
         steps += 1
     return found, steps, bool((decrease.abs() <= goal).all())
 
@@ -83,16 +82,16 @@ def compressed_gradients(
     max_iterations: int,
     dtype: torch.dtype = torch.float64,
 ) -> tuple[Float[Tensor, "unknown side"], int, bool]:
-    """Do what :func:`conjugate_gradients` does for a matrix in compressed rows, by kernels.
+    """Solve as :func:`conjugate_gradients`, for a matrix in compressed rows, by kernels.
 
     Args:
         matrix: Float64, on the CPU.
-        precondition: Approximates the inverse in ``dtype``; it may return the same memory again.
+        precondition: Approximates the inverse in ``dtype``; it may reuse the memory of its result.
         rhs: Float64, one column a right-hand side.
         start: Where to begin; zero if not given.
         tolerance: As there.
         max_iterations: As there.
-        dtype: Of what ``precondition`` takes and gives.
+        dtype: Of the vectors of ``precondition``.
     """
     from pimper_torch.kernels import conjugate_gradients as kernels
     from pimper_torch.kernels import sparse
@@ -115,13 +114,13 @@ def compressed_gradients(
         found.copy_(start)
         product(found, rhs, residual, 1.0, -1.0)
     rounded = residual.to(dtype, copy=True)
-    better = precondition(rounded)
-    decrease = inner(residual, better)
-    direction, image = better.to(torch.float64, copy=True), torch.empty_like(rhs)
+    preconditioned = precondition(rounded)
+    decrease = inner(residual, preconditioned)
+    direction, image = preconditioned.to(torch.float64, copy=True), torch.empty_like(rhs)
     size = decrease if start is None else inner(rhs, precondition(rounded.copy_(rhs)))
     goal = tolerance**2 * size
     steps = 0
-    # Written so that what is not a number stops the loop and has not converged.
+    # Written so that NaN stops the loop, and has not converged.
     while bool((decrease > goal).any()) and steps < max_iterations:
         product(direction, image, image, 0.0, 1.0)
         curvature = inner(direction, image)
@@ -130,10 +129,12 @@ def compressed_gradients(
             break
         length = torch.where(descends, decrease / curvature, 0).numpy()
         vectors = (as_array(each) for each in (found, residual, direction, image))
-        over_rows(kernels.moved, count, *vectors, length, rounded.numpy())
-        better = precondition(rounded)
-        previous, decrease = decrease, inner(residual, better)
+        over_rows(kernels.step, count, *vectors, length, rounded.numpy())
+        preconditioned = precondition(rounded)
+        previous, decrease = decrease, inner(residual, preconditioned)
         growth = torch.where(previous > 0, decrease / previous, 0).numpy()
-        over_rows(kernels.rotated, count, as_array(direction), as_array(better), growth)
+        over_rows(
+            kernels.new_direction, count, as_array(direction), as_array(preconditioned), growth
+        )
         steps += 1
     return found, steps, bool((decrease.abs() <= goal).all())

@@ -1,4 +1,4 @@
-"""Least squares of any sparse equations, such as those that join overlapping rasters."""
+"""Normal equations of sparse least squares."""
 
 from collections.abc import Sequence
 
@@ -26,16 +26,16 @@ def normal_equations(
     r"""Give :math:`J^T W J` and :math:`J^T W t` of equations :math:`\sum_k c_k x_{u_k} = t`.
 
     Args:
-        unknowns: Which unknowns each equation ties together.
-        coefficients: Of these. Fill up shorter equations with 0 of any unknown.
+        unknowns: Indices of each equation's unknowns.
+        coefficients: Of these. Pad shorter equations with 0 of any unknown.
         targets: Right-hand side of each equation.
         weights: Of each equation, not negative.
         size: Number of unknowns.
 
     Returns:
-        Rows, columns and values of the matrix, entries named twice add up, and the
-        right-hand side. Entries of several sets of equations are joined by concatenating
-        them, right-hand sides by adding. Differentiable in all that is not an index.
+        Rows, columns and values of the matrix, duplicate entries adding up, and the
+        right-hand side. Sets of equations are combined by concatenating entries and adding
+        right-hand sides. Differentiable in all but the indices.
     """
     scaled = weights[:, None] * coefficients
     blocks = scaled[:, :, None] * coefficients[:, None, :]
@@ -54,15 +54,15 @@ Terms = tuple[Int[Tensor, "_ _"], Float[Tensor, "_ _"], Float[Tensor, " _"], Flo
 def compressed_equations(
     kinds: Sequence[Terms], damping: Float[Tensor, " unknown"], start: Float[Tensor, " unknown"]
 ) -> tuple[csr_array, Float[Tensor, " unknown"]]:
-    """Give the same for several sets of equations by compiled kernels, in float64 on the CPU.
+    """Give the normal equations of several sets by compiled kernels, in float64 on the CPU.
 
-    Nothing but the matrix itself takes memory.
+    They take no memory beyond that of the matrix.
 
     Args:
         kinds: Unknowns, coefficients, targets and weights of each set, as in
             :func:`normal_equations`.
-        damping: Weight with which every unknown is held to its start; above 0.
-        start: That.
+        damping: Weight of each unknown's prior; above 0.
+        start: Mean of the prior.
 
     Returns:
         The matrix, columns in order, and the right-hand side. A constant to autograd.

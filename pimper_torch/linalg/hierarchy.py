@@ -1,11 +1,10 @@
-"""One cycle of multigrid: an approximate inverse in time proportional to the unknowns.
+"""The multigrid hierarchy of a matrix, and its V-cycle as a preconditioner.
 
-Coarse unknowns and matrices are found on the CPU, once; cycles run in torch on the device of the
-system, or in compiled kernels on the CPU. Without these, products on the CPU go through scipy all
-the same: torch's own compressed rows take up to 4 times as long there for less than a million
-unknowns.
+Levels are built on the CPU, once; cycles run in torch on the device of the system, or in compiled
+kernels on the CPU. Without kernels, products on the CPU are scipy's: torch's compressed rows take
+up to 4 times as long there for less than a million unknowns.
 
-Vectors have one row an unknown, and may have one column a right-hand side.
+Vectors have one row per unknown, and may have one column per right-hand side.
 """
 
 import warnings
@@ -29,30 +28,30 @@ from pimper_torch.parallel import over_rows
 
 Product = Callable[[Tensor], Tensor]
 
-# So few unknowns are solved for by a dense inverse.
+# Up to so many unknowns, the coarsest level is solved by a dense inverse: a choice.
 _DENSE = 400
 
-# Coarsening that leaves more than this fraction of the unknowns is not worth its cycle.
-_WORTHWHILE = 0.8
+# Coarsening stops where it leaves more than this fraction of the unknowns: a choice.
+_MAX_COARSE_FRACTION = 0.8
 
-# Smoothing leaves alone what Chebyshev's polynomial expects of the coarse unknowns: the part
-# of the spectrum, [0, 2], below 2 / _SPAN.
+# Chebyshev's polynomial smooths the part of the spectrum, [0, 2], above 2 / _SPAN: a choice; the
+# part below is left to the coarse unknowns.
 _SPAN = 4
 
 # Two steps of the three-term recurrence of Chebyshev's polynomials on that part: the first goes
-# by D^-1 residual / _CENTER, the second by _OF_STEP of that and _OF_REST of what is left.
+# by D^-1 residual / _CENTER, the second by _OF_STEP of that and _OF_CORRECTION of D^-1 residual.
 _CENTER, _RADIUS = 1 + 1 / _SPAN, 1 - 1 / _SPAN
 _GAIN = 1 / (2 * _CENTER / _RADIUS - _RADIUS / _CENTER)
-_OF_STEP, _OF_REST = 1 + _GAIN * _RADIUS / _CENTER, 2 * _GAIN / _RADIUS
+_OF_STEP, _OF_CORRECTION = 1 + _GAIN * _RADIUS / _CENTER, 2 * _GAIN / _RADIUS
 
 
 class Level:
-    """A matrix, how to smooth it and how to reach the next one.
+    """A level: its matrix, smoother, prolongation and restriction.
 
     Args:
         product: Of the matrix.
         inverse_diagonal: Of its dominant diagonal.
-        prolong: From the next level's unknowns to those of this; nothing on the last one.
+        prolong: From the next level's unknowns to this one's; ``None`` on the last.
         restrict: The transpose.
     """
 
@@ -72,24 +71,24 @@ class Level:
         start: Float[Tensor, "unknown ..."] | None = None,
     ) -> Float[Tensor, "unknown ..."]:
         """Take two Chebyshev steps of Jacobi's iteration towards A x = residual."""
-        left = residual if start is None else residual - self.product(start)
-        step = self._scaled(left).div_(_CENTER)
-        rest = self._scaled(left - self.product(step))
-        if start is None:  # the step itself is where to begin
-            return torch.mul(step, _OF_STEP).add_(rest, alpha=_OF_REST)
-        return torch.add(start, step, alpha=_OF_STEP).add_(rest, alpha=_OF_REST)
+        remaining = residual if start is None else residual - self.product(start)
+        step = self._scaled(remaining).div_(_CENTER)
+        correction = self._scaled(remaining - self.product(step))
+        if start is None:  # the start is zero
+            return torch.mul(step, _OF_STEP).add_(correction, alpha=_OF_CORRECTION)
+        return torch.add(start, step, alpha=_OF_STEP).add_(correction, alpha=_OF_CORRECTION)
 
     def coarse_residual(
         self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
     ) -> Float[Tensor, "coarse ..."]:
-        """Give what is left of a residual, to the next level."""
+        """Give the restricted residual of a solution."""
         assert self.restrict is not None
         return self.restrict(residual - self.product(found))
 
     def add_coarse(
         self, found: Float[Tensor, "unknown ..."], coarse: Float[Tensor, "coarse ..."]
     ) -> None:
-        """Add the next level's answer."""
+        """Add the prolonged correction of the next level."""
         assert self.prolong is not None
         found += self.prolong(coarse)
 
@@ -98,34 +97,40 @@ class Level:
 
 
 class CompiledLevel(Level):
-    """A level whose matrices the kernels read: once for all right-hand sides, on all threads.
+    """A level by compiled kernels: all right-hand sides at once, on all threads.
 
-    Its vectors are made once, so that what it gives lasts until the next cycle.
+    Its vectors are allocated once: results are valid until the next cycle.
 
     Args:
         matrix: Of this level.
-        inverse_diagonal: Of its dominant diagonal, in the type of everything here.
-        spread: From the next level's unknowns to those of this; nothing on the last one.
-        gather: The transpose.
+        inverse_diagonal: Of its dominant diagonal, in the dtype of the level.
+        prolong_matrix: From the next level's unknowns to this one's; ``None`` on the last.
+        restrict_matrix: The transpose.
     """
 
     def __init__(
         self,
         matrix: csr_array,
         inverse_diagonal: Float[Tensor, " unknown"],
-        spread: csr_array | None,
-        gather: csr_array | None,
+        prolong_matrix: csr_array | None,
+        restrict_matrix: csr_array | None,
     ) -> None:
         def product(matrix: csr_array | None) -> Product | None:
             return None if matrix is None else lambda vectors: with_product(matrix, vectors)
 
         real = inverse_diagonal.numpy().dtype
         self._matrix = matrix.astype(real, copy=False)
-        self._spread = None if spread is None else spread.astype(real, copy=False)
-        self._gather = None if gather is None else gather.astype(real, copy=False)
+        self._prolong_matrix = (
+            None if prolong_matrix is None else prolong_matrix.astype(real, copy=False)
+        )
+        self._restrict_matrix = (
+            None if restrict_matrix is None else restrict_matrix.astype(real, copy=False)
+        )
         own = product(self._matrix)
         assert own is not None
-        super().__init__(own, inverse_diagonal, product(self._spread), product(self._gather))
+        super().__init__(
+            own, inverse_diagonal, product(self._prolong_matrix), product(self._restrict_matrix)
+        )
         self._vectors: dict[str, Tensor] = {}
 
     def smoothed(
@@ -133,41 +138,43 @@ class CompiledLevel(Level):
         residual: Float[Tensor, "unknown ..."],
         start: Float[Tensor, "unknown ..."] | None = None,
     ) -> Float[Tensor, "unknown ..."]:
-        """Do the same in three passes."""
+        """Smooth in three passes; see :meth:`Level.smoothed`."""
         from pimper_torch.kernels import sparse
 
-        left, size = residual, len(residual)
-        step, found = (self._room(name, residual) for name in ("step", "found"))
+        remaining, size = residual, len(residual)
+        step, found = (self._buffer(name, residual) for name in ("step", "found"))
         if start is not None:
-            left = self._room("left", residual)
-            with_product(self._matrix, start, residual, keep=1.0, gain=-1.0, found=left)
+            remaining = self._buffer("left", residual)
+            with_product(self._matrix, start, residual, keep=1.0, gain=-1.0, found=remaining)
         diagonal = self.inverse_diagonal.numpy()
-        over_rows(sparse.scaled, size, diagonal, _columns(left), _columns(step), 1 / _CENTER)
-        vectors = [_columns(each) for each in (left, step, step if start is None else start, found)]
+        over_rows(sparse.scaled, size, diagonal, _columns(remaining), _columns(step), 1 / _CENTER)
+        vectors = [
+            _columns(each) for each in (remaining, step, step if start is None else start, found)
+        ]
         of_step = _OF_STEP - 1 if start is None else _OF_STEP
         parts = parts_of(self._matrix)
-        over_rows(sparse.corrected, size, *parts, diagonal, *vectors, of_step, _OF_REST)
+        over_rows(sparse.corrected, size, *parts, diagonal, *vectors, of_step, _OF_CORRECTION)
         return found
 
     def coarse_residual(
         self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
     ) -> Float[Tensor, "coarse ..."]:
-        """Do the same without new vectors."""
-        assert self._gather is not None
-        left = self._room("left", residual)
-        with_product(self._matrix, found, residual, keep=1.0, gain=-1.0, found=left)
-        coarse = self._room("coarse", residual, self._gather.shape[0])
-        return with_product(self._gather, left, found=coarse)
+        """Give the restricted residual without new vectors."""
+        assert self._restrict_matrix is not None
+        remaining = self._buffer("left", residual)
+        with_product(self._matrix, found, residual, keep=1.0, gain=-1.0, found=remaining)
+        coarse = self._buffer("coarse", residual, self._restrict_matrix.shape[0])
+        return with_product(self._restrict_matrix, remaining, found=coarse)
 
     def add_coarse(
         self, found: Float[Tensor, "unknown ..."], coarse: Float[Tensor, "coarse ..."]
     ) -> None:
-        """Do the same in one pass."""
-        assert self._spread is not None
-        with_product(self._spread, coarse, found, keep=1.0, found=found)
+        """Add the prolonged correction in one pass."""
+        assert self._prolong_matrix is not None
+        with_product(self._prolong_matrix, coarse, found, keep=1.0, found=found)
 
-    def _room(self, name: str, like: Tensor, size: int | None = None) -> Tensor:
-        """Give the vectors of a name: those of the last cycle, if they had as many columns."""
+    def _buffer(self, name: str, like: Tensor, size: int | None = None) -> Tensor:
+        """Give a named buffer, kept from cycle to cycle while its shape is the same."""
         shape = (len(like) if size is None else size, *like.shape[1:])
         if name not in self._vectors or self._vectors[name].shape != shape:
             self._vectors[name] = like.new_empty(shape)
@@ -180,8 +187,8 @@ class Hierarchy:
     Args:
         matrix: In float64; both triangles.
         device: Where cycles run.
-        product: Of the matrix, if there is a quicker way than its compressed rows.
-        dtype: That compiled cycles compute in: float32 takes half the memory, and as many cycles.
+        product: Of the matrix, if there is a faster one than by compressed rows.
+        dtype: Of compiled cycles: float32 takes half the memory, and as many cycles.
 
     The cycle is symmetric and positive definite, as conjugate gradients need it: two
     Chebyshev-Jacobi steps before and after every coarser level.
@@ -196,21 +203,26 @@ class Hierarchy:
     ) -> None:
         self._levels: list[Level] = []
         while True:
-            spread = prolongation(matrix) if matrix.shape[0] > _DENSE else None
-            if spread is not None and not 0 < spread.shape[1] < _WORTHWHILE * matrix.shape[0]:
-                spread = None
-            gather = None if spread is None else spread.T.tocsr()
-            self._levels.append(_level(matrix, spread, gather, device, product, dtype))
+            prolong_matrix = prolongation(matrix) if matrix.shape[0] > _DENSE else None
+            if (
+                prolong_matrix is not None
+                and not 0 < prolong_matrix.shape[1] < _MAX_COARSE_FRACTION * matrix.shape[0]
+            ):
+                prolong_matrix = None
+            restrict_matrix = None if prolong_matrix is None else prolong_matrix.T.tocsr()
+            self._levels.append(
+                _level(matrix, prolong_matrix, restrict_matrix, device, product, dtype)
+            )
             product = None
-            if spread is None or gather is None:
+            if prolong_matrix is None or restrict_matrix is None:
                 break
-            matrix = coarser(matrix, spread, gather)
+            matrix = coarser(matrix, prolong_matrix, restrict_matrix)
         small = matrix.shape[0] <= _DENSE
         self._coarsest = _dense_inverse(matrix).to(device) if small else None
 
     @property
     def num_levels(self) -> int:
-        """The given matrix counted."""
+        """Including that of the given matrix."""
         return len(self._levels)
 
     def precondition(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
@@ -218,11 +230,11 @@ class Hierarchy:
         return self.cycle(residual).clone()
 
     def cycle(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
-        """Do the same, in vectors that the next cycle may write to."""
+        """Apply the approximate inverse; the next cycle may overwrite the result."""
         return self._cycle(0, residual)
 
     def with_product(self, product: Product, dominant: Float[Tensor, " unknown"]) -> "Hierarchy":
-        """Give a copy for a matrix not far from this one: only the finest level is new.
+        """Give a copy for a similar matrix: only the finest level is new.
 
         Args:
             product: Of the new matrix.
@@ -250,25 +262,25 @@ class Hierarchy:
 
 def _level(
     matrix: csr_array,
-    spread: csr_array | None,
-    gather: csr_array | None,
+    prolong_matrix: csr_array | None,
+    restrict_matrix: csr_array | None,
     device: torch.device,
     product: Product | None,
     dtype: torch.dtype,
 ) -> Level:
     diagonal = torch.from_numpy(1 / dominant_diagonal(matrix)).to(device)
     if product is None and compiled_for(diagonal):
-        return CompiledLevel(matrix, diagonal.to(dtype), spread, gather)
+        return CompiledLevel(matrix, diagonal.to(dtype), prolong_matrix, restrict_matrix)
     return Level(
         product=product or sparse_product(matrix, device),
         inverse_diagonal=diagonal,
-        prolong=None if spread is None else sparse_product(spread, device),
-        restrict=None if gather is None else sparse_product(gather, device),
+        prolong=None if prolong_matrix is None else sparse_product(prolong_matrix, device),
+        restrict=None if restrict_matrix is None else sparse_product(restrict_matrix, device),
     )
 
 
 def sparse_product(matrix: csr_array, device: torch.device) -> Product:
-    """Give the product of a sparse matrix with vectors on a device, the quickest way."""
+    """Give the fastest product of a sparse matrix with vectors on a device."""
     if device.type != "cpu":
         return torch_product(matrix, device)
     if compiled_for():
@@ -295,7 +307,7 @@ def with_product(
 
 
 def torch_product(matrix: csr_array, device: torch.device) -> Product:
-    """Give the product by torch's own compressed rows."""
+    """Give the product by torch's compressed rows."""
     with warnings.catch_warnings():  # that compressed rows are in beta state
         warnings.simplefilter("ignore", UserWarning)
         moved = torch.sparse_csr_tensor(
@@ -309,7 +321,7 @@ def torch_product(matrix: csr_array, device: torch.device) -> Product:
 
 
 def _columns(vectors: Float[Tensor, "unknown ..."]) -> np.ndarray:
-    """Give vectors as the kernels want them: one column a right-hand side."""
+    """Give vectors as arrays with one column per right-hand side."""
     array = as_array(vectors)
     return array.reshape(len(array), -1)
 
@@ -318,7 +330,7 @@ def _dense_inverse(matrix: csr_array) -> Float[Tensor, "unknown unknown"]:
     dense = torch.from_numpy(matrix.toarray())
     scale = dense.diagonal().rsqrt()
     values, vectors = torch.linalg.eigh(scale[:, None] * dense * scale)
-    # Rounding may turn what is nearly free round; the inverse must stay positive definite.
+    # Rounding may make small eigenvalues negative; the inverse must stay positive definite.
     values = values.clamp_min(torch.finfo(torch.float64).eps)
     half = scale[:, None] * vectors
     return (half / values) @ half.mT

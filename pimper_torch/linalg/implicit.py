@@ -1,4 +1,4 @@
-"""Gradients of the solution of any equations, by the implicit function."""
+"""Gradients of the solution of equations, by the implicit function theorem."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,14 +9,14 @@ from jaxtyping import Float
 from scipy.sparse.linalg import LinearOperator, gmres
 from torch import Tensor
 
-# Of the adjoint solution, relative: far below what finite differences can check.
+# Of the adjoint solution, relative: a choice, far below what finite differences can check.
 _TOLERANCE = 1e-10
 
-# Restarts of GMRES, each of so many steps: a good preconditioner needs some ten of the first.
+# Restarts of GMRES and steps in each: choices; a good preconditioner needs some ten steps.
 _RESTARTS, _STEPS = 5, 60
 
-# Newton's method doubles the digits at every step once it is near; before that its steps are
-# halved until they help, down to this fraction.
+# Newton's steps at most, and the smallest fraction of a step in the line search: choices; near the
+# solution every step doubles the correct digits.
 _NEWTON_STEPS, _MIN_STEP = 8, 0.05
 
 Vector = Float[Tensor, " unknown"]
@@ -28,18 +28,18 @@ def implicit_solution(
     solution: Vector,
     precondition: Callable[[Vector], Vector],
 ) -> Vector:
-    r"""Let gradients flow from a solution of :math:`g(x; \theta) = 0` to :math:`\theta`.
+    r"""Make a solution of :math:`g(x; \theta) = 0` differentiable in :math:`\theta`.
 
     .. math:: \frac{dx}{d\theta} = -\left(\frac{\partial g}{\partial x}\right)^{-1}
               \frac{\partial g}{\partial \theta}
 
     The adjoint system is solved by GMRES with products from autograd, so that ``g`` may be any
-    function; solvers that stopped early are off by what they lacked.
+    function. The error of the gradient is of the order of the solution's.
 
     Args:
-        equations: ``g`` as a function of ``x``; what else it depends on is reached by gradients.
+        equations: ``g`` as a function of ``x``; gradients reach all else it depends on.
         solution: Where it vanishes. As many unknowns as equations.
-        precondition: A symmetric matrix near the inverse of the derivative by ``x``, applied.
+        precondition: Product with a symmetric matrix, about the inverse of the derivative by ``x``.
 
     Returns:
         The solution's values. Float64 on the CPU is used for the adjoint.
@@ -53,10 +53,10 @@ def implicit_solution(
     def adjoint(upstream: Vector) -> Vector:
         with torch.enable_grad():
             at = solution.detach().requires_grad_()
-            left = equations(at)
+            residual = equations(at)
 
         def product(vector: Array) -> Array:
-            (found,) = torch.autograd.grad(left, at, _as(vector, at), retain_graph=True)
+            (found,) = torch.autograd.grad(residual, at, _as(vector, at), retain_graph=True)
             return found.cpu().double().numpy()
 
         return _solve(product, precondition, upstream)
@@ -71,56 +71,56 @@ def newton_solution(
     start: Vector,
     precondition: Callable[[Vector], Vector],
 ) -> Vector:
-    """Take an approximate solution to rounding, by Newton's method with the exact derivative.
+    """Refine a solution to rounding by Newton's method with the exact derivative.
 
     Args:
         equations: That vanish at the solution.
-        start: Near it. Returned if no step brings the equations nearer to zero.
+        start: Near it. Returned if no step reduces the equations' norm.
         precondition: See :func:`implicit_solution`.
 
     A constant to autograd.
     """
-    at, left = start.detach(), equations(start.detach())
-    fraction, close = 1.0, _TOLERANCE * left.norm()
+    at, residual = start.detach(), equations(start.detach())
+    fraction, close = 1.0, _TOLERANCE * residual.norm()
     for _ in range(_NEWTON_STEPS):
-        if bool(left.norm() <= close):
+        if bool(residual.norm() <= close):
             break
 
         def product(vector: Array, at: Vector = at) -> Array:
             found = torch.func.jvp(equations, (at,), (_as(vector, at),))[1]
             return found.cpu().double().numpy()
 
-        step = _solve(product, precondition, left)
+        step = _solve(product, precondition, residual)
         while fraction > _MIN_STEP:
-            there = at - fraction * step
-            after = equations(there)
-            if bool(after.norm() < left.norm()):
+            trial = at - fraction * step
+            new_residual = equations(trial)
+            if bool(new_residual.norm() < residual.norm()):
                 break
             fraction /= 2
         else:
             return at
-        at, left, fraction = there, after, min(1.0, 2 * fraction)
+        at, residual, fraction = trial, new_residual, min(1.0, 2 * fraction)
     return at
 
 
 def _solve(
     product: Callable[[Array], Array],
     precondition: Callable[[Vector], Vector],
-    side: Vector,
+    rhs: Vector,
 ) -> Vector:
-    def near(vector: Array) -> Array:
-        return precondition(_as(vector, side)).detach().cpu().double().numpy()
+    def preconditioned(vector: Array) -> Array:
+        return precondition(_as(vector, rhs)).detach().cpu().double().numpy()
 
-    shape = (len(side), len(side))
+    shape = (len(rhs), len(rhs))
     found, _ = gmres(
         LinearOperator(shape, matvec=product, dtype=np.float64),
-        side.detach().cpu().double().numpy(),
+        rhs.detach().cpu().double().numpy(),
         rtol=_TOLERANCE,
         restart=_STEPS,
         maxiter=_RESTARTS,
-        M=LinearOperator(shape, matvec=near, dtype=np.float64),
+        M=LinearOperator(shape, matvec=preconditioned, dtype=np.float64),
     )
-    return _as(found, side)
+    return _as(found, rhs)
 
 
 def _as(vector: Array, like: Tensor) -> Tensor:
@@ -131,7 +131,7 @@ class _Implicit(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
-        left: Vector,
+        residual: Vector,
         solution: Vector,
         adjoint: Callable[[Vector], Vector],
     ) -> Vector:

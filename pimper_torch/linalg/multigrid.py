@@ -17,10 +17,10 @@ from pimper_torch.linalg.hierarchy import (
 from pimper_torch.linalg.prepared import PreparedMatrix
 from pimper_torch.linalg.singular import WORST_RESIDUAL, SingularSystemError
 
-# Of the error's energy norm next to the solution's. A digit costs one to two cycles.
+# Of the error's energy norm relative to the solution's: a choice; a digit costs one to two cycles.
 DEFAULT_TOLERANCE = 1e-10
 
-# The hardest systems of the benchmark take 25 cycles.
+# A choice: the hardest systems of `benchmarks/linear_systems.py` take 25 cycles.
 _MAX_CYCLES = 300
 
 # Residual, in tolerances, that is accepted where a larger error was asked for: a choice, as the
@@ -30,12 +30,12 @@ _RESIDUAL_TOLERANCES = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Iterate:
-    """A solution and how it was reached.
+    """A solution, its iterations and its residual.
 
     Attributes:
         values: The solution, float64; one column a right-hand side where there are several.
         iterations: Cycles taken.
-        residual: With the diagonal scaled to 1, next to the right-hand side; the worst of them.
+        residual: With the diagonal scaled to 1, relative to the right-hand side; the largest.
     """
 
     values: Float[Tensor, "unknown ..."]
@@ -59,7 +59,7 @@ def solve_with_hierarchy(
         hierarchy: Approximates the inverse of A.
         diagonal: Of A; only to measure the residual.
         rhs: ``b``, one column a right-hand side if there are several.
-        tolerance: Of the error's energy norm, as the hierarchy estimates it, next to that of
+        tolerance: Of the error's energy norm, as the hierarchy estimates it, relative to that of
             the solution.
         what: Names the system in errors.
         start: Where to begin; zero if not given.
@@ -88,18 +88,18 @@ def solve_by_cycles(
     what: str,
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Iterate:
-    """Do the same for a matrix in compressed rows by kernels on the CPU, its hierarchy in float32.
+    """Solve as :func:`solve_with_hierarchy`, by kernels on the CPU, the hierarchy in float32.
 
     Args:
         matrix: A, float64, both triangles.
-        diagonal: Of A.
-        rhs: As there.
-        tolerance: As there.
-        what: As there.
-        start: As there.
+        diagonal: See there.
+        rhs: See there.
+        tolerance: See there.
+        what: See there.
+        start: See there.
 
     Raises:
-        SingularSystemError: As there.
+        SingularSystemError: See there.
     """
     half = torch.float32
     reached = compressed_gradients(
@@ -123,14 +123,14 @@ def _checked(
     tolerance: float,
     what: str,
 ) -> Iterate:
-    """Refuse what conjugate gradients have reached if it is no solution.
+    """Give the result of conjugate gradients, or refuse it.
 
     Args:
-        reached: What they gave: values, steps and whether they converged.
+        reached: Values, steps and whether they converged.
         residual: Of the values.
         diagonal: Of the matrix.
         rhs: Right-hand side.
-        tolerance: That was asked for.
+        tolerance: Of the error.
         what: Names the system.
 
     Raises:
@@ -153,11 +153,11 @@ def _checked(
 
 
 class Multigrid(PreparedMatrix):
-    r"""A hierarchy for a sparse matrix; arguments as for its base, and the tolerance.
+    r"""Solves a sparse system by conjugate gradients with a multigrid preconditioner.
 
-    What :class:`~pimper_torch.linalg.sparse.SparseCholesky` is for some 100,000 unknowns on
-    the CPU, this is for millions, and on CUDA: memory and time grow with the unknowns only.
-    Made for graph Laplacians and their like, whose off-diagonal entries are mostly negative.
+    For millions of unknowns, and on CUDA: memory and time are linear in the unknowns, unlike those
+    of :class:`~pimper_torch.linalg.sparse.SparseCholesky`. For graph Laplacians and similar
+    matrices, whose off-diagonal entries are mostly negative.
 
     Args:
         rows: See :class:`~pimper_torch.linalg.prepared.PreparedMatrix`.
@@ -201,7 +201,7 @@ class Multigrid(PreparedMatrix):
             )
 
     def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
-        """Solve without a trace for autograd."""
+        """Solve; constant to autograd."""
         if rhs.numel() == 0:
             return rhs.clone()
         columns = rhs if rhs.ndim == 1 else rhs.reshape(len(rhs), -1)

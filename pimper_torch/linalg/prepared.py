@@ -1,4 +1,4 @@
-"""What factors and hierarchies share: assembly of the matrix, and gradients of solutions."""
+"""The base of sparse solvers: assembly of the matrix, and gradients of solutions."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -13,10 +13,10 @@ from pimper_torch.linalg.singular import refuse_hopeless
 
 
 class PreparedMatrix(ABC):
-    r"""A sparse symmetric positive definite matrix, ready for any number of right-hand sides.
+    r"""A sparse symmetric positive definite matrix, prepared for any number of right-hand sides.
 
-    :math:`A_{ij} = \sum_{k: (r_k, c_k) = (i, j)} v_k`: entries named twice add up, as they do
-    when normal equations are collected term by term. Both triangles must be given.
+    :math:`A_{ij} = \sum_{k: (r_k, c_k) = (i, j)} v_k`: duplicate entries add up. Both triangles
+    must be given.
 
     Args:
         rows: Row of each entry.
@@ -61,7 +61,7 @@ class PreparedMatrix(ABC):
 
     @abstractmethod
     def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
-        """Solve without a trace for autograd, with the same errors; in device and dtype of rhs."""
+        """Solve, constant to autograd, in device and dtype of rhs; see :meth:`solve` for errors."""
 
 
 class _Solve(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""Refusing equations that cannot be solved, whatever the method."""
+"""Refusal of singular systems."""
 
 import torch
 from jaxtyping import Float
@@ -6,8 +6,8 @@ from torch import Tensor
 
 from pimper_torch.errors import PimperError
 
-# An answer whose residual, with the diagonal scaled to 1, is larger than this next to the
-# right-hand side is refused: a choice, far above rounding and far below any noise of the data.
+# Maximum residual of a solution, with the diagonal scaled to 1, relative to the right-hand side: a
+# choice, far above rounding and far below any noise of the data.
 WORST_RESIDUAL = 1e-6
 
 

@@ -62,7 +62,7 @@ class SparseCholesky(PreparedMatrix):
             ) from error
 
     def _check_condition(self) -> None:
-        """Estimate the condition from the answer to a generic right-hand side."""
+        """Estimate the condition from the solution for a generic right-hand side."""
         size = len(self._scale)
         probe = torch.cos(torch.arange(size, dtype=torch.float64) ** 2)  # no structure to fit
         growth = float(self._substitute(probe).norm() / probe.norm()) if size else 0.0
@@ -80,7 +80,7 @@ class SparseCholesky(PreparedMatrix):
         return torch.from_numpy(answer)
 
     def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
-        """Solve without a trace for autograd; the same errors."""
+        """Solve; constant to autograd."""
         columns = rhs.detach().double().cpu().reshape(rhs.shape[0], -1)
         scaled = columns * self._scale[:, None]
         answer = self._substitute(scaled)

@@ -1,4 +1,4 @@
-"""One door to the solvers of sparse matrices: whichever suits size and device."""
+"""Solution of sparse systems by Cholesky or multigrid, by their size."""
 
 from contextlib import suppress
 
@@ -14,15 +14,15 @@ from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.parallel import over_rows
 
-# Here a factor takes three times as long to make as a hierarchy, and a third as long to use; it
-# is exact, and half a second is soon earned back by the three coordinates of a surface.
+# At this size a factor takes three times as long to make as a hierarchy, and a third as long to
+# use; it is exact, and the three coordinates of a surface make up for half a second.
 _CHOLESKY_UNKNOWNS = 50_000
 
-# Compiled, a hierarchy is the quicker from here on: the fusion of the demo's second round, 34,000
-# and 137,000 unknowns, takes 6.1 s in place of 7.3.
+# By kernels, a hierarchy is faster from this size on: the fusion of the demo's second iteration,
+# 34,000 and 137,000 unknowns, takes 6.1 s in place of 7.3.
 _COMPILED_CHOLESKY_UNKNOWNS = 10_000
 
-# Multigrid is made for matrices whose entries off the diagonal are negative but for this fraction.
+# Maximum fraction of positive entries off the diagonal for multigrid: a choice.
 _POSITIVE_FRACTION = 0.1
 
 
@@ -41,7 +41,7 @@ def prepare(
     Laplacians are, and sparse Cholesky all others.
 
     Args:
-        rows: Row of each entry; entries named twice add up.
+        rows: Row of each entry; duplicate entries add up.
         cols: Column of each entry.
         values: Of the entries; solutions are differentiable in them.
         size: Rows of the square matrix.
@@ -68,10 +68,10 @@ def solutions(
     what: str = "the linear system",
     tolerance: float = DEFAULT_TOLERANCE,
 ) -> tuple[Float[Tensor, "unknown ..."], ...]:
-    """Solve for some right-hand sides, by a factor where iterations do not get there.
+    """Solve for some right-hand sides, by a factor where multigrid does not converge.
 
-    Slivers among the faces of a mesh, and equations a million times surer than their neighbours,
-    can hold multigrid up.
+    Slivers among the faces of a mesh, and weights that differ by a factor of a million between
+    neighbours, may slow multigrid down.
 
     Args:
         rows: As in :func:`prepare`.
@@ -105,14 +105,14 @@ def solve_compressed(
     tolerance: float,
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Float[Tensor, "unknown side"]:
-    """Do what :func:`solutions` does for a matrix in compressed rows, without gradients.
+    """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients.
 
     Args:
         matrix: Symmetric positive definite; float64.
         sides: Right-hand sides, float64, on the CPU.
         what: Names the system in errors.
         tolerance: Of multigrid.
-        start: Where its iterations begin.
+        start: Initial values of multigrid.
 
     Raises:
         SingularSystemError: See :func:`prepare`.

@@ -40,8 +40,8 @@ def test_moves_and_turns_are_those_of_torch_on_the_rows_asked_for(real):
     wanted[2][rows] = wanted[1][rows].to(real)
     wanted[3][rows] = (better + length * direction)[rows]
     arrays = [each.numpy() for each in (found, residual, direction, image, length, rounded)]
-    kernels.moved(*arrays, 4, 17)
-    kernels.rotated(direction.numpy(), better.numpy(), length.numpy(), 4, 17)
+    kernels.step(*arrays, 4, 17)
+    kernels.new_direction(direction.numpy(), better.numpy(), length.numpy(), 4, 17)
     for one, other in zip((found, residual, rounded, direction), wanted, strict=True):
         assert_close(one, other, rtol=1e-6 if real == torch.float32 else 1e-14, atol=1e-14)
 
