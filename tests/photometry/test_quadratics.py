@@ -1,7 +1,15 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.quadratics import apply_packed, congruence, outer, solve_packed
+from pimper_torch.photometry.quadratics import (
+    PackedCholesky,
+    apply_packed,
+    congruence,
+    diagonal,
+    outer,
+    solve_packed,
+    unpacked,
+)
 
 
 def dense(packed, size):
@@ -35,3 +43,21 @@ def test_solving_is_differentiable(generator):
     packed = outer(rows.mT).sum(dim=-1).mT.requires_grad_()
     rhs = torch.randn(1, 4, 2, generator=generator, dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(solve_packed, (packed, rhs))
+
+
+def test_whitened_vectors_have_the_inner_products_of_the_inverse(generator):
+    rows = torch.randn(1, 5, 9, 4, generator=generator, dtype=torch.float64)
+    packed = outer(rows.mT).sum(dim=-1).mT
+    one, two = torch.randn(2, 1, 4, 5, generator=generator, dtype=torch.float64)
+    factor = PackedCholesky(packed, 4)
+    white = [torch.stack(factor.whiten(each.unbind(dim=-2)), dim=-2) for each in (one, two)]
+    expected = torch.einsum("bik,bkij,bjk->bk", one, torch.linalg.inv(dense(packed, 4)), two)
+    assert_close((white[0] * white[1]).sum(dim=-2), expected)
+
+
+def test_unpacked_matrices_are_the_dense_ones_and_the_diagonal_is_theirs(generator):
+    packed = torch.randn(2, 10, 5, generator=generator, dtype=torch.float64)
+    assert_close(unpacked(packed, 4), dense(packed, 4))
+    assert_close(
+        packed[:, diagonal(4)].mT, dense(packed, 4).diagonal(dim1=-2, dim2=-1), rtol=0, atol=0
+    )

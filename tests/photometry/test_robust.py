@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.robust import robust_deviation
+from pimper_torch.photometry.robust import Cauchy, median_deviation, robust_deviation
 
 
 def drawn(generator, *shape):
@@ -44,3 +44,33 @@ def test_the_spread_has_the_gradient_of_its_differences(generator):
     noise = drawn(generator, 2, 30).requires_grad_()
     seen = torch.rand(2, 30, generator=generator) > 0.2
     assert torch.autograd.gradcheck(lambda residual: robust_deviation(residual, seen), noise)
+
+
+def test_the_scale_of_gaussian_noise_solves_its_equation():
+    # By quadrature: the expectation of x^4 / (x^4 + t^4) over a unit Gaussian is a half at t.
+    x = torch.linspace(-12, 12, 400_001, dtype=torch.float64)
+    density = torch.exp(-x * x / 2) / (2 * torch.pi) ** 0.5
+    fraction = x**4 / (x**4 + 0.6472404**4)
+    half = torch.trapezoid(density * fraction, x)
+    assert abs(float(half) - 0.5) < 1e-7  # the constant has seven digits
+
+
+def test_weights_and_curvatures_are_derivatives_of_the_loss(generator):
+    residual = drawn(generator, 60).requires_grad_()
+    deviation = torch.tensor(0.4, dtype=torch.float64)
+    loss = Cauchy()
+    width = loss.scale * deviation
+    value = (width**2 / 2 * torch.log1p((residual / width) ** 2)).sum()
+    (slope,) = torch.autograd.grad(value, residual, create_graph=True)
+    assert_close(slope, loss.weights(residual, deviation) * residual)
+    (bend,) = torch.autograd.grad(slope.sum(), residual)
+    assert_close(bend, loss.curvatures(residual.detach(), deviation))
+    assert (bend < 0).any()  # of outliers
+
+
+def test_the_median_deviation_of_gaussian_noise_is_its_standard_deviation(generator):
+    noise = 3 * drawn(generator, 200_000)
+    seen = torch.rand(200_000, generator=generator) > 0.3
+    found = median_deviation(torch.where(seen, noise, 1e6), seen)
+    assert_close(found, torch.tensor(3.0, dtype=torch.float64), rtol=0.01, atol=0)
+    assert median_deviation(noise, torch.zeros_like(seen)) == 0

@@ -1,0 +1,97 @@
+"""The models of a view's light against their derivatives, their bounds and the light field."""
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.light_field import LightField
+from pimper_torch.photometry.light_models import MIN_DISTANCE, PointLight, SoftLight
+
+
+def draw(generator, *shape):
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+@pytest.fixture
+def samples(generator):
+    return normalize(draw(generator, 50, 3), dim=1), 0.5 * draw(generator, 50, 3)
+
+
+def lights(generator, model, views=6):
+    """Lights off all bounds; point lights three times as far as the samples."""
+    found = draw(generator, views, 4)
+    found[:, 0] = 0.1 + found[:, 0].abs()
+    if isinstance(model, SoftLight):
+        return found
+    return torch.cat([found, torch.full((views, 1), 0.3).double()], dim=1)
+
+
+@pytest.fixture(params=["soft", "point light"])
+def model(request, samples):
+    normals, points = samples
+    if request.param == "soft":
+        return SoftLight(basis=harmonics(normals))
+    return PointLight(normals=normals, points=points)
+
+
+def test_the_jacobian_is_the_derivative_of_shading(model, generator):
+    given = lights(generator, model)
+    whole = torch.autograd.functional.jacobian(model.shade, given)  # sample, view, view, parameter
+    view = torch.arange(len(given))
+    found = model.jacobian(given)
+    assert_close(found, whole[:, view, view])
+    assert (found.abs().amax(dim=0) > 0).all()
+    off = whole.clone()
+    off[:, view, view] = 0
+    assert (off == 0).all()  # a view's shading depends on its own light alone
+
+
+def test_a_point_light_shades_as_the_light_field_does(samples, generator):
+    normals, points = samples
+    model = PointLight(normals=normals, points=points)
+    given = lights(generator, model)
+    field = LightField(
+        origin=torch.zeros(3).double(),
+        soft=torch.cat([given[:, :1], torch.zeros(6, 3).double()], dim=1),
+        point_light=given[:, 1:4],
+        closeness=given[:, 4],
+    )
+    direct = (field.point_light_at(points) * normals[:, None]).sum(dim=-1).clamp_min(0)
+    assert_close(model.shade(given), given[:, 0] + direct)
+
+
+def test_parameters_are_projected_on_their_bounds_and_those_there_are_marked(samples):
+    normals, points = samples
+    outside = torch.tensor([[-1.0, 2, -3, 4, -0.5], [1.0, 0, 0, 1, 9.0], [1.0, 0, 0, 1, 0.2]])
+    model = PointLight(normals=normals, points=points)
+    inside = model.clamp(outside.double())
+    expected = outside.double()
+    expected[0, 0], expected[0, 4], expected[1, 4] = 0, 0, 1 / MIN_DISTANCE
+    assert_close(inside, expected)
+    assert_close(model.clamp(inside), inside)
+    free = torch.ones(3, 5, dtype=torch.bool)
+    free[0, 0] = free[0, 4] = free[1, 4] = False
+    assert (model.inside_bounds(inside) == free).all()
+    soft = SoftLight(basis=harmonics(normals))
+    assert_close(soft.clamp(outside[:, :4].double()), expected[:, :4])
+    assert (soft.inside_bounds(inside[:, :4]) == free[:, :4]).all()
+
+
+def test_the_initial_soft_light_has_the_brightness_of_every_view(samples, generator):
+    from pimper_torch.photometry.image_samples import ImageSamples
+
+    normals = normalize(samples[0] + torch.tensor([0.0, 0, -3]).double(), dim=1)
+    gain = torch.tensor([0.5, 1.0, 3.0]).double()
+    albedo = 0.2 + torch.rand(50, generator=generator, dtype=torch.float64)
+    radiance = albedo[:, None] * gain
+    model = SoftLight(basis=harmonics(normals))
+    found, start = model.initialize(
+        ImageSamples(radiance=radiance, seen=torch.ones(50, 3, dtype=torch.bool))
+    )
+    # Every view is the same but for its gain: so are its light, and the product with albedo.
+    assert_close(found / found[1], (gain[:, None] / gain[1]).expand(-1, 4))
+    assert_close(start / start.median(), albedo / albedo.median())
+    mean = model.basis.mean(dim=0)
+    assert_close(found @ mean * start.median(), gain * albedo.median())
