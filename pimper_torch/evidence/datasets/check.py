@@ -1,14 +1,14 @@
-"""Is a capture consistent? Finds the classic mistakes by what contradicts them.
+"""Consistency checks of a capture: common mistakes in its conventions, by hypothesis testing.
 
-Every mistake is a hypothesis with a way to undo it (:mod:`.mistakes`).
-The capture as given and as each hypothesis would have it are scored by whatever evidence
-there is (:mod:`pimper_torch.evidence.datasets.evidence`), and a mistake is named where undoing it
-fits clearly better.
+Every mistake is a hypothesis with a way to undo it (:mod:`.mistakes`). The capture as given and
+as corrected under each hypothesis are scored by the measures that its data allow
+(:mod:`pimper_torch.evidence.datasets.evidence`), and a mistake is reported where undoing it scores
+significantly higher.
 """
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,38 +17,38 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.datasets.evidence import (
-    cones_touch,
     depth_agreement,
     epipolar_agreement,
     match_features,
     points_in_sight,
+    silhouette_coherence,
     silhouette_mismatch,
     silhouette_overlap,
 )
 from pimper_torch.evidence.datasets.findings import CheckReport, Comparison, Finding
 from pimper_torch.evidence.datasets.mistakes import CameraMistake, camera_mistakes
 from pimper_torch.evidence.datasets.orientation import check_lights, check_mesh, check_normals
-from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.evidence.metrics.sampling import sample_surface
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Capture, Mesh, Truth, Views
 
 _MAX_VIEWS = 8
 _MAX_POINTS = 20_000
-# A mistake is believed where undoing it takes away 40 % of the misfit and raises the mean score
-# by 0.05: the right cameras of a body of revolution may be a little worse than mirrored ones.
-# Scores of matched features end far below 1, as many matches are wrong (0.34 with the right
+# A mistake is reported where undoing it removes 40 % of the misfit and raises the mean score
+# by 0.05: the right cameras of a solid of revolution may be a little worse than mirrored ones.
+# Scores of matched features are far below 1, as many matches are wrong (0.34 with the right
 # cameras of Middlebury's dino, 0.13 at most with wrong ones): there it is 2.5 times as many.
 _LEFT, _MARGIN = 0.6, 0.05
 _TIMES, _STEP = 2.5, 0.15
 _TIE = 0.02
 _HOPELESS = 0.1
 _NOT_RIGID = 1e-3
-_WHOLE = 0.98  # a mask that covers more of the photograph says nothing
+_WHOLE = 0.98  # a mask that covers more of the photograph is ignored
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Subject:
-    """The views that are looked at: one a position, a few all along the capture."""
+    """The views that are checked: one a position, a few all along the capture."""
 
     views: Views
     cameras: Cameras
@@ -57,42 +57,37 @@ class _Subject:
 
 
 def check_capture(capture: Capture) -> CheckReport:
-    """Look for mistakes in a capture's cameras, normals, lights and mesh, and name them.
+    """Find mistakes in a capture's cameras, normals, lights and mesh.
 
     Cameras are tested against the true surface in the masks (or in the photographs, if there
-    are no masks), against depth maps of neighbouring views, by the common volume of the masks,
-    and, where there is nothing better, by features matched between photographs. Normals are
-    tested against depth or mesh, with the cameras set right, and by facing the camera; lights
-    by the shading they predict. Mistakes that nothing in the capture can tell are not found:
-    ``report.comparisons`` says what was tested.
+    are no masks), against depth maps of neighbouring views, by the visual hull of the masks,
+    and, without any of these, by features matched between photographs. Normals are
+    tested against depth or mesh, with the corrected cameras, and by facing the camera; lights
+    by the shading they predict. ``report.comparisons`` lists what the capture's data allowed to
+    test.
 
     Args:
-        capture: Read from a data set or rendered. Up to eight positions are looked at.
+        capture: Read from a data set or rendered. Up to eight positions are checked.
 
     Returns:
         No findings if all is consistent.
     """
     findings: list[Finding] = []
     comparisons: list[Comparison] = []
-    subject = None
-    if capture.cameras is not None:
-        subject = _subject(capture, capture.cameras)
-        findings += _sound(subject.cameras)
-        if not findings or findings[0].name != "cameras_not_finite":
-            subject = _check_cameras(subject, findings, comparisons)
-        else:
-            subject = None
-    if subject is not None:
-        check_mesh(subject.truth, subject.cameras, findings, comparisons)
-    if subject is not None:
-        cameras, views, truth = subject.cameras, subject.views, subject.truth
-    else:
-        # A single viewpoint has many lights: they are what is looked at there.
+    if capture.cameras is None:
+        # The views of a single viewpoint differ in their lights.
         chosen = _spread(list(range(capture.views.num_views)))
         cameras, views, truth = None, capture.views.take(chosen), _taken(capture.truth, chosen)
-    if subject is not None or capture.cameras is None:
-        check_normals(views, truth, cameras, findings, comparisons)
-        check_lights(views, truth, cameras, findings, comparisons)
+    else:
+        subject = _subject(capture, capture.cameras)
+        findings += _invalid(subject.cameras)
+        if any(one.name == "cameras_not_finite" for one in findings):
+            return CheckReport(findings=tuple(findings), comparisons=())
+        subject = _check_cameras(subject, findings, comparisons)
+        cameras, views, truth = subject.cameras, subject.views, subject.truth
+        check_mesh(truth, cameras, findings, comparisons)
+    check_normals(views, truth, cameras, findings, comparisons)
+    check_lights(views, truth, cameras, findings, comparisons)
     return CheckReport(findings=tuple(findings), comparisons=tuple(comparisons))
 
 
@@ -104,7 +99,7 @@ def require_consistent(capture: Capture, *, warn: bool = False) -> None:
         warn: Give a :class:`~pimper_torch.errors.PimperWarning` instead.
 
     Raises:
-        InputError: Names the mistakes with their evidence and what to do.
+        InputError: Names the mistakes with their scores and what to do.
     """
     report = check_capture(capture)
     if not report.findings:
@@ -118,7 +113,7 @@ def require_consistent(capture: Capture, *, warn: bool = False) -> None:
 def _check_cameras(
     subject: _Subject, findings: list[Finding], comparisons: list[Comparison]
 ) -> _Subject:
-    """Add what is wrong with the cameras; gives the subject with cameras set right."""
+    """Add findings on the cameras; give the subject with corrected cameras."""
     tests = _camera_tests(subject)
     if not tests:
         return subject
@@ -139,7 +134,7 @@ def _check_cameras(
         ]
         alternatives = tuple(name for name in near if name != mistake.name)
         findings.append(_named(mistake, scores, best, alternatives))
-        return _with_cameras(subject, candidates[best])
+        return replace(subject, cameras=candidates[best])
     geometric = [values[0] for test, values in scores.items() if test != "features"]
     if geometric and max(geometric) < _HOPELESS:
         findings.append(
@@ -153,7 +148,7 @@ def _check_cameras(
         )
         return subject
     shifted = _half_pixel(subject, findings, comparisons)
-    return _with_cameras(subject, shifted)
+    return replace(subject, cameras=shifted)
 
 
 def _clearly_better(best: float, given: float) -> bool:
@@ -177,7 +172,7 @@ def _camera_tests(subject: _Subject) -> dict[str, Callable[[Cameras], float]]:
     if depth is not None and many:
         tests["depth"] = lambda cameras: depth_agreement(cameras, depth)
     if masks is not None and subject.cameras.num_views > 2:
-        tests["masks"] = lambda cameras: cones_touch(cameras, masks)
+        tests["masks"] = lambda cameras: silhouette_coherence(cameras, masks)
     if many and "depth" not in tests and masks is None:
         matches = match_features(subject.views.images, subject.cameras)
         if sum(len(first) for first, _ in matches.values()) >= 8 * len(matches) > 0:
@@ -202,7 +197,7 @@ def _named(
 def _half_pixel(
     subject: _Subject, findings: list[Finding], comparisons: list[Comparison]
 ) -> Cameras:
-    """Tell by the mesh's silhouette whether pixels are counted from centres or from corners."""
+    """Test by the mesh's silhouette whether pixels are counted from centres or from corners."""
     mesh, masks = subject.truth.mesh, subject.masks
     if mesh is None or masks is None or len(mesh.faces) == 0:
         return subject.cameras
@@ -249,8 +244,8 @@ def _moved(cameras: Cameras, shift: float) -> Cameras:
     return cameras.replace(intrinsics=moved)
 
 
-def _sound(cameras: Cameras) -> list[Finding]:
-    """Refuse numbers that are no cameras."""
+def _invalid(cameras: Cameras) -> list[Finding]:
+    """Find cameras that are not finite, or not rigid."""
     if not bool(cameras.intrinsics.isfinite().all() & cameras.cam_from_world.isfinite().all()):
         return [
             Finding(
@@ -298,43 +293,17 @@ def _spread(views: list[int]) -> list[int]:
 
 
 def _taken(truth: Truth, chosen: list[int]) -> Truth:
-    def of(values: Tensor | None) -> Tensor | None:
-        return None if values is None else values[chosen]
-
-    return truth.replace(
-        depth=of(truth.depth),
-        normals_world=of(truth.normals_world),
-        albedo=of(truth.albedo),
-        foreground=of(truth.foreground),
-        lit=of(truth.lit),
-        highlight=of(truth.highlight),
-        lights_world=of(truth.lights_world),
-        point_lights_world=of(truth.point_lights_world),
-    )
-
-
-def _with_cameras(subject: _Subject, cameras: Cameras) -> _Subject:
-    return _Subject(views=subject.views, cameras=cameras, truth=subject.truth, masks=subject.masks)
+    maps = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
+    fields = {name: getattr(truth, name) for name in (*maps, "lights_world", "point_lights_world")}
+    known = {name: values[chosen] for name, values in fields.items() if values is not None}
+    return truth.replace(**known)
 
 
 def _surface_points(truth: Truth) -> Float[Tensor, "point 3"] | None:
-    generator = torch.Generator().manual_seed(0)
-    if truth.mesh is not None and len(truth.mesh.faces):
-        return _sampled(truth.mesh, generator)
-    points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
-    if points is None or len(points) == 0:
+    """Draw points of the true mesh or cloud; ``None`` without either."""
+    mesh = truth.mesh
+    if mesh is None and truth.points_world is not None:
+        mesh = Mesh(vertices_world=truth.points_world, faces=torch.zeros(0, 3, dtype=torch.long))
+    if mesh is None or len(mesh.vertices_world) == 0:
         return None
-    return points[torch.randperm(len(points), generator=generator)[:_MAX_POINTS]]
-
-
-def _sampled(mesh: Mesh, generator: torch.Generator) -> Float[Tensor, "point 3"]:
-    """Draw points evenly from a mesh's faces."""
-    corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
-    area = face_normals(mesh.vertices_world.detach().cpu().double(), mesh.faces.cpu()).norm(dim=1)
-    # By the cumulative area, as multinomial draws from 2^24 faces at most.
-    total = area.cumsum(0)
-    draw = torch.rand(_MAX_POINTS, 3, generator=generator, dtype=torch.float64)
-    face = torch.searchsorted(total, draw[:, 0] * total[-1]).clamp_max(len(area) - 1)
-    root = draw[:, 1].sqrt()
-    weights = torch.stack([1 - root, root * (1 - draw[:, 2]), root * draw[:, 2]], dim=1)
-    return (weights[..., None] * corners[face]).sum(dim=1)
+    return sample_surface(mesh, _MAX_POINTS, torch.Generator().manual_seed(0)).points

@@ -1,4 +1,4 @@
-"""What the two DTU sets share: one camera, one calibrated size, several point lights a position."""
+"""Captures of the two DTU sets: one calibrated camera, several point lights a position."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -100,7 +100,7 @@ def read_dtu_mvs(
 
 
 def read_dtu_protocol(folder: Path | str, scan: int) -> DtuProtocol:
-    """Read where the set's own evaluation judges a scan.
+    """Read the observability mask and the table's plane of the set's own evaluation.
 
     ``ObsMask/ObsMask<scan>_10.mat`` holds ``ObsMask``, its box ``BB`` (two rows) and voxel
     size ``Res``; ``ObsMask/Plane<scan>.mat`` the table's ``P``.

@@ -1,4 +1,4 @@
-"""How well cameras agree with points, depth, masks and photographs: shares between 0 and 1."""
+"""Agreement of cameras with points, depth, masks and photographs: scores between 0 and 1."""
 
 from itertools import combinations
 
@@ -17,7 +17,7 @@ from pimper_torch.records import Cameras, Mesh
 
 _CELLS = 40  # along an image's longer side, for coverage
 _OUTLINE_PX = 120  # longer side of masks whose silhouettes are compared
-_RIM_RAYS, _RIM_SAMPLES = 80, 96  # a mask, a ray
+_CONTOUR_RAYS, _RAY_SAMPLES = 80, 96  # a mask, a ray
 _FEATURE_PX = 480  # longer side of photographs in which features are sought
 
 
@@ -26,7 +26,7 @@ def points_in_sight(
     points_world: Float[Tensor, "point 3"],
     masks: Bool[Tensor, "view height width"] | None,
 ) -> float:
-    """Tell how well points of the surface fall into the photographs, and fill the masks.
+    """Give the fraction of surface points inside the photographs, or on the masks.
 
     Without masks, the fraction of points in front of a camera and inside its photograph, in
     the mean over the views. With masks, the fraction on the mask times the fraction of the mask's
@@ -48,11 +48,10 @@ def points_in_sight(
 
 
 def depth_agreement(cameras: Cameras, depth: Float[Tensor, "view height width"]) -> float:
-    """Tell which fraction of a view's depth map lies on its neighbour's.
+    """Give the fraction of a view's depth map that agrees with its neighbour's.
 
-    A point agrees when its depth in the other camera is within 3 % of the map's range of
-    what the map has there; points that leave the image, fall on the background or are
-    hidden do not.
+    A point agrees when its depth in the other camera differs from the map's there by less than
+    3 % of the map's range; points outside the image, on the background or occluded do not.
     """
     reduced = shrunk_cameras(cameras, 120)
     maps = [
@@ -80,30 +79,28 @@ def silhouette_overlap(
     caster: RayCaster,
     masks: Bool[Tensor, "view height width"],
 ) -> float:
-    """Tell how well a mesh's silhouettes overlap the masks: intersection over union, mean of views.
+    """Give the intersection over union of a mesh's silhouettes and the masks, mean of the views.
 
-    Seen at 120 pixels along the longer side.
+    At 120 pixels along the longer side.
     """
     small = shrunk_cameras(cameras, _OUTLINE_PX)
     found = []
     for view in range(cameras.num_views):
         width, height = _size(small, view)
         mask = nearest(_cropped(masks, cameras, view), width, height)
-        pixels = pixel_centers(width, height, like=small.intrinsics).reshape(-1, 2)
-        rays = rays_through(pixels, *_of(small, view)).reshape(height, width, 3)
-        seen = caster.cast(small.centers_world[view], rays).distance.isfinite()
+        seen = caster.cast(small.centers_world[view], pixel_rays(small, view)).distance.isfinite()
         either = int((seen | mask).sum())
         found.append(float((seen & mask).sum()) / either if either else 0.0)
     return float(np.mean(found))
 
 
-def cones_touch(cameras: Cameras, masks: Bool[Tensor, "view height width"]) -> float:
-    """Tell how well the cones through the masks fit one body.
+def silhouette_coherence(cameras: Cameras, masks: Bool[Tensor, "view height width"]) -> float:
+    """Give the silhouette coherence of the masks: the fraction of contour rays that touch the hull.
 
-    A body touches every ray through the rim of its mask, and where it does the other masks
-    have it too. The fraction of rim rays on which some point is in all other masks (one pixel
-    of 120 spared) is near 1 for right cameras; cameras that look elsewhere leave none, and
-    mirrored ones fewer. A body without features, or views from nearly one side, tell less.
+    An object touches every ray through the contour of its mask, at a point inside all other
+    masks. The fraction of contour rays with a point in all other masks (dilated by one pixel of
+    120) is near 1 for right cameras, lower for mirrored ones, and 0 for cameras that look
+    elsewhere. Symmetric objects, and views from nearly one side, discriminate less.
 
     Source: the tangency constraint of Hernandez, Schmitt & Cipolla, Silhouette Coherence for
     Camera Calibration under Circular Motion, PAMI 29(2), 2007.
@@ -114,17 +111,17 @@ def cones_touch(cameras: Cameras, masks: Bool[Tensor, "view height width"]) -> f
     ]
     if not all(bool(mask.any()) for mask in drawn):
         return 0.0
-    centre, radius = _common_place(small, drawn)
+    centre, radius = _common_point(small, drawn)
     if centre is None:
         return 0.0
-    spared = [max_pool2d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0 for mask in drawn]
+    dilated = [max_pool2d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0 for mask in drawn]
     found = []
     for view, mask in enumerate(drawn):
-        points = _along_rim(small, view, mask, centre, radius)
+        points = _along_contour_rays(small, view, mask, centre, radius)
         if points is None:
             continue
         covered = torch.ones(points.shape[:2], dtype=torch.bool)
-        for other, wide in enumerate(spared):
+        for other, wide in enumerate(dilated):
             if other != view:
                 pixels, depth = project(points.reshape(-1, 3), *_of(small, other))
                 inside = (depth > 0) & _within(pixels, *_size(small, other))
@@ -136,24 +133,24 @@ def cones_touch(cameras: Cameras, masks: Bool[Tensor, "view height width"]) -> f
     return float(np.mean(found)) if found else 0.0
 
 
-def _along_rim(
+def _along_contour_rays(
     cameras: Cameras,
     view: int,
     mask: Bool[Tensor, "height width"],
     centre: Float[Tensor, "3"],
     radius: float,
 ) -> Float[Tensor, "ray sample 3"] | None:
-    """Give points along rays through the mask's rim, round the depth of the centre."""
+    """Give points along rays through the mask's contour, around the depth of the centre."""
     outside = torch.zeros_like(mask)
     outside[1:-1, 1:-1] = max_pool2d((~mask)[None, None].float(), 3, 1, 0)[0, 0] > 0
     rows, columns = torch.nonzero(mask & outside, as_tuple=True)
     if len(rows) == 0:
         return None
-    kept = torch.linspace(0, len(rows) - 1, min(len(rows), _RIM_RAYS)).long()
+    kept = torch.linspace(0, len(rows) - 1, min(len(rows), _CONTOUR_RAYS)).long()
     pixels = torch.stack([columns[kept], rows[kept]], dim=1).to(cameras.intrinsics) + 0.5
     rays = rays_through(pixels, *_of(cameras, view))
     depth = float(transform(cameras.cam_from_world[view], centre[None])[0, 2])
-    reach = torch.linspace(max(depth - 2 * radius, 0.0), depth + 2 * radius, _RIM_SAMPLES)
+    reach = torch.linspace(max(depth - 2 * radius, 0.0), depth + 2 * radius, _RAY_SAMPLES)
     return cameras.centers_world[view] + reach.to(rays)[:, None] * rays[:, None]
 
 
@@ -161,7 +158,7 @@ def epipolar_agreement(
     cameras: Cameras,
     matches: dict[tuple[int, int], tuple[Float[Tensor, "match 2"], Float[Tensor, "match 2"]]],
 ) -> float:
-    """Tell which fraction of matched features the cameras' epipolar geometry allows.
+    """Give the fraction of matched features that are inliers of the epipolar geometry.
 
     A match agrees when its points lie within 0.4 % of the image's longer side of each
     other's epipolar lines and the rays through them meet in front of both cameras.
@@ -185,7 +182,7 @@ def match_features(
         gray = images[view, :, :height, :width].mean(dim=0)
         factor = min(1.0, _FEATURE_PX / max(width, height))
         small = nearest(gray, max(1, round(width * factor)), max(1, round(height * factor)))
-        # A root brings out what lies in the shade; the scale does not matter to SIFT.
+        # A square root enhances dark regions; SIFT is invariant to scale.
         level = small.clamp_min(0).sqrt().cpu().double().numpy()
         finder = SIFT(upsampling=1)
         try:
@@ -217,7 +214,7 @@ def silhouette_mismatch(
     view: int,
     surroundings: Mesh | None = None,
 ) -> float:
-    """Count pixels at the mask's rim where mesh and mask differ, as a fraction of the rim's length.
+    """Count pixels at the mask's contour where mesh and mask differ, over the contour's length.
 
     About 0 for a mask that was made from the mesh, and 0.6 after a shift by half a pixel.
     """
@@ -227,8 +224,8 @@ def silhouette_mismatch(
     grown = max_pool2d(solid, 7, 1, 3)[0, 0] > 0
     core = max_pool2d(1 - solid, 7, 1, 3)[0, 0] > 0
     band = grown & core
-    rim = int((mask & (max_pool2d(1 - solid, 3, 1, 1)[0, 0] > 0)).sum())
-    if rim == 0:
+    contour_length = int((mask & (max_pool2d(1 - solid, 3, 1, 1)[0, 0] > 0)).sum())
+    if contour_length == 0:
         return 0.0
     pixels = pixel_centers(width, height, like=cameras.intrinsics)[band]
     rays = rays_through(pixels, *_of(cameras, view))
@@ -238,7 +235,7 @@ def silhouette_mismatch(
     if surroundings is not None:
         caster = RayCaster(surroundings.vertices_world, surroundings.faces)
         seen = seen & (reach <= caster.cast(center, rays).distance)
-    return float((seen != mask[band]).sum()) / rim
+    return float((seen != mask[band]).sum()) / contour_length
 
 
 def normals_of_depth(
@@ -275,6 +272,13 @@ def normals_of_depth(
     return unit * outward[..., None]
 
 
+def pixel_rays(cameras: Cameras, view: int) -> Float[Tensor, "height width 3"]:
+    """Give the rays through a view's pixels, of depth 1 along z; world frame."""
+    width, height = _size(cameras, view)
+    pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
+    return rays_through(pixels, *_of(cameras, view)).reshape(height, width, 3)
+
+
 def _of(cameras: Cameras, view: int) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "3 3"]]:
     return cameras.cam_from_world[view], cameras.intrinsics[view]
 
@@ -304,7 +308,7 @@ def _neighbours(num_views: int) -> list[tuple[int, int]]:
 
 
 def shrunk_cameras(cameras: Cameras, longer_px: int) -> Cameras:
-    """Let cameras follow a resize of their photographs to this longer side, if they are larger."""
+    """Scale cameras with their photographs to this longer side, if they are larger."""
     factor = min(1.0, longer_px / float(cameras.sizes_px.max()))
     sizes = (cameras.sizes_px * factor).round().clamp_min(1).long()
     ratio = sizes.to(cameras.intrinsics) / cameras.sizes_px.to(cameras.intrinsics)
@@ -320,9 +324,7 @@ def shrunk_cameras(cameras: Cameras, longer_px: int) -> Cameras:
 def _lifted(
     cameras: Cameras, view: int, depth: Float[Tensor, "height width"]
 ) -> Float[Tensor, "height width 3"]:
-    height, width = depth.shape
-    pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
-    rays = rays_through(pixels, *_of(cameras, view)).reshape(height, width, 3)
+    rays = pixel_rays(cameras, view)
     reach = torch.where(depth.isfinite(), depth, 0).to(rays)
     return cameras.centers_world[view] + reach[..., None] * rays
 
@@ -341,10 +343,10 @@ def _coverage(
     return float((drawn & filled).sum()) / max(1, int(drawn.sum()))
 
 
-def _common_place(
+def _common_point(
     cameras: Cameras, masks: list[Bool[Tensor, "height width"]]
 ) -> tuple[Float[Tensor, "3"] | None, float]:
-    """Find the point nearest to the rays through the masks' centres, and a radius round it."""
+    """Find the point nearest to the rays through the masks' centroids, and a radius around it."""
     normal, right, sizes = torch.zeros(3, 3).double(), torch.zeros(3).double(), []
     for view, mask in enumerate(masks):
         rows, columns = torch.nonzero(mask, as_tuple=True)

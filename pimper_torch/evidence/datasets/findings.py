@@ -1,4 +1,4 @@
-"""What a check of a capture says."""
+"""The report of a check of a capture."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ class Finding(Record):
         name: Short, for programs.
         meaning: What is wrong.
         remedy: What to do about it.
-        evidence: Figures that say so.
-        alternatives: Other mistakes that would explain it about as well.
+        evidence: Scores, by measure.
+        alternatives: Other mistakes with about the same scores.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Finding(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Comparison(Record):
-    """How well each hypothesis agrees with one kind of evidence.
+    """The score of each hypothesis by one measure.
 
     Attributes:
         evidence: Which.
@@ -59,5 +59,5 @@ class CheckReport(Record):
     def __str__(self) -> str:
         tested = ", ".join(comparison.evidence for comparison in self.comparisons)
         if not self.findings:
-            return f"no mistake found; tested: {tested or 'nothing, as there is nothing to go by'}."
+            return f"no mistake found; tested: {tested or 'nothing, for want of data'}."
         return "the capture contradicts itself. " + " ".join(str(one) for one in self.findings)

@@ -1,4 +1,4 @@
-"""What a reader says when a folder is not laid out as it expects, and how it reads on."""
+"""Layout of data sets: refusals of other layouts, and readers of their text files."""
 
 import json
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ def expect(ok: bool, path: Path, kind: str, needed: str, found: str | None = Non
 
 
 def contents(path: Path) -> str:
-    """Tell what a folder holds, for a message."""
+    """List a folder's contents, for a message."""
     if path.is_dir():
         names = sorted(inner.name for inner in path.iterdir())
         return some(names) if names else "an empty folder"

@@ -1,4 +1,4 @@
-"""The classic mistakes in camera files and normal maps, each with what undoes it."""
+"""Common mistakes in camera files and normal maps, each with the transformation that undoes it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class CameraMistake:
         name: Short, for programs.
         meaning: What was done.
         remedy: What the user does about it.
-        undo: Gives the cameras as they should be.
+        undo: Gives the corrected cameras.
     """
 
     name: str
@@ -51,8 +51,8 @@ class VectorMistake:
 def camera_mistakes(cameras: Cameras) -> tuple[CameraMistake, ...]:
     """List the mistakes that these cameras may have, the commonest first.
 
-    Which size ``K`` is for, and whether rows and columns are confused, is asked only where
-    its principal point gives reason to.
+    Another image size, and swapped rows and columns, are hypotheses only where the principal point
+    is far from the centre.
     """
     return (*_POSES, *_intrinsics(cameras))
 

@@ -1,4 +1,4 @@
-"""Checks of which way things point: meshes, normal maps, lights."""
+"""Checks of orientation: of meshes, normal maps and lights."""
 
 from collections.abc import Sequence
 
@@ -8,12 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.datasets.evidence import normals_of_depth, shrunk_cameras
+from pimper_torch.evidence.datasets.evidence import (
+    normals_of_depth,
+    pixel_rays,
+    shrunk_cameras,
+)
 from pimper_torch.evidence.datasets.findings import Comparison, Finding
 from pimper_torch.evidence.datasets.mistakes import VECTOR_MISTAKES, VectorMistake
 from pimper_torch.evidence.datasets.raster import nearest
-from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.visibility import Hits, cast_view
 from pimper_torch.records import Cameras, Mesh, Truth, Views
@@ -21,8 +23,8 @@ from pimper_torch.records import Cameras, Mesh, Truth, Views
 _LOOKED_AT = 4  # views
 _SMALL_PX = 160
 _SATURATED = 0.99
-# Right normals agree with those of depth or mesh to a mean cosine above 0.95, and no turn of
-# them can halve what is left; mirrored ones reach 0.9 where a surface is rather flat.
+# Right normals agree with those of depth or mesh to a mean cosine above 0.95, and no hypothesis
+# halves the rest; mirrored ones reach 0.9 where a surface is rather flat.
 _LEFT, _BETTER_COSINE = 0.5, 0.03
 _BETTER_CORRELATION = 0.1
 _FACING = 0.75
@@ -31,7 +33,7 @@ _FACING = 0.75
 def check_mesh(
     truth: Truth, cameras: Cameras, findings: list[Finding], comparisons: list[Comparison]
 ) -> None:
-    """Add findings on a mesh whose faces or vertex normals look inward."""
+    """Add findings on a mesh whose faces or vertex normals point inward."""
     mesh = truth.mesh
     if mesh is None or len(mesh.faces) == 0:
         return
@@ -42,7 +44,7 @@ def check_mesh(
         hit = hits.face >= 0
         if not bool(hit.any()):
             continue
-        toward = -_rays(small, view)[hit]
+        toward = -pixel_rays(small, view)[hit]
         faces.append(_fraction_facing(_face_normals_hit(mesh, hits)[hit], toward))
         if mesh.normals_world is not None:
             interpolated = hits.interpolate(mesh.normals_world.to(toward), mesh.faces)
@@ -79,7 +81,7 @@ def check_normals(
     findings: list[Finding],
     comparisons: list[Comparison],
 ) -> None:
-    """Add a finding on normal maps that contradict the depth, the mesh or the viewpoint."""
+    """Add a finding on normal maps that disagree with the depth, the mesh or the viewpoint."""
     maps = truth.normals_world
     if maps is None:
         return
@@ -106,7 +108,7 @@ def check_normals(
         halved = 1 - values[best] < _LEFT * (1 - values[0])
         wrong = halved and values[best] > values[0] + _BETTER_COSINE
     else:
-        # Several turns may face the camera; which of them, the shading tells.
+        # Several hypotheses may face the camera; the shading selects one.
         shaded = [_shading_score(views, truth, cameras, one, None) for one in (None, *mistakes)]
         best = int(np.argmax(np.add(values, shaded)))
         wrong = values[0] < _FACING and values[best] > 0.95
@@ -123,7 +125,7 @@ def check_lights(
     findings: list[Finding],
     comparisons: list[Comparison],
 ) -> None:
-    """Add a finding on lights under which the photographs cannot have been taken."""
+    """Add a finding on lights whose shading does not correlate with the photographs."""
     if any(one.name.startswith("normals") for one in findings):
         return
     values = [_shading_score(views, truth, cameras, None, one) for one in (None, *VECTOR_MISTAKES)]
@@ -142,9 +144,9 @@ def _shading_score(
     in_normals: VectorMistake | None,
     in_lights: VectorMistake | None,
 ) -> float:
-    """Correlate the photographs with the shading that normals and lights predict.
+    """Give the correlation of the photographs with the shading of normals and lights.
 
-    The mean over the views, negative ones counting 0; 0 also where one of both is unknown.
+    The mean over the views, negative ones counting 0; 0 also where either is unknown.
     """
     lights, found = truth.lights_world, []
     if lights is None or truth.normals_world is None:
@@ -204,7 +206,7 @@ def _normal_samples(
     elif truth.mesh is not None and len(truth.mesh.faces):
         hits = cast_view(truth.mesh, small, view)
         surface = _face_normals_hit(truth.mesh, hits)
-        outward = (surface * -_rays(small, view)).sum(dim=-1, keepdim=True).sign()
+        outward = (surface * -pixel_rays(small, view)).sum(dim=-1, keepdim=True).sign()
         surface = surface * outward
     if surface is not None:
         known = known & (surface.norm(dim=-1) > 0)
@@ -212,7 +214,7 @@ def _normal_samples(
     return (
         maps[known].to(like),
         surface,
-        -_rays(small, view)[known],
+        -pixel_rays(small, view)[known],
         cameras.cam_from_world[view, :3, :3],
     )
 
@@ -253,13 +255,6 @@ def _fraction_facing(normals: Float[Tensor, "pixel 3"], toward: Float[Tensor, "p
 def _face_normals_hit(mesh: Mesh, hits: Hits) -> Float[Tensor, "height width 3"]:
     normals = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
     return torch.where((hits.face >= 0)[..., None], normals[hits.face.clamp_min(0)], 0)
-
-
-def _rays(cameras: Cameras, view: int) -> Float[Tensor, "height width 3"]:
-    width, height = (int(side) for side in cameras.sizes_px[view])
-    pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
-    rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
-    return rays.reshape(height, width, 3)
 
 
 def _few(num_views: int) -> list[int]:
