@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
 
 # Of scenes on a table, whose world has z up.
@@ -41,6 +42,36 @@ def pinholes(
         cam_from_world=cam_from_world,
         sizes_px=torch.tensor([[width, height]]).repeat(num_views, 1),
     )
+
+
+def panned(cameras: Cameras, shift_px: Float[Tensor, "view 2"]) -> Cameras:
+    """Turn cameras about their centres, so that what was at the principal point is beside it.
+
+    Args:
+        cameras: Any.
+        shift_px: Where that is then, from the principal point. Without roll.
+    """
+    focal_px = cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2]
+    toward = normalize(homogeneous(shift_px / focal_px), dim=-1)
+    x, y, z = toward.unbind(dim=-1)
+    # Rodrigues' formula of the shortest rotation that takes the z axis to ``toward``.
+    rotation = torch.stack(
+        [
+            torch.stack([1 - x * x / (1 + z), -x * y / (1 + z), x], dim=-1),
+            torch.stack([-x * y / (1 + z), 1 - y * y / (1 + z), y], dim=-1),
+            torch.stack([-x, -y, z], dim=-1),
+        ],
+        dim=-2,
+    )
+    pan = rigid(rotation, torch.zeros_like(toward))
+    return cameras.replace(cam_from_world=pan @ cameras.cam_from_world)
+
+
+def cropped(cameras: Cameras, shift_px: Float[Tensor, "view 2"]) -> Cameras:
+    """Cut photographs of the same size out with another centre: all they show shifts."""
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[:, :2, 2] += shift_px
+    return cameras.replace(intrinsics=intrinsics)
 
 
 def arc_cameras(
@@ -141,8 +172,8 @@ def distance_to_fit(
     target_world: Float[Tensor, " 3"],
     *,
     focal_px: float,
-    width: int,
-    height: int,
+    width: float,
+    height: float,
     fill: float,
 ) -> float:
     """Find how near cameras can come for all points to stay in all their pictures.
@@ -170,8 +201,8 @@ def aim_to_fit(
     points_world: Float[Tensor, "point 3"],
     *,
     focal_px: float,
-    width: int,
-    height: int,
+    width: float,
+    height: float,
     fill: float,
 ) -> tuple[Float[Tensor, " 3"], float]:
     """Find what cameras look at, and from how far, to show all points as large as can be.

@@ -30,6 +30,10 @@ class SceneConfig:
             camera; only with the turntable. Else there is nothing beyond the table.
         fixed_table: The table stands still before the camera, too, and the object alone turns;
             only with the turntable. Else it turns with the object.
+        pan_jitter_px: The camera pans and tilts on its tripod between photographs, so that the
+            picture of what stands still shifts by up to so many pixels from where it is meant to
+            be; the object stays in the picture, smaller.
+        crop_jitter_px: The picture is cut out with its centre off by up to so many pixels.
         light: A near point light, whose light falls off over the object, or one far away.
         point_light_distance: Of the near point light, in object sizes; up to a quarter nearer or
             farther.
@@ -43,7 +47,8 @@ class SceneConfig:
         supersample: Rays a pixel, along each side, where pixels differ from their neighbours.
         bits: Of a sample in the photographs.
         encoding: sRGB as cameras write it, or samples proportional to radiance.
-        table: Its texture: cloth is modest, patterned has plenty of features all over.
+        table: Its texture: cloth is modest, patterned has plenty of features all over, plain
+            has none.
         up: Which axis of a mesh file points up.
         rotation_deg: Of the object about the upright axis, counter-clockwise seen from above.
         albedo: Linear red, green and blue, uniform over the object; by default its texture.
@@ -71,6 +76,8 @@ class SceneConfig:
     constant_light: bool = False
     fixed_room: bool = False
     fixed_table: bool = False
+    pan_jitter_px: float = 0.0
+    crop_jitter_px: float = 0.0
     light: Literal["point", "directional"] = "point"
     point_light_distance: float = 2.5
     irradiance: float = 0.85
@@ -83,7 +90,7 @@ class SceneConfig:
     supersample: int = 2
     bits: Literal[8, 16] = 8
     encoding: Literal["srgb", "linear"] = "srgb"
-    table: Literal["cloth", "patterned"] = "cloth"
+    table: Literal["cloth", "patterned", "plain"] = "cloth"
     up: Literal["x", "y", "z"] = "z"
     rotation_deg: float = 0.0
     albedo: tuple[float, float, float] | None = None
@@ -114,6 +121,14 @@ class SceneConfig:
                 name,
                 fixed,
                 f"path turntable instead of {self.path}, for what stands still before the camera",
+            )
+        most = 0.3 * min(self.width, self.height)
+        for name in ("pan_jitter_px", "crop_jitter_px"):
+            require(
+                getattr(self, name) >= 0 and self.jitter_px <= most,
+                name,
+                getattr(self, name),
+                f"0 or more, and both jitters together at most {most:.0f}, 0.3 of the tighter side",
             )
         require(
             not (self.constant_light and self.fixed_point_light),
@@ -153,6 +168,11 @@ class SceneConfig:
         if self.environment is not None:
             return self.environment
         return "none" if self.conductor == "none" else "constant"
+
+    @property
+    def jitter_px(self) -> float:
+        """How far the picture can be from where it is meant to be, for all reasons."""
+        return self.pan_jitter_px + self.crop_jitter_px
 
     @property
     def sensor(self) -> SensorConfig:

@@ -20,7 +20,7 @@ from pimper_torch.evidence.scenes.level_sets import (
 from pimper_torch.evidence.scenes.meshes import icosphere, lathe, moved, potato, push_clear, table
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.scene_object import SceneObject
-from pimper_torch.evidence.scenes.textures import CylinderRegion, Marked, Painted
+from pimper_torch.evidence.scenes.textures import CylinderRegion, Marked, Painted, Uniform
 from pimper_torch.records import Mesh
 
 Recipe = Callable[[torch.Generator], tuple[SceneObject, ...]]
@@ -260,9 +260,17 @@ def patterned_cloth(generator: torch.Generator, half_side: float = 4.0) -> Scene
     return SceneObject(mesh=table(half_side, cells=64), texture=print_, surroundings=True)
 
 
+def plain_cloth(generator: torch.Generator, half_side: float = 4.0) -> SceneObject:
+    """Lay a matte cloth without texture on the table."""
+    return SceneObject(
+        mesh=table(half_side, cells=64), texture=Uniform(albedo=(0.5, 0.5, 0.5)), surroundings=True
+    )
+
+
 TABLES: dict[str, Callable[[torch.Generator], SceneObject]] = {
     "cloth": cloth,
     "patterned": patterned_cloth,
+    "plain": plain_cloth,
 }
 RECIPES: dict[str, Recipe] = {
     "mug": mug,

@@ -14,8 +14,10 @@ from pimper_torch.evidence.scenes.cameras import (
     UP,
     aim_to_fit,
     arc_directions,
+    cropped,
     handheld_directions,
     look_at,
+    panned,
     pinholes,
     turntable_directions,
 )
@@ -41,6 +43,7 @@ from pimper_torch.records import Cameras, Mesh
 OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
 _MARGIN = 1.15  # of the turntable's radius over the object's reach from the axis
 _ENVIRONMENT = 1 << 20  # numbers of environments; those of photographs' noise are smaller
+_PAN, _CROP = 1 << 21, (1 << 21) + 1  # numbers of what shifts photographs
 _FOCAL = 1.6  # widths of the picture: a normal to short telephoto lens
 
 
@@ -125,8 +128,8 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
         toward,
         points,
         focal_px=focal_px,
-        width=config.width,
-        height=config.height,
+        width=config.width - 2 * config.jitter_px,
+        height=config.height - 2 * config.jitter_px,
         fill=config.fill,
     )
     eyes = target + distance * toward
@@ -141,11 +144,25 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
         name=str(name_or_path),
         config=config,
         objects=(*objects, *turning),
-        cameras=pinholes(poses, focal_px, config.width, config.height),
+        cameras=_shifted(pinholes(poses, focal_px, config.width, config.height), config),
         lights=lights.replace(environments=environments),
         fixed=fixed,
         world_from_room=world_from_room,
     )
+
+
+def _shifted(cameras: Cameras, config: SceneConfig) -> Cameras:
+    """Pan the cameras and crop their photographs, as the settings say."""
+    cameras = panned(cameras, config.pan_jitter_px * _in_disc(config, _PAN))
+    return cropped(cameras, config.crop_jitter_px * _in_disc(config, _CROP))
+
+
+def _in_disc(config: SceneConfig, number: int) -> Float[Tensor, "view 2"]:
+    """Draw a point of the unit disc for every photograph, evenly over its area."""
+    generator = _generator(config.seed, number)
+    drawn = torch.rand(config.num_views, 2, generator=generator, dtype=torch.float64)
+    radius, angle = drawn[:, :1].sqrt(), 2 * torch.pi * drawn[:, 1:]
+    return radius * torch.cat([angle.cos(), angle.sin()], dim=1)
 
 
 def _lights(

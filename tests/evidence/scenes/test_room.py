@@ -1,4 +1,5 @@
 import pytest
+import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
@@ -10,7 +11,7 @@ from pimper_torch.evidence.scenes.scene import build_scene
 from pimper_torch.evidence.scenes.stage import Stage
 from pimper_torch.evidence.scenes.write import render_scene
 from pimper_torch.geometry.frames import transform
-from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
@@ -130,3 +131,90 @@ def test_the_truth_is_told_in_the_frame_of_the_object(egg, tmp_path, fixed_table
         assert_close(frame.depth[shown], bare.depth[shown])
         assert_close(frame.albedo[shown], bare.albedo[shown])
         assert_close(frame.normals_world[shown], bare.normals_world[shown])
+
+
+def seen_again(scene, first, second, view):
+    """Follow what stands still from photograph 0 to another; pixels in both, where seen."""
+    cameras = scene.cameras
+    at = pixel_centers(80, 60, like=cameras.intrinsics).reshape(-1, 2)
+    rays = rays_through(at, cameras.cam_from_world[0], cameras.intrinsics[0])
+    points = cameras.centers_world[0] + first.depth.reshape(-1, 1).double() * rays
+    still = points[:, 2] < -0.1  # the floor; the wall is above its edge
+    there = scene.world_from_room[view] @ scene.world_from_room[0].inverse()
+    points = transform(there, points)
+    pixels, _ = project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
+    u, v = pixels.floor().long().unbind(dim=-1)
+    framed = (u >= 0) & (v >= 0) & (u < 80) & (v < 60)
+    row, column = v.clamp(0, 59), u.clamp(0, 79)
+    away = transform(cameras.cam_from_world[view], points)[:, 2]
+    seen = still & framed & ((second.depth[row, column] - away).abs() < 0.05)
+    albedo = first.albedo.reshape(-1, 3)
+    followed = (albedo - second.albedo[row, column]).abs().mean(dim=-1)[seen]
+    unfollowed = (albedo - second.albedo.reshape(-1, 3)).abs().mean(dim=-1)[seen]
+    assert seen.sum() > 200
+    # The finest pattern is less than a pixel, 0.07 wide here, so that parts of one show.
+    assert followed.mean() < 0.5 * unfollowed.mean()
+    return at[seen], pixels[seen]
+
+
+FIXED = {"fixed_point_light": True, "fixed_room": True, "fixed_table": True}
+
+
+def test_a_crop_shifts_all_that_stands_still_by_one_vector_and_the_cameras_say_which(egg):
+    scene = build_scene(egg, settings(crop_jitter_px=9.0, **FIXED))
+    shift = scene.cameras.intrinsics[:, :2, 2] - scene.cameras.intrinsics.new_tensor([40.0, 30.0])
+    assert shift.norm(dim=1).max() < 9
+    assert (shift[1:] - shift[:-1]).norm(dim=1).max() > 3
+    first = photograph(scene, 0)
+    for view in (2, 3):
+        before, after = seen_again(scene, first, photograph(scene, view), view)
+        assert_close(after - before, (shift[view] - shift[0]).expand_as(before))
+
+
+def test_a_pan_leaves_the_camera_in_its_place_and_moves_what_stands_still_by_a_homography(egg):
+    scene, calm = (build_scene(egg, settings(pan_jitter_px=px, **FIXED)) for px in (9.0, 0.0))
+    in_room = [
+        transform(scene.world_from_room.inverse(), scene.cameras.centers_world[:, None])[:, 0]
+        for scene in (scene, calm)
+    ]
+    for centers in in_room:
+        assert_close(centers, centers[:1].expand_as(centers))
+    first = photograph(scene, 0)
+    K = scene.cameras.intrinsics[0]
+    in_camera = scene.cameras.cam_from_world @ scene.world_from_room
+    for view in (2, 3):
+        before, after = seen_again(scene, first, photograph(scene, view), view)
+        turn = (in_camera[view] @ in_camera[0].inverse())[:3, :3]
+        mapped = homogeneous(before) @ (K @ turn @ K.inverse()).mT
+        assert_close(mapped[:, :2] / mapped[:, 2:], after)
+        assert (after - before).norm(dim=1).amin() > 0.5
+        assert (after - before).std(dim=0).max() < 1.5  # nearly one vector, for so small a turn
+
+
+@pytest.mark.parametrize("jitter", [{"crop_jitter_px": 12.0}, {"pan_jitter_px": 12.0}])
+def test_the_object_is_where_the_true_cameras_see_it_and_whole_in_every_photograph(egg, jitter):
+    scene = build_scene(egg, settings(**FIXED, **jitter))
+    cameras = scene.cameras
+    places = []
+    for view in range(5):
+        pixels, _ = project(
+            scene.object_mesh.vertices_world, cameras.cam_from_world[view], cameras.intrinsics[view]
+        )
+        assert pixels.amin() > 0
+        assert (pixels.amax(dim=0) < pixels.new_tensor([80, 60])).all()
+        row, column = photograph(scene, view).foreground.nonzero().unbind(dim=1)
+        shown = torch.stack([column, row], dim=1).double() + 0.5
+        assert_close(shown.amin(dim=0), pixels.amin(dim=0), atol=1.0, rtol=0)  # whole pixels
+        assert_close(shown.amax(dim=0), pixels.amax(dim=0), atol=1.0, rtol=0)
+        places.append(pixels.mean(dim=0))
+    assert torch.stack(places).std(dim=0).max() > 2
+
+
+def test_a_jitter_that_leaves_no_room_for_the_object_is_refused():
+    with pytest.raises(ConfigError, match=r"pan_jitter_px is 9.*at most 18"):
+        settings(pan_jitter_px=9.0, crop_jitter_px=10.0)
+
+
+def test_a_plain_table_has_no_texture(egg):
+    (table,) = build_scene(egg, settings(table="plain")).objects[1:]
+    assert table.texture(table.mesh.vertices_world).std(dim=0).max() == 0
