@@ -125,9 +125,16 @@ def _leave_out_room(space: Workspace, settings: RegistrationSettings) -> None:
     if rest.room:
         left = sum(int(resting.sum()) for resting in rest.features)
         found = sum(len(resting) for resting in rest.features)
+        how = "lie still in the photographs while others move"
+        if rest.shift_px:
+            how = (
+                f"shift together between photographs, by up to {rest.shift_px:.0f} px, as "
+                "where a camera is turned in its place or pictures are cropped, while others move "
+                "otherwise"
+            )
         warnings.warn(
-            f"{left} of {found} features lie still in the photographs while others move: they are "
-            "taken for those of a room before which the object turns, and are left out.",
+            f"{left} of {found} features {how}: they are taken for those of a room before which "
+            "the object turns, and are left out.",
             PimperWarning,
             stacklevel=2,
         )

@@ -53,12 +53,15 @@ class StaticBackground(Record):
         moving_pairs: Pairs with still matches in which others move by one epipolar geometry.
         violating_fraction: Of the moving matches in those, the ones that no geometry explains
             together with the still ones; 0 without such pairs.
+        shift_px: How far the room shifts in a photograph, at most, before a camera that was turned
+            in its place or whose pictures were cropped; 0 where it is at rest.
     """
 
     features: tuple[Bool[Tensor, " _"], ...]
     still_fraction: float
     moving_pairs: int
     violating_fraction: float
+    shift_px: float = 0.0
 
     @property
     def room(self) -> bool:

@@ -95,3 +95,31 @@ def test_a_rigid_scene_keeps_all_its_matches(tmp_path, generator):
     for one, other in zip(before, read(path, scene), strict=True):
         assert torch.equal(one[0], other[0])
         assert torch.equal(one[1], other[1])
+
+
+def test_a_room_that_shifts_is_left_out_as_one_at_rest_is(tmp_path, generator):
+    scene = turntable(
+        generator, turning=250, resting=300, count=6, span_deg=100.0, shift_px=90.0, table=80
+    )
+    path = stored(scene, tmp_path / "database.db")
+    former = scene.thing
+    rest = leave_out_room(path, SETTINGS)
+    assert rest.room
+    assert 40 < rest.shift_px < 180
+    for thing, resting in zip(former, rest.features, strict=True):
+        assert resting[thing >= 250].double().mean() > 0.98
+        assert resting[thing < 250].double().mean() < 0.02
+    scene.thing = [one[~resting] for one, resting in zip(former, rest.features, strict=True)]
+    for pair, (_, verified) in zip(scene.pairs, read(path, scene), strict=True):
+        assert len(verified) >= 15
+        assert scene.right(pair.replace(matches=verified)).double().mean() > 0.95
+
+
+def test_a_table_that_turns_with_the_object_keeps_its_matches(tmp_path, generator):
+    scene = turntable(generator, turning=400, resting=0, count=5, span_deg=40.0, table=250)
+    path = stored(scene, tmp_path / "database.db")
+    before = read(path, scene)
+    assert not leave_out_room(path, SETTINGS).room
+    for one, other in zip(before, read(path, scene), strict=True):
+        assert torch.equal(one[0], other[0])
+        assert torch.equal(one[1], other[1])

@@ -83,6 +83,19 @@ def test_cameras_before_a_room_and_a_table_at_rest_are_those_of_the_object(solid
     assert without < 1.5 * masked  # the same features, but for those that the masks' rims cut
 
 
+@pytest.mark.parametrize("jitter", [{"pan_jitter_px": 30.0}, {"crop_jitter_px": 30.0}])
+def test_cameras_before_a_room_that_shifts_are_those_of_the_object(solid, jitter):
+    larger = {"width": 480, "height": 360, "num_views": 36}
+    scene = furnished(solid, fixed_table=True, **larger, **jitter)
+    views = photographs(scene, list(range(6)))
+    with pytest.warns(PimperWarning, match="features shift together .* are left out"):
+        without = Reconstruct(QUICK)(views.replace(masks=None))
+    masked = Reconstruct(QUICK)(views)
+    assert without.unregistered == masked.unregistered == ()
+    without, masked = (float(center_errors(one, scene).median()) for one in (without, masked))
+    assert without < max(0.01, 1.5 * masked)
+
+
 @pytest.mark.slow
 def test_cameras_all_round_a_turntable_are_as_exact_as_with_masks(solid):
     scene = furnished(solid)
