@@ -157,6 +157,7 @@ def _(scene: SparseScene) -> dict[str, int | float]:
         "sparse_points": len(scene.points_world),
         "mean_track_length": length,
         "mean_reprojection_px": _mean(scene.reprojection_errors_px),
+        "doubtful": int(bool(scene.doubt)),
     }
 
 

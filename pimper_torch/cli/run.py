@@ -111,6 +111,8 @@ def _conclude(console: Console, job: Job, result: Reconstruction) -> None:
     console.print(table)
     fewer = "" if job.common.full_mesh else " (simplified; --full-mesh writes every vertex)"
     console.print(headline(result), highlight=False)
+    if result.scene.doubt:
+        console.print(result.scene.doubt, style="bold yellow", highlight=False, soft_wrap=True)
     console.print(
         f"{job.out}/mesh.ply is the surface{fewer}, {job.out}/overview.png shows it.",
         highlight=False,

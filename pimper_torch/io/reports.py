@@ -135,6 +135,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "views": scene.views.num_views + len(scene.unregistered),
         "registered": scene.views.num_views,
         "unregistered": list(scene.unregistered),
+        "doubt": scene.doubt or None,
         "sparse_points": len(scene.points_world),
         "mesh_points": len(result.coarse.mesh.vertices_world),
         "triangles": len(result.coarse.mesh.faces),

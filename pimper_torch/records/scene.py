@@ -46,6 +46,8 @@ class SparseScene(Record):
         observation_pixels: Where, in the photograph before undistortion.
         lenses: The photographs' own intrinsics.
         unregistered: Names of the photographs that found no place in the model.
+        doubt: Why the cameras may be wrong, and what to do; empty where nothing speaks against
+            them.
     """
 
     views: Views
@@ -57,6 +59,7 @@ class SparseScene(Record):
     observation_pixels: Float[Tensor, "observation 2"]
     lenses: tuple[Lens, ...]
     unregistered: tuple[str, ...] = ()
+    doubt: str = ""
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List what does not belong together."""

@@ -14,7 +14,7 @@ but are no such ones: by :math:`I + t n^T / d`, which shears and does not preser
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Complex, Float
@@ -68,18 +68,14 @@ def reference_from_photographs(
         ``A`` of each photograph, the identity where one cannot be tied; ``None`` where most
         cannot, or where nothing shifts by a pixel.
     """
-    matched = _both_ways(keypoints, pairs)
+    matched = both_ways(keypoints, pairs)
     identity, centre = torch.eye(3, dtype=torch.float64), picture_centre(keypoints)
     count = len(keypoints)
     best: dict[int, Tensor] = {}
-    for slot in range(_REFERENCES):
-        reference = (2 * slot + 1) * count // (2 * _REFERENCES)
-        tied = {reference: identity}
-        for view, ends in matched[reference].items():
-            found = fit_map(ends[1], ends[0], centre, max_error_px, generator)
-            if found is not None and found[1].sum() >= fewest:
-                tied[view] = found[0]
-        best = max(best, tied, key=len)
+    for reference in references(count):
+        tied = tied_to(matched[reference], centre, max_error_px, fewest, generator)
+        maps = {reference: identity} | {view: found[0] for view, found in tied.items()}
+        best = max(best, maps, key=len)
     if len(best) < _MIN_TIED * count or shift_px(tuple(best.values()), keypoints) < 1:
         return None
     for _ in range(_SWEEPS):
@@ -95,6 +91,38 @@ def reference_from_photographs(
             if found is not None and found[1].sum() >= fewest:
                 best[view] = found[0]
     return tuple(best.get(view, identity) for view in range(count))
+
+
+def references(count: int) -> list[int]:
+    """Name a few photographs, evenly over a sequence."""
+    return sorted({(2 * slot + 1) * count // (2 * _REFERENCES) for slot in range(_REFERENCES)})
+
+
+def tied_to(
+    matched: Mapping[int, Ends],
+    centre: Float[Tensor, " 2"],
+    max_error_px: float,
+    fewest: int,
+    generator: torch.Generator,
+) -> dict[int, tuple[Float[Tensor, "3 3"], Bool[Tensor, " match"]]]:
+    """Map photographs to a reference, each by itself.
+
+    Args:
+        matched: Pixels in the reference and in each other photograph.
+        centre: Of the pictures.
+        max_error_px: Distance up to which a match follows a map.
+        fewest: Matches that tie a photograph.
+        generator: Of random numbers.
+
+    Returns:
+        The map to the reference of each photograph that can be tied, and the matches that follow.
+    """
+    tied = {}
+    for view, (here, there) in matched.items():
+        found = fit_map(there, here, centre, max_error_px, generator)
+        if found is not None and found[1].sum() >= fewest:
+            tied[view] = found
+    return tied
 
 
 def shift_px(maps: Sequence[Float[Tensor, "3 3"]], keypoints: Keypoints) -> float:
@@ -205,7 +233,7 @@ def _similarity(scale: Complex[Tensor, ""], shift: Complex[Tensor, ""]) -> Float
     return torch.stack([a, -b, right, b, a, down, none, none, none + 1]).reshape(3, 3)
 
 
-def _both_ways(keypoints: Keypoints, pairs: Sequence[Pair]) -> list[dict[int, Ends]]:
+def both_ways(keypoints: Keypoints, pairs: Sequence[Pair]) -> list[dict[int, Ends]]:
     """Give, photograph by photograph, the matches with each other one: pixels here and there."""
     found: list[dict[int, Ends]] = [{} for _ in keypoints]
     for pair in pairs:

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import invert_rigid
@@ -32,11 +34,15 @@ def count_spread_views(model: SparseModel, fewest: int) -> int:
         model: Any.
         fewest: Points that a view must see whose widest angle between rays is 4 degrees or more.
     """
+    seen = model.observed[wide_points(model)].sum(dim=0)
+    return int((seen >= fewest).sum())
+
+
+def wide_points(model: SparseModel) -> Bool[Tensor, " point"]:
+    """Mark points whose widest angle between rays is 4 degrees or more."""
     centers = invert_rigid(model.cam_from_world)[:, :3, 3]
     angles = triangulation_angles(model.points_world, model.observed, centers)
-    wide = torch.rad2deg(angles) >= MIN_ANGLE_DEG
-    seen = model.observed[wide].sum(dim=0)
-    return int((seen >= fewest).sum())
+    return torch.rad2deg(angles) >= MIN_ANGLE_DEG
 
 
 def require_motion(rest: StaticBackground, num_views: int) -> None:

@@ -1,6 +1,6 @@
 """Leave features of a room at rest out of COLMAP's database."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,7 @@ class _Found:
 
 
 def _at_rest(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found:
-    return _find(matched.keypoints, matched.pairs, verifier, settings, STILL_PX)
+    return _find(matched.keypoints, track(matched.pairs), verifier, settings, STILL_PX)
 
 
 def _shifted(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found | None:
@@ -108,21 +108,21 @@ def _shifted(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) 
     some = sorted(matched.pairs, key=both, reverse=True)[:_TRIED]
     if not _find(pixels, some, verifier, settings, _SHIFTED_PX).rest.room:
         return None
-    found = _find(pixels, matched.pairs, verifier, settings, _SHIFTED_PX)
+    found = _find(pixels, track(matched.pairs), verifier, settings, _SHIFTED_PX)
     shift = shift_px(maps, matched.keypoints)
     return replace(found, rest=found.rest.replace(shift_px=shift))
 
 
 def _find(
     keypoints: Keypoints,
-    pairs: Sequence[Pair],
+    pairs: Iterable[Pair],
     verifier: "_Verifier",
     settings: MatchSettings,
     still_px: float,
 ) -> _Found:
     rest = find_static_background(
         keypoints,
-        track(pairs),
+        pairs,
         verifier,
         still_px=still_px,
         max_error_px=settings.max_error_px,

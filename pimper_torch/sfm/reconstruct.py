@@ -16,6 +16,7 @@ from pimper_torch.sfm.binding import thread_count
 from pimper_torch.sfm.cache import KeptModel, ModelCache, model_key
 from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
+from pimper_torch.sfm.doubt import doubt
 from pimper_torch.sfm.existing import existing_model
 from pimper_torch.sfm.features import FeatureSettings, find_features
 from pimper_torch.sfm.mapping import MapSettings
@@ -182,7 +183,10 @@ class Reconstruct(Stage):
 
 
 def placed_scene(views: Views, model: SparseModel) -> SparseScene:
-    """Put photographs beside their cameras and cloud; warn of those that the model lacks."""
+    """Put photographs beside their cameras and cloud.
+
+    Warns of those that the model lacks, and of a model that is doubtful.
+    """
     missing = [name for name in views.names if name not in model.names]
     if missing:
         warnings.warn(
@@ -191,7 +195,10 @@ def placed_scene(views: Views, model: SparseModel) -> SparseScene:
             PimperWarning,
             stacklevel=3,
         )
-    return assemble_scene(views, model)
+    reason = doubt(model, views.num_views)
+    if reason:
+        warnings.warn(reason, PimperWarning, stacklevel=3)
+    return assemble_scene(views, model).replace(doubt=reason)
 
 
 def find_model(views: Views, config: ReconstructConfig, cache: ModelCache | None) -> KeptModel:

@@ -55,6 +55,7 @@ def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
     assert summary["preset"] == "paper"
     assert summary["unregistered"] == ["d.png"]
     assert (summary["views"], summary["registered"]) == (4, 3)
+    assert summary["doubt"] is None
     lights = json.loads((out / "lights.json").read_text())
     assert [view["name"] for view in lights["views"]] == ["a.png", "b.png", "c.png"]
 
@@ -217,6 +218,8 @@ def test_the_common_light_is_what_the_patches_see_of_one_light(reconstruction):
 
 def test_the_summary_counts(reconstruction):
     summary = summary_report(reconstruction, {})
+    doubted = reconstruction.replace(scene=reconstruction.scene.replace(doubt="All is flat."))
+    assert summary_report(doubted, {})["doubt"] == "All is flat."
     wanted = {
         "mesh_points": 4,
         "triangles": 2,

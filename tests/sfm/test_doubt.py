@@ -1,0 +1,101 @@
+import pytest
+import torch
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Lens, Views
+from pimper_torch.sfm.doubt import doubt, following_fraction
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.reconstruct import Reconstruct
+from pimper_torch.sfm.scene import assemble_scene, write_model
+from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, orbit, seen_of_ball
+
+LENS = Lens(
+    camera=1,
+    model="SIMPLE_PINHOLE",
+    params=(FOCAL, WIDTH / 2, HEIGHT / 2),
+    width=WIDTH,
+    height=HEIGHT,
+)
+
+
+def model_of(points, cam_from_world, pixels, generator):
+    """Give a model that explains its observations to 0.3 px; NaN where not seen."""
+    view, point = torch.nonzero(pixels.isfinite().all(dim=-1), as_tuple=True)
+    noise = 0.3 * torch.randn(len(view), 2, generator=generator, dtype=torch.float64)
+    return SparseModel(
+        names=tuple(f"{index}.png" for index in range(len(cam_from_world))),
+        lenses=(LENS,) * len(cam_from_world),
+        cam_from_world=cam_from_world,
+        points_world=points,
+        observation_point=point,
+        observation_view=view,
+        observation_pixels=pixels[view, point] + noise,
+    )
+
+
+def of_a_ball(generator, count=12, span_deg=330.0):
+    cameras = orbit(count, span_deg)
+    points = torch.randn(400, 3, generator=generator.clone_state(), dtype=torch.float64)
+    points = points / points.norm(dim=1, keepdim=True)  # those of seen_of_ball
+    pixels = seen_of_ball(generator, 400, cameras)
+    return model_of(points, cameras.cam_from_world, pixels, generator)
+
+
+def of_a_room(generator, count=12):
+    """Give the wrong model of cropped photographs: a camera that shifts before a wall."""
+    cameras = orbit(count, 330.0)
+    poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    poses[:, :2, 3] = torch.rand(count, 2, generator=generator, dtype=torch.float64) - 0.5
+    poses[:, 2, 3] = 5.0
+    points = 3 * torch.rand(400, 3, generator=generator, dtype=torch.float64) - 1.5
+    points[:, 2] *= 0.02
+    pixels, _ = project(points, poses, cameras.intrinsics)
+    return model_of(points, poses, pixels, generator)
+
+
+def test_points_that_follow_a_camera_in_its_place_make_a_consistent_model_that_is_doubtful(
+    generator,
+):
+    model = of_a_room(generator)
+    assert following_fraction(model) > 0.9
+    reason = doubt(model, model.num_views)
+    assert "stays in its place" in reason
+    for way in ("--masks", "plain cloth"):
+        assert way in reason
+
+
+@pytest.mark.parametrize(("count", "span_deg"), [(12, 330.0), (8, 50.0)])
+def test_an_object_seen_from_round_it_is_believed(generator, count, span_deg):
+    model = of_a_ball(generator, count, span_deg)
+    assert following_fraction(model) < 0.3
+    assert doubt(model, model.num_views) == ""
+
+
+def test_a_model_of_less_than_half_of_the_photographs_is_doubtful(generator):
+    model = of_a_ball(generator, 6, 90.0)
+    assert doubt(model, 11) == ""
+    assert "6 of 13 photographs are registered and see" in doubt(model, 13)
+
+
+def test_a_doubtful_model_says_so_in_the_scene_and_in_a_warning(generator, tmp_path):
+    model = of_a_room(generator, 5)
+    views = Views(
+        images=torch.rand(5, 3, HEIGHT, WIDTH, generator=generator),
+        sizes_px=torch.tensor([[WIDTH, HEIGHT]] * 5),
+        names=model.names,
+        focals_px=torch.full((5,), torch.nan),
+    )
+    write_model(assemble_scene(views, model), tmp_path)
+    with pytest.warns(PimperWarning, match="cameras are doubtful"):
+        scene = Reconstruct()(views, tmp_path)
+    assert "stays in its place" in scene.doubt
+
+
+def test_points_under_small_angles_are_doubtful_though_they_do_not_follow(generator):
+    cameras = orbit(8, 3.9)
+    points = 2 * torch.randn(400, 3, generator=generator, dtype=torch.float64)
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    model = model_of(points, cameras.cam_from_world, pixels, generator)
+    assert following_fraction(model) < 0.5
+    assert "0 of 8 photographs are registered and see most" in doubt(model, 8)
