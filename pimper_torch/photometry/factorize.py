@@ -23,7 +23,7 @@ from pimper_torch.photometry.light_field import LightField, faces_light
 from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
-from pimper_torch.photometry.rows import Rows, on_raster, rows_of
+from pimper_torch.photometry.rows import Rows, in_row, on_raster, rows_of
 from pimper_torch.photometry.sample_estimates import fit_albedo, initial_shading, refine_on_manifold
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
 from pimper_torch.photometry.status import patch_status, warn_of_undetermined
@@ -235,9 +235,8 @@ class Factorize(Stage):
         for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
             normals = transferred_normals(seen.patches.coarse, templates)
             bucket = _Bucket(templates=templates, registered=registered, normals=normals)
-            enough_views = bucket.replace(registered=_without_shadows(bucket, light))
-            prepared = self._prepare(enough_views, light.field)
-            buckets.append(self._photometry(enough_views, prepared, self._solve(prepared.problem)))
+            prepared = self._prepare(bucket, _illuminated(bucket, light), light.field)
+            buckets.append(self._photometry(bucket, prepared, self._solve(prepared.problem)))
         return PhotometricPatches(patches=seen.patches, buckets=tuple(buckets))
 
     def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
@@ -246,7 +245,13 @@ class Factorize(Stage):
         warn_of_undetermined(solved.buckets, config.min_views, config.min_light_variation)
         return in_gauge(solved)
 
-    def _prepare(self, bucket: _Bucket, field: LightField) -> _Prepared:
+    def _prepare(
+        self,
+        bucket: _Bucket,
+        illuminated: Bool[Tensor, "patch view height width"],
+        field: LightField,
+    ) -> _Prepared:
+        """Pose the problem; where light determines no normals, samples in shadow take part."""
         config = self.config
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
         centre = invert_rigid(patch_from_world)[:, :3, 3]
@@ -254,18 +259,18 @@ class Factorize(Stage):
         point_light = rotate(patch_from_world, field.point_light_at(centre))
         rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
         observed = bucket.registered.valid & bucket.templates.inside[:, None]
-        finite = rows.seen.flatten(1).any(dim=1)
-        rows = rows.replace(seen=rows.seen & faces_light(point_light, rows.normals))
+        lit = in_row(illuminated, rows.index) & rows.seen & faces_light(point_light, rows.normals)
         status = patch_status(
             observed.flatten(1).any(dim=1),
-            finite,
-            rows.seen,
+            rows.seen.flatten(1).any(dim=1),
+            lit,
             anchor,
             config.min_views,
             config.min_light_variation,
         )
         raster = bucket.normals.shape[1] * bucket.normals.shape[2]
         refused = status != int(PatchStatus.DETERMINED)
+        rows = rows.only(lit | (rows.seen & refused[:, None, None]))
         anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
         problem = self._problem(rows, anchor, refused, raster)
         return _Prepared(rows=rows, status=status, problem=problem)
@@ -366,11 +371,11 @@ def _in_parts(seen: PatchViews, bucket: int) -> list[PatchViews]:
     ]
 
 
-def _without_shadows(bucket: _Bucket, light: Illumination) -> Observations:
-    """Mark samples in cast shadows, or near their edges, as missing."""
+def _illuminated(bucket: _Bucket, light: Illumination) -> Bool[Tensor, "patch view height width"]:
+    """Mark observed samples that are not in cast shadows, or near their edges."""
     registered, templates = bucket.registered, bucket.templates
     if light.caster is None:
-        return registered
+        return registered.valid
     world_from_patch = invert_rigid(templates.patch_from_world)
     raster = templates.points_patch.shape
     points_world = transform(world_from_patch, templates.points_patch.flatten(1, 2))
@@ -386,7 +391,7 @@ def _without_shadows(bucket: _Bucket, light: Illumination) -> Observations:
         seen=registered.valid,
     )
     reached = (shadows.lit & shadows.sure).movedim(-1, 1)
-    return registered.replace(valid=registered.valid & reached)
+    return registered.valid & reached
 
 
 def _exposed(rows: Rows, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:

@@ -26,6 +26,11 @@ class Rows(Record):
     seen: Bool[Tensor, "patch view sample"]
     normals: Float[Tensor, "patch sample 3"]
 
+    def only(self, some: Bool[Tensor, "patch view sample"]) -> "Rows":
+        """Take all others as missing."""
+        seen = self.seen & some
+        return self.replace(seen=seen, radiance=torch.where(seen[:, :, None], self.radiance, 0))
+
 
 def rows_of(
     templates: Templates, registered: Observations, normals: Float[Tensor, "patch height width 3"]
@@ -48,6 +53,14 @@ def rows_of(
         seen=seen,
         normals=normals.flatten(1, 2).gather(1, index[..., None].expand(-1, -1, 3)),
     )
+
+
+def in_row(
+    raster: Bool[Tensor, "patch view height width"], index: Int[Tensor, "patch sample"]
+) -> Bool[Tensor, "patch view sample"]:
+    """Take the samples of a row from their rasters."""
+    flat = raster.flatten(2)
+    return flat.gather(2, index[:, None].expand(-1, flat.shape[1], -1))
 
 
 def on_raster(

@@ -7,6 +7,7 @@ from torch.testing import assert_close
 from pimper_torch.chains.presets import load_config
 from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.patches.transfer import coarse_normals
+from pimper_torch.photometry import factorize
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.records import PatchStatus, PatchViews
@@ -133,6 +134,24 @@ def test_without_normals_a_patch_still_has_its_own_lights_and_albedo(scene):
         assert_close(predicted[one.valid], one.gray[one.valid], rtol=0.03, atol=0)
         assert (bucket.convergence.residual < 0.01).all()
         assert (bucket.observed == one.valid.any(dim=1)).all()
+
+
+def test_a_patch_in_shadow_has_lights_and_albedo_of_the_shadow(scene, monkeypatch):
+    true = scene(bumps=0.0)
+
+    def illuminated(bucket, _):
+        return bucket.registered.valid & (bucket.templates.facet != 1)[:, None, None, None]
+
+    monkeypatch.setattr(factorize, "_illuminated", illuminated)
+    with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
+        found = Factorize()(true.seen).buckets[0]
+    observations = true.seen.buckets[0]
+    basis = harmonics(coarse_normals(true.seen.patches.coarse, true.seen.patches.buckets[0]))
+    shading = torch.einsum("fi,hwi->fhw", found.lights_patch[1], basis[1])
+    predicted, seen = shading * found.albedo[1].mean(dim=-1), observations.valid[1]
+    assert not found.valid[1].any()
+    assert (found.observed[1] == seen.any(dim=0)).all()
+    assert_close(predicted[seen], observations.gray[1][seen], rtol=0.01, atol=0)
 
 
 def spoil(seen: PatchViews, how: str) -> PatchViews:
