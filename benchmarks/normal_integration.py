@@ -92,7 +92,7 @@ def depth_error(one: NormalMap, depth: Tensor) -> float:
 def with_true_weights(one: NormalMap) -> Tensor:
     """Solve with the weights that the true depth gives."""
     steps, _, weights = at_the_truth(one)
-    return RasterSystem(*weights).fit_steps(*steps.wanted).exp()
+    return RasterSystem(*weights).fit_steps(*steps.target).exp()
 
 
 def true_bias(one: NormalMap) -> list[float]:
@@ -160,7 +160,7 @@ def rotated_by(one: NormalMap, found: IntegratedMap) -> Tensor:
         steps = perspective_steps(one.normals.double(), one.mask, K)
     across = unknown.diff(dim=1) / steps.unit_right
     along = unknown.diff(dim=0) / steps.unit_down
-    kept = [steps.known_right, steps.known_down]
+    kept = [steps.reliable_right, steps.reliable_down]
     if found.continuity is not None:
         kept[0] = kept[0] & (found.continuity.right > 0.25)
         kept[1] = kept[1] & (found.continuity.down > 0.25)

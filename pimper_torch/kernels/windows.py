@@ -201,7 +201,7 @@ def window_scores(
         shift: Of the same, ``source 3``.
         tone: Of the sources, ``source height width``.
         usable: Valid pixels of the sources.
-        weight: Of the pixels of every window, ``place height width``; 0 where ``valid`` is false.
+        weight: Of the pixels of every window, ``entry height width``; 0 where ``valid`` is false.
         deviation: That weight times the tone's difference to the window's mean.
         power: Variance of the tone in every window.
         valid: Of the reference view; elsewhere the score is 0.

@@ -71,8 +71,8 @@ def compressed_equations(
 
     size = len(damping)
     each = torch.arange(size)[:, None]
-    held = (each, torch.ones(size, 1, dtype=start.dtype), start, damping)
-    sets = [_arrays(*kind) for kind in (held, *kinds) if len(kind[0])]
+    prior = (each, torch.ones(size, 1, dtype=start.dtype), start, damping)
+    sets = [_arrays(*kind) for kind in (prior, *kinds) if len(kind[0])]
     counts, side = np.zeros(size, np.int32), np.zeros(size)
     for unknowns, coefficients, targets, weights in sets:
         kernels.count(unknowns, counts)

@@ -23,7 +23,7 @@ DEFAULT_TOLERANCE = 1e-10
 # A choice: the hardest systems of `benchmarks/linear_systems.py` take 25 cycles.
 _MAX_CYCLES = 300
 
-# Residual, in tolerances, that is accepted where a larger error was asked for: a choice, as the
+# Residual, in tolerances, that is accepted under a larger tolerance: a choice, as the
 # hierarchy only estimates the energy norm that the tolerance bounds.
 _RESIDUAL_TOLERANCES = 10.0
 

@@ -29,12 +29,11 @@ from pimper_torch.photometry.bilinear import (
     equations_of_views,
     keep_scale,
     robust_weights,
-    to_factors,
 )
-from pimper_torch.photometry.iteration import RUNNING, iterate
+from pimper_torch.photometry.iteration import RUNNING, State, iterate
 from pimper_torch.photometry.quadratics import diagonal, solve_packed
 from pimper_torch.photometry.robust import Squares
-from pimper_torch.records import Record, StopCause
+from pimper_torch.records import StopCause
 
 # The penalty starts at this fraction of the mean eigenvalue of a sample's data term, and grows by
 # the factor below in each step up to the cap. A stiff penalty couples lights and shading, and
@@ -46,11 +45,8 @@ PENALTY_CAP = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _State(Record):
-    lights: Float[Tensor, "patch view rank"]
-    shading: Float[Tensor, "patch rank sample"]
+class _State(State):
     multiplier: Float[Tensor, "patch rank sample"]
-    weight: Float[Tensor, "patch view sample"]
 
 
 def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Factors:
@@ -81,8 +77,7 @@ def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Fact
             multiplier=torch.zeros_like(problem.shading),
             weight=robust_weights(problem, problem.lights, problem.shading),
         )
-        state, taken, cause = iterate(problem, start, advance, max_iterations)
-        return to_factors(problem, state.lights, state.shading, state.weight, taken, cause)
+        return iterate(problem, start, advance, max_iterations)
 
 
 def _step(problem: Bilinear, state: _State, step: int) -> tuple[_State, Float[Tensor, " patch"]]:

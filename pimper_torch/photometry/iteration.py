@@ -2,16 +2,15 @@
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.photometry.bilinear import Bilinear
+from pimper_torch.photometry.bilinear import Bilinear, Factors, to_factors
 from pimper_torch.records import Record, StopCause
-
-State = TypeVar("State", bound=Record)
 
 # In place of a cause, for a patch that has not stopped.
 RUNNING = -1
@@ -21,24 +20,43 @@ RUNNING = -1
 _COMPACT_FRACTION = 0.25
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class State(Record):
+    """What every solver iterates, and some more besides; the first axis is the patch.
+
+    Attributes:
+        lights: ``L``.
+        shading: ``N``, columns on the manifold.
+        weight: Of each entry, robust weights included.
+    """
+
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    weight: Float[Tensor, "patch view sample"]
+
+
+AnyState = TypeVar("AnyState", bound=State)
+
+
 def iterate(
     problem: Bilinear,
-    state: State,
-    advance: Callable[[Bilinear, State, int], tuple[State, Int[Tensor, " patch"]]],
+    state: AnyState,
+    advance: Callable[[Bilinear, AnyState, int], tuple[AnyState, Int[Tensor, " patch"]]],
     max_iterations: int,
-) -> tuple[State, Int[Tensor, " patch"], Int[Tensor, " patch"]]:
+) -> Factors:
     """Iterate until every patch has stopped; those that have leave the batch.
 
     Args:
         problem: All patches.
-        state: The initial state; the first axis of all its tensors is the patch.
+        state: The initial state.
         advance: One step of the remaining patches: from problem, state and index of the step
             to the next state and, for each patch, a :class:`StopCause` or ``RUNNING``.
         max_iterations: Steps at most.
 
     Returns:
-        Every patch's last state, its number of steps, and its stop cause.
+        Every patch's last lights, shading and weights, its number of steps, and its stop cause.
     """
+    whole = problem
     patches = torch.arange(len(problem.radiance), device=problem.radiance.device)
     taken = torch.full_like(patches, max_iterations)
     causes = torch.full_like(patches, int(StopCause.LIMIT))
@@ -53,13 +71,13 @@ def iterate(
         causes[patches[ended]] = cause[ended]
         running = running & ~ended
         if not bool(running.any()):
-            return final, taken, causes
+            break
         if float((~running).double().mean()) >= _COMPACT_FRACTION:
             keep = running.nonzero()[:, 0]
             state, problem, patches = state.take(keep), problem.take(keep), patches[keep]
             running = running[keep]
     _store(final, state, names, patches, running)
-    return final, taken, causes
+    return to_factors(whole, final.lights, final.shading, final.weight, taken, causes)
 
 
 def _store(

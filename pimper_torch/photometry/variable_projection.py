@@ -31,14 +31,13 @@ from pimper_torch.photometry.bilinear import (
     evaluate,
     keep_scale,
     robust_weights,
-    to_factors,
     update_shading,
 )
-from pimper_torch.photometry.iteration import RUNNING, iterate
+from pimper_torch.photometry.iteration import RUNNING, State, iterate
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
 from pimper_torch.photometry.robust import Squares
-from pimper_torch.records import Convergence, Record, StopCause
+from pimper_torch.records import Convergence, StopCause
 
 # Initial damping, as a fraction of the mean curvature, and the factors by which it falls and
 # rises. Of initial values from 1e-4 to 1e-2 and factors from 3 to 10 these led most random starts
@@ -57,10 +56,7 @@ _GROUP_ENTRIES = 100_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _State(Record):
-    lights: Float[Tensor, "patch view rank"]
-    shading: Float[Tensor, "patch rank sample"]
-    weight: Float[Tensor, "patch view sample"]
+class _State(State):
     energy: Float[Tensor, " patch"]
     cost: Float[Tensor, " patch"]
     slope: Float[Tensor, "patch view rank"]
@@ -106,8 +102,7 @@ def solve_variable_projection(
 
     with torch.no_grad():
         state = _start(problem, curvature_samples)
-        state, taken, cause = iterate(problem, state, advance, max_iterations)
-        return to_factors(problem, state.lights, state.shading, state.weight, taken, cause)
+        return iterate(problem, state, advance, max_iterations)
 
 
 def curvature_of_lights(

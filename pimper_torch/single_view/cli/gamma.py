@@ -15,12 +15,12 @@ from pimper_torch.progress import listening
 from pimper_torch.radiometry import LINEAR
 from pimper_torch.single_view.factorization.gamma import GammaEstimate, gamma_of_photographs
 
-# Residuals so near the best one are as good.
+# A standard response whose residual is below this multiple of the best is recommended: a choice.
 _AS_GOOD = 1.05
 
 
 def run(command: str, arguments: Sequence[str]) -> None:
-    """Carry out ``gamma``: read, estimate, and say what to tell `pimper reconstruct`.
+    """Carry out ``gamma``: read, estimate, and print it with the option of `pimper reconstruct`.
 
     Raises:
         PimperError: Photographs that cannot be read, or too few under too few lights.
@@ -44,11 +44,11 @@ class _Job:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse photographs and a mask that are not there.
+    """Parse the arguments, and refuse photographs and a mask that do not exist.
 
     Raises:
         InputError: The folder of photographs, or the mask.
-        SystemExit: Arguments that are none, told as tyro does, or ``--help``.
+        SystemExit: Invalid arguments, or ``--help``.
     """
 
     def gamma(
@@ -78,7 +78,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
 
 def advice(found: GammaEstimate) -> str:
-    """Say which response to tell `pimper reconstruct`; nothing if none is known."""
+    """Give the option of `pimper reconstruct` for the response; empty if it is not determined."""
     if not found.determined:
         return ""
     response = f"{found.gamma:.2f}"

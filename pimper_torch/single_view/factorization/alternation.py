@@ -1,7 +1,7 @@
-"""Alternating least squares: all shading vectors with lights given, then the other way round.
+"""Alternating least squares: shading vectors with lights fixed, then lights with shading fixed.
 
-Every step has a closed form and the objective never rises, but where lights and shading mimic
-each other the steps crawl: the rival of the other solvers, and their first steps.
+Every step has a closed form and the objective never rises, but convergence is slow where lights
+and shading are correlated: the baseline of the other solvers.
 """
 
 from dataclasses import dataclass
@@ -19,20 +19,16 @@ from pimper_torch.photometry.bilinear import (
     keep_scale,
     objective,
     robust_weights,
-    to_factors,
     update_shading,
 )
-from pimper_torch.photometry.iteration import RUNNING, iterate
+from pimper_torch.photometry.iteration import RUNNING, State, iterate
 from pimper_torch.photometry.quadratics import solve_packed
 from pimper_torch.photometry.robust import Squares
-from pimper_torch.records import Record, StopCause
+from pimper_torch.records import StopCause
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _State(Record):
-    lights: Float[Tensor, "patch view rank"]
-    shading: Float[Tensor, "patch rank sample"]
-    weight: Float[Tensor, "patch view sample"]
+class _State(State):
     cost: Float[Tensor, " patch"]
 
 
@@ -40,13 +36,13 @@ def solve_alternation(problem: Bilinear, max_iterations: int, tolerance: float) 
     """Factorize a batch of patches by alternating least squares.
 
     Args:
-        problem: With its start.
+        problem: With its initial values.
         max_iterations: Steps at most.
-        tolerance: A patch is done when a step lowered its objective by less than this fraction.
+        tolerance: A patch has converged when a step lowers its objective by less than this
+            fraction.
 
-    On a curved manifold the samples take one Gauss-Newton step along it in their turn. Without
-    ``pull`` the scale between albedo and light is kept where it started. Constant to autograd.
-    Patches do not influence one another.
+    On a curved manifold the samples take one Gauss-Newton step per iteration. Lights without
+    ``regularization`` keep their initial scale. Constant to autograd. Patches are independent.
     """
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
@@ -70,5 +66,4 @@ def solve_alternation(problem: Bilinear, max_iterations: int, tolerance: float) 
             weight=weight,
             cost=objective(problem, problem.lights, problem.shading, weight),
         )
-        state, taken, cause = iterate(problem, start, advance, max_iterations)
-        return to_factors(problem, state.lights, state.shading, state.weight, taken, cause)
+        return iterate(problem, start, advance, max_iterations)

@@ -1,4 +1,4 @@
-r"""What factorization leaves free: scaled Lorentz transformations.
+r"""The ambiguity of first-order factorization: scaled Lorentz transformations.
 
 :math:`J = L N = (L A^{-1})(A N)` for every invertible 4 x 4 matrix, but ``A N`` stays on the
 cone only if ``A`` preserves the form :math:`\eta = \mathrm{diag}(1, -1, -1, -1)` up to
@@ -51,7 +51,7 @@ class Ambiguity(Record):
 
 
 def minkowski(like: Float[Tensor, "..."]) -> Float[Tensor, "4 4"]:
-    """Give ``diag(1, -1, -1, -1)``; ``n^T eta n = 0`` is the tie of albedo and normal."""
+    """Give ``diag(1, -1, -1, -1)``; ``s^T eta s = 0`` is the equation of the cone."""
     return torch.diag(like.new_tensor([1.0, -1.0, -1.0, -1.0]))
 
 
@@ -79,10 +79,10 @@ def align_factorizations(
     polar factor with respect to the form, reflections included.
 
     Args:
-        shading: ``N`` to be moved, columns on the cone.
-        reference: Where it should come to lie, columns on the cone.
-        weight: Not negative. Samples without weight do not matter.
-        iterations: Of Gauss-Newton, after the linear start.
+        shading: ``N`` to be aligned, columns on the cone.
+        reference: What it is aligned to, columns on the cone.
+        weight: Not negative. Samples without weight are ignored.
+        iterations: Of Gauss-Newton, after the linear solution.
 
     Fails softly where the samples span less than four dimensions: the best transformation
     found is still a scaled Lorentz transformation. Constant to autograd.
@@ -129,7 +129,7 @@ def _nearest_lorentz(linear: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*bat
     """Take the polar factor with respect to the form by Newton's iteration.
 
     Source: Higham, Mackey, Mackey & Tisseur, SIAM J. Matrix Anal. 25(4), 2004. Where it does
-    not converge (the matrix is far from every Lorentz transformation) the identity is taken.
+    not converge (the matrix is far from every Lorentz transformation) it gives the identity.
     """
     eta = minkowski(linear)
     scale = _scale(linear)[..., None, None]

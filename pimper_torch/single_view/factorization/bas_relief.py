@@ -1,9 +1,9 @@
-r"""What rank-three factorization leaves free once the surface is one: bas-relief.
+r"""The ambiguity of rank-three factorization under integrability: bas-relief transformations.
 
 :math:`J = L B = (L A^{-1})(A B)` for every invertible 3 x 3 matrix, where the columns of ``B``
-are albedo times normal. That normals belong to a surface ``z(x, y)`` ties ``A`` down to the
-transformations of :math:`\bar z = \lambda z + \mu x + \nu y`, the generalised bas-relief
-transformations, times one factor between albedo and light.
+are albedo times normal. Integrability, that normals belong to a surface ``z(x, y)``, restricts
+``A`` to the generalised bas-relief transformations :math:`\bar z = \lambda z + \mu x + \nu y`,
+times one factor between albedo and light.
 
 Source: Belhumeur, Kriegman & Yuille, IJCV 35(1), 1999.
 """
@@ -78,8 +78,8 @@ def align_reliefs(
     ``s``, which is linear in ``s``, ``s lambda``, ``s mu``, ``s nu``.
 
     Args:
-        shading: ``B`` to be moved, albedo times normal.
-        reference: Where it should come to lie.
+        shading: ``B`` to be aligned, albedo times normal.
+        reference: What it is aligned to.
         weight: Not negative.
 
     Ill-posed where all normals are parallel. Differentiable.
@@ -90,7 +90,7 @@ def align_reliefs(
     depth = (w * z * z).sum()
     slant_x, slant_y = (w * x * z).sum(), (w * y * z).sum()
     a, b, c = reference.double()
-    # Unknowns s lam, s mu, s nu, s: rows x and y tell the first three, row z the last.
+    # Unknowns s lam, s mu, s nu, s: rows x and y determine the first three, row z the last.
     normal = torch.stack(
         [
             torch.stack([square, -slant_x, -slant_y]),

@@ -1,9 +1,9 @@
-r"""Colour: every channel its own light and albedo, all the same normals.
+r"""Factorization in colour: each channel has its own light and albedo, all share the normals.
 
 .. math:: J_{fck} = q_{ck}\, l_{fc}^\top n_k
 
-With the chroma ``q`` known, channels are views of one problem more: the data over the chroma,
-weighted by its square, cost what they did. Chroma follows in closed form, in turn.
+With the chroma ``q`` fixed, channels are further views of one problem: the data divided by the
+chroma, weighted by its square. Chroma is updated in closed form, alternately.
 """
 
 from dataclasses import dataclass
@@ -15,11 +15,12 @@ from torch import Tensor
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.records import Convergence, Record
 
-# A channel with less than this fraction of a sample's brightness has nothing to say of its normal.
+# Channels with less than this fraction of a sample's brightness are ignored: a choice.
 _MIN_CHROMA = 0.02
 
-# Turns of tints and chroma before the first factorization; each halves what is left at least.
-_TINTING = 8
+# Alternations of tints and chroma before the first factorization: a choice; each at least halves
+# the residual.
+_TINT_ITERATIONS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -27,12 +28,12 @@ class ColourFactors(Record):
     """The solution in colour.
 
     Attributes:
-        lights: One a view and channel.
-        shading: What all channels share, on the manifold.
+        lights: Of each view and channel.
+        shading: Shared by all channels, on the manifold.
         chroma: ``q``, its mean square over the channels 1; albedo is that of the shading times
             chroma.
-        weight: What each entry counted in the end.
-        convergence: Of the last round.
+        weight: Final weight of each entry.
+        convergence: Of the last iteration.
     """
 
     lights: Float[Tensor, "patch view channel rank"]
@@ -53,14 +54,14 @@ def solve_in_colour(
     """Factorize patches channel by channel with common normals.
 
     Args:
-        problem: The same patches in gray, the mean of the channels, with its start; what holds
-            its lights holds each channel's, tinted as the channel is brighter or darker.
+        problem: The same patches in gray, the mean of the channels, with initial values; the
+            prior of its lights, times the channel's tint, is that of each channel's.
         radiance: In colour; zero where missing.
         solve: One of the solvers.
-        max_iterations: Steps at most, each round.
+        max_iterations: Steps at most in each iteration.
         tolerance: The solver's.
-        iterations: Turns of factors and chroma; more matter where the light's colour changes
-            between views, which chroma is then taken for at first.
+        iterations: Alternations of factors and chroma; more are needed where the light's colour
+            changes between views.
 
     Constant to autograd.
     """
@@ -99,9 +100,9 @@ def split_colours(
 ) -> Bilinear:
     """Make every channel of a view a view of its own."""
     channels = radiance.shape[2]
-    told = chroma > _MIN_CHROMA
-    scale = torch.where(told, chroma, 1)[:, None]
-    weight = problem.weight[:, :, None] * torch.where(told, chroma, 0)[:, None] ** 2
+    bright = chroma > _MIN_CHROMA
+    scale = torch.where(bright, chroma, 1)[:, None]
+    weight = problem.weight[:, :, None] * torch.where(bright, chroma, 0)[:, None] ** 2
     return problem.replace(
         radiance=(radiance / scale).flatten(1, 2),
         weight=weight.flatten(1, 2),
@@ -115,20 +116,20 @@ def split_colours(
 def _tints(
     problem: Bilinear, radiance: Float[Tensor, "patch view channel sample"]
 ) -> tuple[Float[Tensor, "patch view channel"], Float[Tensor, "patch channel sample"]]:
-    """Tell the colours of lights and of samples apart, the gray problem's start given."""
+    """Separate the colours of lights and samples, from the gray problem's initial values."""
     shade = (problem.lights @ problem.shading)[:, :, None]
     heavy = problem.weight[:, :, None] * shade
     product, square = heavy * radiance, heavy * shade
     tint = torch.ones_like(radiance[..., 0])
     chroma = torch.ones_like(radiance[:, 0])
-    for _ in range(_TINTING):
+    for _ in range(_TINT_ITERATIONS):
         total = (tint[..., None] ** 2 * square).sum(dim=1)
         chroma = (tint[..., None] * product).sum(dim=1) / torch.where(total > 0, total, 1)
         chroma, _ = _scaled(chroma.clamp_min(0))
         total = (chroma[:, None] ** 2 * square).sum(dim=3)
         tint = (chroma[:, None] * product).sum(dim=3) / torch.where(total > 0, total, 1)
         tint = torch.where(total > 0, tint, 1)
-        # Colour is told from brightness, which stays with the lights.
+        # Tints have mean 1: brightness stays with the lights.
         mean = tint.mean(dim=2, keepdim=True)
         tint = torch.where(mean > 0, tint / torch.where(mean > 0, mean, 1), 1)
     return tint, chroma
@@ -153,7 +154,7 @@ def _chroma(
 def _scaled(
     chroma: Float[Tensor, "patch channel sample"],
 ) -> tuple[Float[Tensor, "patch channel sample"], Float[Tensor, "patch sample"]]:
-    """Bring its mean square to 1, and give the factor taken out."""
+    """Normalize the mean square over the channels to 1; give the factors, too."""
     size = chroma.square().mean(dim=1).sqrt()
     some = size > 0
     size = torch.where(some, size, 1)

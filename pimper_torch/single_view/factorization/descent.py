@@ -1,8 +1,8 @@
-"""Factorization by gradient descent with projection: the second opinion.
+"""Factorization by preconditioned Riemannian gradient descent.
 
 The gradient comes from autograd, so that another loss or a learned prior is one more term of
-the objective. Each step goes down the gradient along the manifold, scaled by the curvature of
-its own block, and is brought back to the manifold: Riemannian descent.
+the objective. Each step follows the gradient along the manifold, preconditioned by its own
+block of the Hessian, and is retracted to the manifold.
 
 Source: Absil, Mahony & Sepulchre, Optimization Algorithms on Matrix Manifolds, 2008.
 """
@@ -21,9 +21,8 @@ from pimper_torch.photometry.bilinear import (
     equations_of_views,
     objective,
     robust_weights,
-    to_factors,
 )
-from pimper_torch.photometry.iteration import RUNNING, iterate
+from pimper_torch.photometry.iteration import RUNNING, State, iterate
 from pimper_torch.photometry.quadratics import (
     combination,
     congruence,
@@ -31,19 +30,16 @@ from pimper_torch.photometry.quadratics import (
     solve_packed,
 )
 from pimper_torch.photometry.robust import Squares
-from pimper_torch.records import Record, StopCause
+from pimper_torch.records import StopCause
 
-# A step that must be this much shorter than Newton's to descend does not descend.
-_SHORTEST_STRIDE = 1e-6
+# Smallest step, as a fraction of Newton's, in the line search: a choice.
+_MIN_STRIDE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _State(Record):
-    lights: Float[Tensor, "patch view rank"]
-    shading: Float[Tensor, "patch rank sample"]
+class _State(State):
     before_lights: Float[Tensor, "patch view rank"]
     before_shading: Float[Tensor, "patch rank sample"]
-    weight: Float[Tensor, "patch view sample"]
     cost: Float[Tensor, " patch"]
     momentum: Float[Tensor, " patch"]
     stride: Float[Tensor, " patch"]
@@ -53,17 +49,17 @@ def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> F
     """Factorize a batch of patches by preconditioned, accelerated descent.
 
     Args:
-        problem: With its start.
+        problem: With its initial values.
         max_iterations: Steps at most; it needs several times as many as BALM.
-        tolerance: A patch is done when a step moved its shading vectors by less than this
+        tolerance: A patch has converged when a step moves its shading vectors by less than this
             fraction of their length.
 
     Returns:
         Factors with ``N`` on the manifold; the same minimum as BALM's where there is one.
 
-    Half a Newton step of every block is tried, as two blocks curve into each other at most
-    by that; where it fails to descend, half of it. Momentum (Nesterov's) restarts in a patch
-    whose objective went up. Constant to autograd. Patches do not influence one another.
+    Steps start at half a Newton step of every block, which bounds the coupling of two blocks;
+    one that does not descend is halved. Nesterov's momentum restarts in a patch whose objective
+    rises. Constant to autograd. Patches are independent.
     """
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
@@ -76,7 +72,7 @@ def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> F
         change = (state.shading - state.before_shading).norm(dim=(1, 2)) / size
         done = better & (change <= tolerance)
         cause = torch.where(done, int(StopCause.CONVERGED), RUNNING)
-        stalled = (state.stride < _SHORTEST_STRIDE) & ~done
+        stalled = (state.stride < _MIN_STRIDE) & ~done
         return state, torch.where(stalled, int(StopCause.STALLED), cause)
 
     lights, shading = problem.lights.detach(), problem.shading.detach()
@@ -93,15 +89,14 @@ def solve_descent(problem: Bilinear, max_iterations: int, tolerance: float) -> F
         momentum=one,
         stride=one / 2,
     )
-    state, taken, cause = iterate(problem, start, advance, max_iterations)
-    return to_factors(problem, state.lights, state.shading, state.weight, taken, cause)
+    return iterate(problem, start, advance, max_iterations)
 
 
 def _step(problem: Bilinear, state: _State) -> tuple[_State, Tensor]:
-    following = (1 + (1 + 4 * state.momentum**2).sqrt()) / 2
-    push = ((state.momentum - 1) / following)[:, None, None]
-    lights = state.lights + push * (state.lights - state.before_lights)
-    shading = state.shading + push * (state.shading - state.before_shading)
+    next_momentum = (1 + (1 + 4 * state.momentum**2).sqrt()) / 2
+    extrapolation = ((state.momentum - 1) / next_momentum)[:, None, None]
+    lights = state.lights + extrapolation * (state.lights - state.before_lights)
+    shading = state.shading + extrapolation * (state.shading - state.before_shading)
     moved = _descend(problem, lights, shading, state.weight, state.stride)
     found = objective(problem, *moved, state.weight)
     better = found <= state.cost
@@ -113,7 +108,7 @@ def _step(problem: Bilinear, state: _State) -> tuple[_State, Tensor]:
         before_lights=state.lights,
         before_shading=state.shading,
         cost=torch.where(better, found, state.cost),
-        momentum=torch.where(better, following, 1.0).to(lights.dtype),
+        momentum=torch.where(better, next_momentum, 1.0).to(lights.dtype),
         stride=torch.where(better, (1.2 * state.stride).clamp_max(0.5), shorter),
     )
     return state, better

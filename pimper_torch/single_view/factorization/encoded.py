@@ -1,6 +1,6 @@
-r"""Encoded values explained by first-order light that is seen through a response.
+r"""First-order light fitted to encoded values, through a camera's response.
 
-The residual is taken in the encoded values, where the noise is:
+Residuals are those of encoded values, where the noise is:
 :math:`e = M - f^{-1}(L R)` with f the response.
 """
 
@@ -16,13 +16,13 @@ from pimper_torch.radiometry import Response
 from pimper_torch.records import Record
 from pimper_torch.single_view.factorization.low_rank import low_rank_problem, singular_left
 
-# Further rounds of linearising about the fit and weighing outliers, each exponent starting where
-# the last one ended.
+# Further linearizations about the fit, with outlier weights: a choice, as each exponent starts from
+# the last one's fit.
 ITERATIONS = 1
 _ITERATIONS, _TOLERANCE = 30, 1e-7
 _FILL_STEPS = 30  # to a start good enough for the solver
 
-# Where a fit predicts less light than none, it is linearised here.
+# Lower bound of the encoded value about which the fit is linearized: a choice.
 _DARKEST = 0.02
 
 
@@ -31,10 +31,10 @@ class EncodedMatrix(Record):
     """Encoded values of the same samples in several views.
 
     Attributes:
-        encoded: All samples looked at.
-        seen: Among them, that are not missing.
-        used: That the fit rests on.
-        scale: Of residuals, beyond which they are outliers; 0 is least squares.
+        encoded: All samples.
+        seen: False where missing.
+        used: Entries that are fitted.
+        scale: Of Cauchy's loss; 0 is least squares.
         rank: Of radiance.
     """
 
@@ -47,13 +47,13 @@ class EncodedMatrix(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class EncodedFit(Record):
-    """How well a response does.
+    """The fit under one response.
 
     Attributes:
         predicted: Encoded values.
         loss: Of each entry; 0 where not used.
         weight: Of each entry, less for outliers.
-        left: Left factor, from which the next response starts.
+        left: Left factor, the initial value for the next response.
     """
 
     predicted: Float[Tensor, "view sample"]
@@ -68,16 +68,16 @@ def fit_encoded(
     start: EncodedFit | None,
     iterations: int = ITERATIONS,
 ) -> EncodedFit:
-    """Explain the encoded values by first-order light seen through a response.
+    """Fit first-order light to encoded values through a response.
 
-    The encoded residual is linearised, first about the values or a former fit, then about the
-    fit: least squares in radiance, weighted by the square of the response's slope, is least
-    squares in encoded values then. Constant to autograd.
+    The encoded residual is linearized, first about the values or a former fit, then about the
+    fit: it is then least squares in radiance, weighted by the square of the response's slope.
+    Constant to autograd.
 
     Args:
         problem: The values.
         response: Through which they are seen; ``f``.
-        start: Fit of a response near by; ``None`` starts from the values.
+        start: Fit of a similar response; ``None`` starts from the values.
         iterations: After the first.
     """
     mask = problem.used.double()
@@ -85,7 +85,7 @@ def fit_encoded(
     left: Tensor | None = None
     if start is not None:
         about, weight, left = start.predicted, mask * start.weight, start.left
-    for rotation in range(iterations + 1):
+    for iteration in range(iterations + 1):
         rate = _derivative(response, about)
         target = response.linear_from_encoded(about) + rate * (problem.encoded - about)
         heavy = weight / rate.square()
@@ -98,7 +98,7 @@ def fit_encoded(
         linear = left @ solved.shading[0]
         about = response.encoded_from_linear(linear).clamp_min(_DARKEST)
         residual = mask * (problem.encoded - about)
-        if problem.scale and rotation < iterations:
+        if problem.scale and iteration < iterations:
             weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
     loss = residual.square()
     if problem.scale:
@@ -119,7 +119,7 @@ def _derivative(
 def _start(
     matrix: Float[Tensor, "view sample"], mask: Float[Tensor, "view sample"], rank: int
 ) -> Float[Tensor, "view rank"]:
-    """Fill what is missing by albedo times brightness, then by the best of the rank in turn."""
+    """Impute missing values by albedo times brightness, then by low-rank approximations."""
     gain = (mask * matrix).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp_min(1)
     level = (mask * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
     guess = gain * (mask * matrix).sum(dim=0, keepdim=True) / level
@@ -127,20 +127,20 @@ def _start(
 
 
 def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
-    """Leave out samples and views that the factors fit whatever they hold."""
+    """Leave out samples and views with too few entries to constrain the factors."""
     for _ in range(2):
         used = used & (used.sum(dim=0) > rank) & (used.sum(dim=1, keepdim=True) > 2 * rank)
     return used
 
 
 def freedom(used: Bool[Tensor, "view sample"], rank: int) -> int:
-    """Count the degrees of freedom that the factors leave."""
+    """Count the residual degrees of freedom."""
     views, samples = (int(used.any(dim=axis).sum()) for axis in (1, 0))
     return int(used.sum()) - rank * (views + samples - rank)
 
 
 def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
-    """Give the robust standard deviation of the residuals, for the freedom that is left."""
+    """Give the residuals' robust standard deviation, corrected for the degrees of freedom."""
     residual = (problem.encoded - fit.predicted)[problem.used]
     size = float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
     free = max(freedom(problem.used, problem.rank), 1)

@@ -1,15 +1,15 @@
-r"""An unknown gamma, found as the one that lets first-order light explain the photographs.
+r"""Radiometric self-calibration: the gamma under which first-order light fits the photographs.
 
 Views of the same samples under several lights are, as radiance, a matrix of rank 3 (distant
-point lights) or 4 (ambient light besides). Encoded by a curve that is not the assumed one they are
-not. For each exponent the residual is taken where the noise is, in the encoded values,
+point lights) or 4 (ambient light besides); under a wrong response they are not. For each exponent
+the residual is that of the encoded values, where the noise is,
 
 .. math:: e = M - (L R)^{1/\gamma}, \qquad f(\gamma) = \min_{L, R} \sum \rho(e),
 
-so that it means the same for every exponent. A residual in radiance, even relative to radiance
-itself, does not: ``M ** gamma`` tends to a matrix of ones, which is of rank 1, as gamma falls.
+so that it is comparable over exponents. A residual in radiance, even relative to radiance
+itself, is not: ``M ** gamma`` tends to a matrix of ones, which is of rank 1, as gamma falls.
 To first order noise adds to ``f`` its variance times the degrees of freedom, whatever the
-exponent, and does not move the minimum.
+exponent, and does not shift the minimum.
 """
 
 import math
@@ -34,53 +34,53 @@ from pimper_torch.single_view.factorization.encoded import (
     residual_spread,
 )
 
-# Between them lie all curves in use; 1 is linear.
-LEAST, MOST = 0.4, 4.0
-# Tried first, evenly in their logarithm; neighbours are 1.4 times one another.
+# Range of the search, a choice: it holds all curves in use; 1 is linear.
+MIN_GAMMA, MAX_GAMMA = 0.4, 4.0
+# Exponents of the grid search, a choice: even in their logarithm, 1.4 times one another.
 _TRIALS = 8
-# Of gamma's logarithm, a tenth of what noise leaves uncertain at best.
-_CLOSE = 1e-4
+# Of gamma's logarithm: a choice, a tenth of the smallest standard errors.
+_TOLERANCE = 1e-4
 # Relative difference between estimates of data without noise.
 _ROUNDING = 1e-3
 
-# A relative standard error above which 1.8 and 2.2 are not told apart.
+# Maximum relative standard error: a choice, twice as much would not distinguish 1.8 from 2.2.
 _MAX_UNCERTAIN = 0.1
 
-# Four levels of 255: more than noise, that is shadows, highlights, or a curve that is no gamma.
+# Maximum residual: a choice, four levels of 255; more is shadows, highlights, or another curve.
 _MAX_RESIDUAL = 0.015
 
-# Residuals of this size, half the rounding of 8 bits, are no outliers whatever the others are.
+# Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
 _MIN_SCALE = 5e-4
 # Cauchy's loss is as good as least squares on Gaussian noise to 95 % at 2.385 deviations
 # (Holland & Welsch, 1977).
 _CAUCHY = 2.385
 
-# The estimate is checked without the darker third and half of the entries.
+# The estimate is checked without these fractions of the entries, the darkest: a choice.
 _DARKEST_FRACTIONS = (1 / 3, 1 / 2)
-# Fewer degrees of freedom say little of their own error.
+# Fewer degrees of freedom give no reliable standard error: a choice.
 _MIN_FREE = 100
-# Beyond so many standard errors of theirs the brighter entries are believed instead; beyond the
-# first number the estimate becomes less sure.
-_DOUBTED, _CONTRADICTED = 2.0, 3.0
+# Difference from the estimate of the brighter entries, in its standard errors, above which the
+# standard error grows, and above which the brighter entries replace the estimate: choices.
+_SUSPECT_ERRORS, _MAX_ERRORS = 2.0, 3.0
 
-# The first choice by the fit still starts from entries chosen by noisy values.
+# Selections of entries by the fit; the first still starts from a selection by noisy values.
 _CHOICES = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class GammaEstimate(Record):
-    """The exponent of a gamma curve, as far as the data tells it.
+    """The estimated exponent of a gamma curve, and its standard error.
 
     Attributes:
         gamma: ``radiance = encoded ** gamma``.
-        standard_error: Of gamma, from how samples, or views if those differ more, disagree.
-        determined: False where the data cannot tell: the standard error is more than a tenth
-            of gamma, the loss still falls at an end of what was searched, or more is left than
-            a camera's noise, so that first-order light explains the values with no gamma.
-        residual: Spread of what is left in encoded values, 1 being full scale.
-        residual_linear: The same if the values are taken for linear.
-        residual_srgb: The same if they are taken for sRGB.
-        entries: Of the matrix, that the estimate rests on.
+        standard_error: Of gamma, from its variation over samples, or views if that is larger.
+        determined: False where the standard error is more than a tenth of gamma, the minimum is
+            at an end of the range, or residuals exceed a camera's noise, so that first-order
+            light does not fit under any gamma.
+        residual: Robust standard deviation of the residuals in encoded values, 1 being full scale.
+        residual_linear: The same for a linear response.
+        residual_srgb: The same for sRGB.
+        entries: Of the matrix, that were fitted.
     """
 
     gamma: float
@@ -92,7 +92,7 @@ class GammaEstimate(Record):
     entries: int
 
     def __str__(self) -> str:
-        """Say it in a sentence."""
+        """Give the estimate in a sentence."""
         found = (
             f"gamma {self.gamma:.3f} +- {self.standard_error:.3f}; residual "
             f"{100 * self.residual:.2f} % of full scale, {100 * self.residual_linear:.2f} % if "
@@ -106,7 +106,7 @@ class GammaEstimate(Record):
             if noisy
             else "light or surfaces vary too little"
         )
-        return f"gamma cannot be told from these photographs, {why} ({found})."
+        return f"gamma is not determined by these photographs, {why} ({found})."
 
 
 def estimate_gamma(
@@ -118,29 +118,28 @@ def estimate_gamma(
     saturation_level: float = SATURATED,
     max_samples: int = 300,
 ) -> GammaEstimate:
-    """Find the gamma of photographs from the same surface samples under several lights.
+    """Estimate gamma from the same surface samples under several lights.
 
-    Values that shadow or saturation took are left out: first by what is observed, then by what
-    the fit predicts, since choosing by noisy values favours those with noise of one sign, which
-    biases gamma. Outliers, such as highlights and cast shadows, lose weight. Where the brighter
-    entries alone contradict, they are believed: ambient light in attached shadows is not
+    Dark and saturated values are left out: first by their observed values, then by those the fit
+    predicts, since selecting by noisy values favours those with noise of one sign, which biases
+    gamma. Outliers, such as highlights and cast shadows, lose weight. Where the estimate from the
+    brighter entries differs significantly, it is taken: ambient light in attached shadows is not
     first-order.
 
-    A gain of each view, such as its exposure, is part of its light and does not matter. What
-    cannot be told apart: light from one direction, or a plane, gives a matrix of rank 1 with
-    every gamma. The standard error knows of noise, not of light that is of another kind than
-    assumed.
+    A gain of each view, such as its exposure, is part of its light and has no effect. Light from
+    one direction, or a plane, does not determine gamma: the matrix is of rank 1 under every
+    exponent. The standard error is that of noise, not of a wrong model of the light.
 
     Args:
         encoded: As the files hold them, 1 being full scale.
-        seen: False for what is missing. Neither dark nor saturated values need be left out.
+        seen: False where missing. Dark and saturated values may be seen.
         rank: 3 for distant point lights alone, 4 with ambient light.
         dark_level: Encoded value up to which shading is not first-order.
-        saturation_level: From which values are cut off.
-        max_samples: More are thinned evenly.
+        saturation_level: Encoded value from which the sensor saturates.
+        max_samples: More are subsampled evenly.
 
     Raises:
-        InputError: Values that are not in [0, 1] or no numbers, an impossible rank, or fewer
+        InputError: Values outside [0, 1] or not finite, an impossible rank, or fewer
             views or samples than the rank needs.
 
     Constant to autograd.
@@ -164,8 +163,10 @@ def estimate_gamma(
         limits = (dark_level, saturation_level)
         problem = _problem(encoded, seen, rank, limits, max_samples)
         for _ in range(_CHOICES):
-            problem = _chosen_by_fit(problem, _coarsely(problem, iterations=0)[1].predicted, limits)
-        return _judged(_most_reliable(problem))
+            problem = _chosen_by_fit(
+                problem, _grid_search(problem, iterations=0)[1].predicted, limits
+            )
+        return _estimate_of(_consistent_minimum(problem))
 
 
 def gamma_of_photographs(
@@ -176,15 +177,15 @@ def gamma_of_photographs(
     channel: int | None = None,
     max_samples: int = 300,
 ) -> GammaEstimate:
-    """Find the gamma of photographs that a fixed camera took under several lights.
+    """Estimate the gamma of photographs that a fixed camera took under several lights.
 
     Args:
         views: Read with :data:`~pimper_torch.radiometry.LINEAR`, so that they hold the files'
             own values; of one size. Pixels that any of their masks leaves out are left out.
         mask: True on the object, for all photographs.
         rank: 3 for distant point lights alone, 4 with ambient light.
-        channel: Colour to look at; the centre one, green, unless given.
-        max_samples: More are thinned evenly.
+        channel: Which colour; by default the middle one, green.
+        max_samples: More are subsampled evenly.
 
     Raises:
         InputError: As :func:`estimate_gamma`, and for photographs or a mask of unlike sizes.
@@ -212,7 +213,7 @@ def gamma_of_photographs(
 def gamma_of_patches(
     seen: PatchViews, *, rank: int = 4, channel: int | None = None, max_samples: int = 300
 ) -> GammaEstimate:
-    """Find the gamma of registered photographs, all facets together.
+    """Estimate the gamma of registered photographs, from all facets together.
 
     One light a view for the whole scene is assumed, so a near point light counts as noise. Samples
     that registration dropped as dark or saturated stay dropped: keep ``warp.dark_level`` well
@@ -221,8 +222,8 @@ def gamma_of_patches(
     Args:
         seen: Of views read with :data:`~pimper_torch.radiometry.LINEAR`.
         rank: 3 for distant point lights alone, 4 with ambient light.
-        channel: Colour to look at; the centre one, green, unless given.
-        max_samples: More are thinned evenly.
+        channel: Which colour; by default the middle one, green.
+        max_samples: More are subsampled evenly.
 
     Raises:
         InputError: As :func:`estimate_gamma`.
@@ -234,7 +235,7 @@ def gamma_of_patches(
         values.append(registered.radiance[:, :, colour].movedim(1, 0)[:, facet])
         valid.append(registered.valid.movedim(1, 0)[:, facet])
     encoded = torch.cat(values, dim=1).detach()
-    # Interpolation and pyramids round; what they leave outside [0, 1] is no more than that.
+    # Values outside [0, 1] are rounding of interpolation and pyramids.
     return estimate_gamma(
         encoded.clamp(0, 1), torch.cat(valid, dim=1), rank=rank, max_samples=max_samples
     )
@@ -242,13 +243,13 @@ def gamma_of_patches(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Minimum(Record):
-    """Where the loss is least, and how sure that is.
+    """The minimum of the loss over gamma, and its standard error.
 
     Attributes:
-        problem: Whose loss.
-        gamma: Where it is least.
-        fit: There.
-        inner: Whether the loss rises on both sides.
+        problem: The entries.
+        gamma: Where the loss is minimal.
+        fit: At the minimum.
+        inner: Whether it is not at an end of the range.
         error: Standard error of gamma.
     """
 
@@ -266,7 +267,7 @@ def _problem(
     limits: tuple[float, float],
     max_samples: int,
 ) -> EncodedMatrix:
-    """Thin the samples, and use what is neither dark nor saturated."""
+    """Subsample, and use entries that are neither dark nor saturated."""
     used = enough(seen & (encoded > limits[0]) & (encoded < limits[1]), rank)
     views, samples = used.any(dim=1), used.any(dim=0).nonzero().flatten()
     if int(views.sum()) <= rank + 1 or len(samples) <= 4 * rank:
@@ -290,7 +291,7 @@ def _problem(
 def _chosen_by_fit(
     problem: EncodedMatrix, predicted: Float[Tensor, "view sample"], limits: tuple[float, float]
 ) -> EncodedMatrix:
-    """Use what the fit predicts to be lit and not saturated, and weigh outliers."""
+    """Use entries that the fit predicts to be lit and not saturated, with outlier weights."""
     dark, saturated = limits
     encoded = problem.encoded
     known = problem.seen & (problem.used.sum(dim=0) > problem.rank)
@@ -304,9 +305,11 @@ def _chosen_by_fit(
     return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
 
 
-def _coarsely(problem: EncodedMatrix, iterations: int) -> tuple[float, EncodedFit]:
-    """Give the best of a few exponents, spread evenly."""
-    trials = torch.logspace(math.log10(LEAST), math.log10(MOST), _TRIALS, dtype=torch.float64)
+def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, EncodedFit]:
+    """Give the best exponent of a coarse grid, and its fit."""
+    trials = torch.logspace(
+        math.log10(MIN_GAMMA), math.log10(MAX_GAMMA), _TRIALS, dtype=torch.float64
+    )
     fits: list[EncodedFit] = []
     for exponent in trials.tolist():
         former = fits[-1] if fits else None
@@ -316,7 +319,7 @@ def _coarsely(problem: EncodedMatrix, iterations: int) -> tuple[float, EncodedFi
 
 
 def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float) -> _Minimum:
-    """Find where between two exponents the loss is least."""
+    """Minimize the loss between two exponents."""
     fit = start
 
     def loss(logarithm: float) -> float:
@@ -324,26 +327,26 @@ def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float
         fit = fit_encoded(problem, Gamma(exponent=math.exp(logarithm)), fit)
         return float(fit.loss.sum())
 
-    bounds = (math.log(max(low, LEAST)), math.log(min(high, MOST)))
-    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _CLOSE})
+    bounds = (math.log(max(low, MIN_GAMMA)), math.log(min(high, MAX_GAMMA)))
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _TOLERANCE})
     gamma = math.exp(found.x)
     fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
     return _Minimum(
         problem=problem,
         gamma=gamma,
         fit=fit,
-        inner=LEAST * 1.01 < gamma < MOST / 1.01,
+        inner=MIN_GAMMA * 1.01 < gamma < MAX_GAMMA / 1.01,
         error=_standard_error(problem, gamma, fit),
     )
 
 
-def _most_reliable(problem: EncodedMatrix) -> _Minimum:
-    """Estimate from all entries, or from the brighter ones alone where those contradict.
+def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
+    """Estimate from all entries, or from the brighter ones where theirs differs significantly.
 
-    Ambient light in attached shadows is not first-order, bright, and more precise than right.
+    Ambient light in attached shadows is not first-order: it biases the estimate from all entries.
     """
-    best, fit = _coarsely(problem, ITERATIONS)
-    step = (MOST / LEAST) ** (1 / (_TRIALS - 1))
+    best, fit = _grid_search(problem, ITERATIONS)
+    step = (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
     found = [_minimise(problem, fit, best / step, best * step)]
     predicted = found[0].fit.predicted
     for fraction in _DARKEST_FRACTIONS:
@@ -351,28 +354,29 @@ def _most_reliable(problem: EncodedMatrix) -> _Minimum:
         used = enough(problem.used & (predicted > level), problem.rank)
         if freedom(used, problem.rank) < _MIN_FREE:
             break
-        found.append(_minimise(problem.replace(used=used), found[0].fit, LEAST, MOST))
-    for place, estimate in enumerate(found):
-        rivals = [brighter for brighter in found[place + 1 :] if brighter.inner]
-        off = [abs(brighter.gamma - estimate.gamma) for brighter in rivals]
-        believed = [
-            each <= _CONTRADICTED * brighter.error + _ROUNDING * estimate.gamma
-            for each, brighter in zip(off, rivals, strict=True)
+        found.append(_minimise(problem.replace(used=used), found[0].fit, MIN_GAMMA, MAX_GAMMA))
+    for position, estimate in enumerate(found):
+        subsets = [brighter for brighter in found[position + 1 :] if brighter.inner]
+        differences = [abs(brighter.gamma - estimate.gamma) for brighter in subsets]
+        consistent = [
+            each <= _MAX_ERRORS * brighter.error + _ROUNDING * estimate.gamma
+            for each, brighter in zip(differences, subsets, strict=True)
         ]
-        if all(believed):
-            doubts = [
-                each - _DOUBTED * brighter.error for each, brighter in zip(off, rivals, strict=True)
+        if all(consistent):
+            excess = [
+                each - _SUSPECT_ERRORS * brighter.error
+                for each, brighter in zip(differences, subsets, strict=True)
             ]
-            return estimate.replace(error=math.hypot(estimate.error, max([0.0, *doubts])))
+            return estimate.replace(error=math.hypot(estimate.error, max([0.0, *excess])))
     raise AssertionError("nothing contradicts the last estimate")
 
 
 def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> float:
-    r"""Say how far samples, or views if those differ more, disagree about gamma.
+    r"""Give gamma's sandwich standard error over samples, or over views if that is larger.
 
     With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
     second derivative of the whole, the variance is :math:`\sum_k s_k^2 / h^2`; it needs no model
-    of the noise. Infinite where the loss hardly bends.
+    of the noise. Infinite where the loss has next to no curvature.
     """
     step = 0.02 * gamma
     below = fit_encoded(problem, Gamma(exponent=gamma - step), fit)
@@ -382,12 +386,12 @@ def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> fl
     slope = (above.loss - below.loss) / (2 * step)
     noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
     # On data without noise everything but the curvature is rounding.
-    bends = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(problem.used.sum())
-    return noise / curvature if bends else math.inf
+    curved = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(problem.used.sum())
+    return noise / curvature if curved else math.inf
 
 
-def _judged(found: _Minimum) -> GammaEstimate:
-    """Put the answer together."""
+def _estimate_of(found: _Minimum) -> GammaEstimate:
+    """Give the estimate, with residuals under the linear and the sRGB response."""
     problem = found.problem
     residual = residual_spread(problem, found.fit)
     linear = fit_encoded(problem, Linear(), found.fit, 2 * ITERATIONS)

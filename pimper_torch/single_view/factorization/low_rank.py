@@ -1,4 +1,4 @@
-"""Low-rank factorization of matrices with missing entries, posed for the solvers."""
+"""Low-rank factorization of matrices with missing entries, as a problem for the solvers."""
 
 import torch
 from jaxtyping import Float
@@ -14,13 +14,13 @@ def low_rank_problem(
     weight: Float[Tensor, "batch row column"],
     start: Float[Tensor, "batch row rank"],
 ) -> Bilinear:
-    r"""Pose :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
+    r"""Give the problem :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
 
     Rows are the problem's views, columns its samples: ``L`` becomes ``lights``, ``N``
     ``shading``. They are unique at best up to one invertible matrix between them.
 
     Args:
-        matrix: ``X``; entries without weight do not matter.
+        matrix: ``X``; entries without weight are ignored.
         weight: 0 where missing.
         start: Left factors of full rank.
 
@@ -62,12 +62,12 @@ def singular_left(
     weight: Float[Tensor, "batch row column"],
     rank: int,
     guess: Float[Tensor, "batch row column"] | None = None,
-    fillings: int = 20,
+    imputations: int = 20,
 ) -> Float[Tensor, "batch row rank"]:
-    """Start from the data: singular vectors of the matrix with its holes filled in.
+    """Initialize by singular vectors of the matrix, missing entries imputed iteratively.
 
-    Holes begin as a guess, without one as the mean of their row, and become, in turn, what the
-    leading singular vectors say. Orthonormal; in float64.
+    Missing entries start from a guess, by default the mean of their row, and are replaced by the
+    low-rank approximation in turn. Orthonormal; in float64.
     """
     seen = weight > 0
     known = torch.where(seen, matrix.double(), 0)
@@ -75,7 +75,7 @@ def singular_left(
         guess = known.sum(dim=2, keepdim=True) / seen.sum(dim=2, keepdim=True).clamp_min(1)
     filled = torch.where(seen, known, guess.double())
     left = _leading(filled, rank)
-    for _ in range(fillings):
+    for _ in range(imputations):
         filled = torch.where(seen, known, left @ (left.mT @ filled))
         left = _leading(filled, rank)
     return left

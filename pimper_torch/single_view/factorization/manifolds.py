@@ -1,16 +1,16 @@
-r"""What shading vectors can be: the photometric manifolds of each order of lighting.
+r"""Photometric manifolds of each order of lighting, and their ambiguities.
 
-A surface shows :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends
-on albedo and normal alone. Which vectors those are decides how much of a factorization is free:
+Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends
+on albedo and normal alone. The set of these vectors determines the ambiguity of a factorization:
 
-====================  ====  ============================  =====================
-light                 rank  :math:`s`                     left free
-====================  ====  ============================  =====================
-any low-rank matrix   any   any vector                    an invertible matrix
-a distant point light        3     :math:`\rho n`: any vector    an invertible 3 x 3
-first order           4     :math:`\rho (1, n)`           scaled Lorentz
-second order          9     :math:`\rho (1, n, n n^\top)` rotation, scale
-====================  ====  ============================  =====================
+=====================  ====  ============================  =====================
+light                  rank  :math:`s`                     ambiguity
+=====================  ====  ============================  =====================
+any low-rank matrix    any   any vector                    an invertible matrix
+a distant point light  3     :math:`\rho n`: any vector    an invertible 3 x 3
+first order            4     :math:`\rho (1, n)`           scaled Lorentz
+second order           9     :math:`\rho (1, n, n n^\top)` rotation, scale
+=====================  ====  ============================  =====================
 
 First order is :class:`pimper_torch.photometry.manifolds.Cone`.
 
@@ -46,7 +46,7 @@ class Free:
         return shading
 
     def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Bring back what a small step along the tangents has left: nothing."""
+        """Give the end of the step: the manifold is linear."""
         return shading
 
     def curvature(
@@ -58,7 +58,7 @@ class Free:
         return slope.new_zeros(*slope.shape[:-2], slope.shape[-1], self.rank, self.rank)
 
     def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
-        """Span the tangent space: all of it. With rank three albedo first, then two turns."""
+        """Span the space; with rank three by albedo, then by two rotations of the normal."""
         if self.rank == 3:
             _, normal = self.split(shading.mT)
             return [column.mT for column in (normal, *tangents(normal))]
@@ -68,7 +68,7 @@ class Free:
     def split(
         self, shading: Float[Tensor, "*batch rank"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Read albedo and unit normal off vectors of rank three."""
+        """Give albedo and unit normal of vectors of rank three."""
         self._only_three()
         length = shading.norm(dim=-1)
         return length, shading / torch.where(length > 0, length, 1)[..., None]
@@ -83,7 +83,7 @@ class Free:
     def normal_prior(
         self, normals: Float[Tensor, "*batch 3 sample"]
     ) -> Float[Tensor, "*batch 6 sample"]:
-        r"""Give the quadratic form :math:`\lVert b - (b \cdot \bar n) \bar n \rVert^2`, packed."""
+        r"""Give the penalty :math:`\lVert b - (b \cdot \bar n) \bar n \rVert^2`, packed."""
         self._only_three()
         one, zero = torch.ones_like(normals[..., 0, :]), torch.zeros_like(normals[..., 0, :])
         unit = torch.stack([one, zero, zero, one, zero, one], dim=-2)
@@ -112,7 +112,7 @@ class SecondOrder:
 
         The normal maximises :math:`b \cdot n + n^\top Q n` on the sphere, with ``b`` and ``Q``
         the vector's first and second degree: the largest root of a secular equation, found by
-        Newton's method. Albedo is the third of what is reached, or zero. Constant to autograd.
+        Newton's method. Albedo is a third of the maximum, or zero. Constant to autograd.
         """
         with torch.no_grad():
             vector, form = shading[..., 1:4].double(), _quadratic(shading[..., 4:].double())
@@ -131,28 +131,28 @@ class SecondOrder:
                 slope = (part**2 / (root - values)).sum(dim=-1, keepdim=True) / length**3
                 root = torch.maximum(root + (1 - 1 / length) / slope.clamp_min(1e-300), root)
             found = inner / (root - values)
-            # Where b has no part along the largest value's axis that axis makes up the length.
-            rest = (1 - found[..., :-1].square().sum(dim=-1, keepdim=True)).clamp_min(0).sqrt()
-            last = torch.where(found[..., -1:] < 0, -rest, rest)
+            # Where b has no part along the largest value's axis, that part makes the length 1.
+            remainder = (1 - found[..., :-1].square().sum(dim=-1, keepdim=True)).clamp_min(0).sqrt()
+            last = torch.where(found[..., -1:] < 0, -remainder, remainder)
             found = torch.cat([found[..., :-1], last], dim=-1)
             normal = (axes @ found[..., None])[..., 0]
             normal = normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-300)
         return self._along(shading, normal.to(shading))
 
     def retract(self, shading: Float[Tensor, "*batch 9"]) -> Float[Tensor, "*batch 9"]:
-        """Bring back what a small step along the tangents has left: by its first degree."""
+        """Map the end of a small step along the tangents back, by its first-degree part."""
         vector = shading[..., 1:4]
         length = vector.norm(dim=-1, keepdim=True)
         return self._along(shading, vector / torch.where(length > 0, length, 1))
 
     def tangents(self, shading: Float[Tensor, "*batch 9 sample"]) -> list[Tensor]:
-        r"""Span the tangent space: albedo, and two turns of the normal by :math:`1/\rho`."""
+        r"""Span the tangent space: albedo, and two rotations of the normal by :math:`1/\rho`."""
         _, normal = self.split(shading.mT)
         first, second = tangents(normal)
         columns = [second_order(normal)]
         for rotation in (first, second):
-            nothing = torch.zeros_like(rotation[..., :1])
-            columns.append(torch.cat([nothing, rotation, _differential(normal, rotation)], dim=-1))
+            zero = torch.zeros_like(rotation[..., :1])
+            columns.append(torch.cat([zero, rotation, _differential(normal, rotation)], dim=-1))
         return [column.mT for column in columns]
 
     def curvature(
@@ -175,14 +175,14 @@ class SecondOrder:
         }
         flat = tangent_curvature(-outward, mixed[0], mixed[1], twice[0, 1], albedo)
         safe = torch.where(albedo > 0, albedo, 1)
-        normal_prior = torch.zeros_like(flat)
-        normal_prior[..., 1, 1], normal_prior[..., 2, 2] = twice[0, 0] / safe, twice[1, 1] / safe
-        return flat + normal_prior
+        square = torch.zeros_like(flat)
+        square[..., 1, 1], square[..., 2, 2] = twice[0, 0] / safe, twice[1, 1] / safe
+        return flat + square
 
     def split(
         self, shading: Float[Tensor, "*batch 9"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Read albedo and unit normal off the vectors."""
+        """Give albedo and unit normal of the vectors."""
         return split_shading(shading[..., :4])
 
     def join(
@@ -194,7 +194,7 @@ class SecondOrder:
     def normal_prior(
         self, normals: Float[Tensor, "*batch 3 sample"]
     ) -> Float[Tensor, "*batch 45 sample"]:
-        r"""Give the quadratic form :math:`\lVert b - \rho \bar n \rVert^2`, packed."""
+        r"""Give the penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
         small = Cone().normal_prior(normals)
         wide = small.new_zeros(*small.shape[:-2], 45, small.shape[-1])
         # Row i of the packed triangle of nine begins after 9 + 8 + ...; of four, 4 + 3 + ...
@@ -243,7 +243,7 @@ def _quadratic(degree: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 3 3"]
 def _differential(
     normals: Float[Tensor, "*batch 3"], rotation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 5"]:
-    """Give the change of the second degree when normals move along ``turn``."""
+    """Give the derivative of the second degree when normals move along ``rotation``."""
     x, y, z = normals.unbind(dim=-1)
     a, b, c = rotation.unbind(dim=-1)
     root = math.sqrt(3)

@@ -1,4 +1,4 @@
-"""Factorization from several places, until the best minimum repeats."""
+"""Factorization from random starts, until the best minimum repeats."""
 
 from dataclasses import dataclass
 
@@ -23,8 +23,8 @@ class Restarted(Record):
     Attributes:
         best: A batch of one, rows as views and columns as samples.
         residuals: Of all starts, in their order.
-        repeated: Whether the best minimum was reached as often as asked; else a better one
-            may well have been missed.
+        repeated: Whether ``repeats`` starts reached the best minimum; if not, there may well be a
+            better one.
     """
 
     best: Factors
@@ -47,7 +47,7 @@ def factorize_from_many(
     """Factorize a matrix with missing entries from random starts until the best repeats.
 
     Args:
-        matrix: Entries without weight do not matter.
+        matrix: Entries without weight are ignored.
         weight: 0 where missing.
         rank: Of the factors.
         generator: On the CPU.
@@ -59,7 +59,7 @@ def factorize_from_many(
             :func:`~pimper_torch.photometry.variable_projection.solve_variable_projection`.
 
     Raises:
-        InputError: No starts are allowed, or the matrix, weights or rank make no sense.
+        InputError: ``max_starts`` below ``repeats``, or an invalid matrix, weight or rank.
     """
     if not 1 <= repeats <= max_starts:
         raise InputError(
@@ -77,7 +77,7 @@ def factorize_from_many(
         residuals.append(float(found.convergence.residual))
         if best is None or residuals[-1] < float(best.convergence.residual):
             best = found
-        # On exact data the best residual is rounding, and no two are alike.
+        # On exact data the residuals are rounding, and all differ.
         same = max(min(residuals) * (1 + closeness), _ROUNDING * level)
         repeated = sum(one <= same for one in residuals) >= repeats
         if repeated:

@@ -1,4 +1,4 @@
-"""A start from the data alone: singular vectors, upgraded to the photometric cone."""
+"""Initial factors from the data alone: singular vectors, upgraded to the photometric cone."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,20 @@ from pimper_torch.photometry.quadratics import diagonal, outer, solve_packed
 from pimper_torch.records import Record
 from pimper_torch.single_view.factorization.ambiguity import minkowski
 
-# Filling converges in a few steps to a good start; the alternation after it is exact.
+# Imputations of missing entries, and steps of the weighted alternation after them: choices.
 FILL_STEPS = 20
 ALTERNATIONS = 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Upgraded(Record):
-    """Factors equal in product to those given, near the cone up to a Lorentz transformation.
+    """Factors with the same product, near the cone up to a Lorentz transformation.
 
     Attributes:
         lights: ``L``.
         shading: ``N``, with albedo positive for most samples.
-        lorentzian: Whether the quadric found had the cone's signature; if not, the factors are
-            on no cone, and a start from elsewhere is better.
+        lorentzian: Whether the quadric has the cone's signature; if not, the factors are not
+            near a cone.
     """
 
     lights: Float[Tensor, "patch view 4"]
@@ -34,12 +34,12 @@ class Upgraded(Record):
 def factorize_rank_four(
     radiance: Float[Tensor, "patch view sample"], weight: Float[Tensor, "patch view sample"]
 ) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
-    """Find the best product of rank four where the data is seen, cone ignored.
+    """Give the rank-four factors that minimize the weighted residual, the cone ignored.
 
-    Missing entries are filled with a sample's albedo times a view's brightness, then with
-    the rank-four part of the filled matrix in turn (eigenvectors of the small view-by-view
-    matrix); weighted alternation follows. A view or sample with fewer than four entries
-    gets the smallest solution. The product is unique, its factors up to a 4 x 4 matrix.
+    Missing entries are imputed by a sample's albedo times a view's brightness, then
+    iteratively by the rank-four part of the imputed matrix (eigenvectors of the small
+    view-by-view matrix); weighted alternation follows. A view or sample with fewer than four
+    entries gets the minimum-norm solution. Factors are unique up to a 4 x 4 matrix.
     """
     count = weight.sum(dim=1, keepdim=True).clamp_min(1)
     gain = (weight * radiance).sum(dim=2, keepdim=True) / weight.sum(dim=2, keepdim=True).clamp_min(
@@ -68,12 +68,12 @@ def upgrade_to_cone(
     shading: Float[Tensor, "patch 4 sample"],
     weight: Float[Tensor, "patch sample"],
 ) -> Upgraded:
-    r"""Bring shading vectors as near to the cone as one matrix for all of them can.
+    r"""Find the linear map that takes the shading vectors nearest to the cone, and apply it.
 
-    All lie on a quadric :math:`s^\top Q s = 0`; the least eigenvector of their quadratic
-    monomials is ``Q``, and :math:`Q = H^\top \eta H` gives the matrix ``H``. Noise, or normals
-    that differ too little, can spoil Q's signature (1, 3), which is told; the eigenvalue most
-    apart in sign is then taken for albedo.
+    All lie on a quadric :math:`s^\top Q s = 0`; ``Q`` is the least eigenvector of their quadratic
+    monomials, and :math:`Q = H^\top \eta H` gives the matrix ``H``. With noise, or normals
+    that vary too little, Q may not have the signature (1, 3), which ``lorentzian`` reports; the
+    eigenvalue of the rarer sign is then that of albedo.
     """
     S, L = shading.double(), lights.double()
     moment = (S * weight[:, None]) @ S.mT
@@ -104,7 +104,7 @@ def upgrade_to_cone(
     S, L = H @ S, L @ torch.linalg.inv(H)
     sign = torch.where((weight * S[:, 0].sign()).sum(dim=1) < 0, -1.0, 1.0)[:, None, None]
     eta = minkowski(S)
-    # A time axis of the wrong sign is repaired by -1; space axes are the alignment's affair.
+    # A negative time axis is mirrored by -1; space axes are left to the alignment.
     mirror = torch.where(sign < 0, -torch.eye(4, dtype=S.dtype, device=S.device), eta @ eta)
     return Upgraded(
         lights=(L @ mirror).to(lights), shading=(mirror @ S).to(shading), lorentzian=lorentzian

@@ -1,4 +1,4 @@
-"""A start from the data alone, its ambiguity fixed by reference lights."""
+"""Initial factors from the data alone, their ambiguity resolved by reference lights."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,20 +15,19 @@ def start_from_data(
     reference: Float[Tensor, "patch view 4"],
     fallback: Float[Tensor, "patch 4 sample"],
 ) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
-    """Factorize without the mesh, then fix the ambiguity by reference lights.
+    """Factorize without the mesh, then resolve the ambiguity by reference lights.
 
-    Singular vectors of the filled data, upgraded to the cone; of all Lorentz transformations
-    the one is applied that brings the lights nearest to ``reference``. Normals would be the
+    Singular vectors of the imputed data, upgraded to the cone; of all Lorentz transformations
+    the one is applied that brings the lights nearest to ``reference``. Normals would be a
     worse reference: those of a mesh are smoother than the true ones, and the transformation
-    that fits them best flattens the relief. A patch whose data is not of rank four, such as
-    one that three views see, or whose quadric is no cone, starts at ``reference`` and
-    ``fallback``.
+    that fits them best flattens the surface. A patch whose data is not of rank four, such as
+    one that three views see, or whose quadric is no cone, gets ``reference`` and ``fallback``.
     """
     weight = seen.to(radiance.dtype)
-    # Samples that fewer than four views see say nothing of the cone.
-    told = (weight.sum(dim=1) >= 4).to(radiance.dtype)
+    # Samples that fewer than four views see do not constrain the cone.
+    determined = (weight.sum(dim=1) >= 4).to(radiance.dtype)
     lights, shading = factorize_rank_four(radiance, weight)
-    upgraded = upgrade_to_cone(lights, shading, told)
+    upgraded = upgrade_to_cone(lights, shading, determined)
     lights, shading = upgraded.lights, upgraded.shading
     enough = (weight.sum(dim=2) > 0).sum(dim=1) >= 4
     sound = lights.isfinite().all(dim=(1, 2)) & shading.isfinite().all(dim=(1, 2)) & enough

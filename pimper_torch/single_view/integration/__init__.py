@@ -1,4 +1,4 @@
-"""Normals to surface: of one map, and of every patch."""
+"""Integration of normal maps."""
 
 from pimper_torch.single_view.integration.discontinuities import Continuity, DiscontinuityConfig
 from pimper_torch.single_view.integration.normal_map import IntegratedMap, integrate_normal_map

@@ -1,23 +1,22 @@
-r"""Integration that lets depth jump: which steps between pixels the surface really takes.
+r"""Discontinuity-preserving integration: which steps between pixels are continuous.
 
 .. math:: \min_x \sum_e D_e\, \phi_\sigma\!\left(\frac{x_b - x_a}{u_e} - s_e\right)
 
-over steps ``e`` that normals predict as ``s_e``, with Geman and McClure's :math:`\phi`, whose
-influence ends: a step across an edge of depth is given up instead of bending the surface on
+over steps ``e`` that normals predict as ``s_e``, with Geman and McClure's :math:`\phi`, which
+redescends: a step across a depth discontinuity is rejected instead of deforming the surface on
 both sides. That problem has many minima. It is solved by graduated non-convexity: from plain
-least squares :math:`\sigma` falls to its last value, and the weights then settle; every linear
-system is solved to the end, so where that leads does not depend on how.
+least squares :math:`\sigma` falls to its final value, then the weights converge; every linear
+system is solved to convergence, so that the result does not depend on the solver.
 
-At a crease, and where something ends in front of something else, the slope along a step
-changes on it by more than beside it, and what normals predict there is wrong by up to that
-change. Where the slope across a step changes so, both sides rise differently and meet in one
-point at most. Such steps prove nothing, and are not asked: they, and all others that were
-given up, only tie. Parts that hang together by ties alone, whose places normals do not tell,
-so lie where the mean of their border says.
+At a crease, and at an occlusion boundary, the slope along a step changes by more than on the
+steps beside it, and the predicted step is wrong by up to that change. Where the slope across a
+step changes so, both sides meet in one point at most. Such steps are not tested: they, and all
+rejected ones, keep a small weight, ``tie``. Components that are connected by such weights alone,
+whose relative depth normals do not determine, are so aligned in the mean of their border.
 
-Source: Black & Rangarajan, IJCV 19(1), 1996, for the loss and its graduation; the division in
-continuous parts and borders follows Milano, Chung, Ott & Siegwart, 2025, though here parts are
-what the weights leave together and never fixed. Kinks and twists are ours.
+Source: Black & Rangarajan, IJCV 19(1), 1996, for the loss and its graduation; the partition into
+continuous components and borders follows Milano, Chung, Ott & Siegwart, 2025, though here
+components follow from the weights and are never fixed. Kinks and twists are ours.
 """
 
 from dataclasses import dataclass
@@ -34,17 +33,17 @@ from pimper_torch.records import Convergence, Record, StopCause
 from pimper_torch.single_view.integration.rasters import Method, RasterSystem
 from pimper_torch.single_view.integration.steps import Steps
 
-# The first scale, in pixels, and by how much each round divides it.
+# Initial scale, in pixels, and the factor by which each iteration divides it: choices.
 _FIRST_SCALE, _NARROWER = 3.0, 3.0
 
-# Of the linear systems' solutions, in their energy; what remains is far below any scale.
+# Of the linear systems' solutions, in their energy: a choice, far below any scale.
 _TOLERANCE = 1e-6
 
-# Once the scale is at its last value weights move little, and a hierarchy is kept until it
-# needs more cycles than this.
+# At the final scale weights change little, and a hierarchy is kept until it needs more cycles than
+# this: a choice.
 _MANY_CYCLES = 25
 
-# A deviation is this many times the median of absolute residuals.
+# Standard deviation of Gaussian noise over its median absolute value.
 _PER_MEDIAN = 1.4826
 
 Pair = tuple[Tensor, Tensor]
@@ -52,18 +51,17 @@ Pair = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscontinuityConfig:
-    """When a step is given up.
+    """When a step is rejected.
 
     Attributes:
         scale_px: Residual at which a step keeps a quarter of its weight, in widths of a
             pixel at the surface's depth.
-        noise_scales: The scale is at least so many deviations of the residuals, so that noisy
-            normals do not tear the surface.
-        kink: A step whose slope changes by so much more than on the steps beside it is not
-            asked about jumps; about the tangent of the angle of a crease.
+        noise_scales: Minimum scale in deviations of the residuals, so that noisy normals make no
+            discontinuities.
+        kink: Maximum kink of a step that is tested; about the tangent of a crease's angle.
         twist: Likewise of the slope across the step, which no crease along the raster has.
-        tie: Weight of steps that are given up or not asked.
-        tolerance: Mean change of the weights at which they have settled.
+        tie: Weight of steps that are rejected or not tested.
+        tolerance: Mean change of the weights at convergence.
         max_iterations: Linear systems at most.
     """
 
@@ -85,10 +83,10 @@ class DiscontinuityConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Continuity(Record):
-    """Which steps the surface takes.
+    """Which steps are continuous.
 
     Attributes:
-        right: Weight in [0, 1] of each step to the right: 1 continuous, ``tie`` given up, 0
+        right: Weight in [0, 1] of each step to the right: 1 continuous, ``tie`` rejected, 0
             outside.
         down: Likewise.
         convergence: Of the weights; the residual is that of continuous steps, in pixels.
@@ -108,29 +106,32 @@ def find_discontinuities(
     config: DiscontinuityConfig,
     method: Method = "auto",
 ) -> Continuity:
-    """Find out which steps the surface takes.
+    """Find the continuous steps.
 
     Args:
-        steps: Wanted by the normals.
+        steps: Predicted by the normals.
         weight_right: ``D``, zero outside, in units of the squared unknown's inverse.
         weight_down: Likewise.
         anchor: Of pixels whose unknown is given.
         heights: The given ones.
-        config: When a step is given up.
+        config: When a step is rejected.
         method: Of the linear systems.
 
     Constant to autograd.
     """
     with torch.no_grad():
         inside = weight_right > 0, weight_down > 0
-        calm = (
+        smooth = (
             (steps.kink_right < config.kink) & (steps.twist_right < config.twist),
             (steps.kink_down < config.kink) & (steps.twist_down < config.twist),
         )
-        asked = steps.known_right & calm[0] & inside[0], steps.known_down & calm[1] & inside[1]
+        tested = (
+            steps.reliable_right & smooth[0] & inside[0],
+            steps.reliable_down & smooth[1] & inside[1],
+        )
         fraction = (
-            torch.where(asked[0], 1.0, config.tie) * inside[0],
-            torch.where(asked[1], 1.0, config.tie) * inside[1],
+            torch.where(tested[0], 1.0, config.tie) * inside[0],
+            torch.where(tested[1], 1.0, config.tie) * inside[1],
         )
         system, solution = None, None
         scale, narrowed, cause = _FIRST_SCALE, False, StopCause.LIMIT
@@ -144,14 +145,14 @@ def find_discontinuities(
                 keep = narrowed and solution.iterations <= _MANY_CYCLES
                 system = system.refreshed(*weights, anchor, keep=keep)
             solution = _solved(system, steps, weights, anchor, heights, solution)
-            apart = _residuals(steps, solution.values.reshape(steps.inside.shape))
-            smallest = _last_scale(apart, asked, config)
+            residuals = _residuals(steps, solution.values.reshape(steps.inside.shape))
+            smallest = _final_scale(residuals, tested, config)
             narrowed = scale <= smallest
             scale = max(scale, smallest)
             before = fraction
             fraction = (
-                _fraction(apart[0], asked[0], inside[0], scale, config.tie),
-                _fraction(apart[1], asked[1], inside[1], scale, config.tie),
+                _robust_weight(residuals[0], tested[0], inside[0], scale, config.tie),
+                _robust_weight(residuals[1], tested[1], inside[1], scale, config.tie),
             )
             report(taken, config.max_iterations)
             if narrowed and _mean_change(before, fraction, inside) < config.tolerance:
@@ -163,7 +164,7 @@ def find_discontinuities(
             down=fraction[1],
             convergence=Convergence(
                 iterations=torch.tensor([taken]),
-                residual=_deviation(apart, fraction)[None],
+                residual=_deviation(residuals, fraction)[None],
                 cause=torch.tensor([int(cause)]),
             ),
         )
@@ -177,33 +178,35 @@ def _solved(
     heights: Tensor | None,
     start: Iterate | None,
 ) -> Iterate:
-    wanted = steps.wanted
-    source = differences_transposed(weights[0] * wanted[0], weights[1] * wanted[1])
+    target = steps.target
+    source = differences_transposed(weights[0] * target[0], weights[1] * target[1])
     if anchor is not None and heights is not None:
         source = source + anchor * heights
     return system.iterate(source, None if start is None else start.values.reshape(source.shape))
 
 
 def _residuals(steps: Steps, found: Float[Tensor, "height width"]) -> Pair:
-    """Tell by how many pixels' widths the surface leaves the wanted steps."""
+    """Give the residuals of the steps, in widths of a pixel."""
     right, down = differences(found)
     return right / steps.unit_right - steps.right, down / steps.unit_down - steps.down
 
 
-def _fraction(
+def _robust_weight(
     residual: Float[Tensor, "row column"],
-    asked: Bool[Tensor, "row column"],
+    tested: Bool[Tensor, "row column"],
     inside: Bool[Tensor, "row column"],
     scale: float,
     tie: float,
 ) -> Float[Tensor, "row column"]:
-    """Give the fraction of its weight that a step keeps."""
+    """Give each step's robust weight."""
     geman_mcclure = (1 + (residual / scale).square()) ** -2
-    return torch.where(asked, geman_mcclure, 0).clamp_min(tie) * inside
+    return torch.where(tested, geman_mcclure, 0).clamp_min(tie) * inside
 
 
-def _last_scale(apart: Pair, asked: tuple[Tensor, Tensor], config: DiscontinuityConfig) -> float:
-    some = torch.cat([apart[0][asked[0]], apart[1][asked[1]]])
+def _final_scale(
+    residuals: Pair, tested: tuple[Tensor, Tensor], config: DiscontinuityConfig
+) -> float:
+    some = torch.cat([residuals[0][tested[0]], residuals[1][tested[1]]])
     deviation = _PER_MEDIAN * float(some.abs().median()) if len(some) else 0.0
     return max(config.scale_px, config.noise_scales * deviation)
 
@@ -213,6 +216,8 @@ def _mean_change(before: Pair, after: Pair, inside: tuple[Tensor, Tensor]) -> fl
     return float(moved) / max(1, int(inside[0].sum()) + int(inside[1].sum()))
 
 
-def _deviation(apart: Pair, fraction: Pair) -> Float[Tensor, ""]:
-    square = (fraction[0] * apart[0].square()).sum() + (fraction[1] * apart[1].square()).sum()
+def _deviation(residuals: Pair, fraction: Pair) -> Float[Tensor, ""]:
+    square = (fraction[0] * residuals[0].square()).sum() + (
+        fraction[1] * residuals[1].square()
+    ).sum()
     return (square / (fraction[0].sum() + fraction[1].sum()).clamp_min(1)).sqrt()

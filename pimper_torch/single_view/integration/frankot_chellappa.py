@@ -1,11 +1,10 @@
-r"""Slopes of a full rectangle to heights, in the Fourier basis of the mirrored rectangle.
+r"""Integration of slopes on a rectangle in the Fourier basis, by Frankot and Chellappa.
 
 .. math:: \hat z = \frac{-i\omega_x \hat p - i\omega_y \hat q}{\omega_x^2 + \omega_y^2}
 
-is the projection of ``p, q`` on slopes that belong to a height. The basis is periodic, which
-surfaces are not: the rectangle is mirrored in both directions, heights evenly, so that they
-meet at every border, and the mean slope, whose mirror image would be a roof, is taken out
-before and put back after.
+is the projection of ``p, q`` on integrable slopes. The basis is periodic, which surfaces are
+not: the rectangle is mirrored in both directions, heights evenly, so that they are continuous
+across every border, and the mean slope is subtracted before and added after.
 
 Source: Frankot & Chellappa, A method for enforcing integrability in shape from shading
 algorithms, PAMI 10(4), 1988.
@@ -22,7 +21,7 @@ def integrate_fourier(
     pixel_width: float = 1.0,
     pixel_height: float = 1.0,
 ) -> Float[Tensor, "*batch height width"]:
-    """Find the heights, of mean zero, whose slopes come nearest to those given.
+    """Give the heights, of mean zero, whose slopes are nearest to those given.
 
     Args:
         slope_right: At every pixel.
@@ -40,23 +39,23 @@ def integrate_fourier(
     along = _frequencies(2 * height, pixel_height, slope_right)[:, None]
     square = across.square() + along.square()
     spectrum = -1j * (across * torch.fft.fft2(right) + along * torch.fft.fft2(down))
-    # No height answers to the mean; dividing it by infinity removes it.
+    # The mean is removed by division by infinity.
     spectrum = spectrum / square.masked_fill(square == 0, torch.inf)
     waves = torch.fft.ifft2(spectrum).real[..., :height, :width]
-    place = torch.arange(width, device=waves.device, dtype=waves.dtype) - (width - 1) / 2
+    column = torch.arange(width, device=waves.device, dtype=waves.dtype) - (width - 1) / 2
     row = torch.arange(height, device=waves.device, dtype=waves.dtype) - (height - 1) / 2
-    plane = means[0] * pixel_width * place + means[1] * pixel_height * row[:, None]
+    plane = means[0] * pixel_width * column + means[1] * pixel_height * row[:, None]
     return plane + waves - waves.mean(dim=(-2, -1), keepdim=True)
 
 
 def _mirrored(raster: Float[Tensor, "*batch height width"], odd: int, even: int) -> Tensor:
-    """Continue slopes as those of a mirrored height: turned round along their own direction."""
+    """Extend slopes as those of a mirrored height: negated along their own direction."""
     raster = torch.cat([raster, raster.flip(even)], dim=even)
     return torch.cat([raster, -raster.flip(odd)], dim=odd)
 
 
 def _frequencies(size: int, spacing: float, like: Float[Tensor, "..."]) -> Float[Tensor, " {size}"]:
     frequencies = torch.fft.fftfreq(size, device=like.device, dtype=like.dtype)
-    # The highest frequency has no sign, and so no slope.
+    # The Nyquist frequency has no sign, and so no slope.
     frequencies[size // 2] = 0
     return 2 * torch.pi / spacing * frequencies

@@ -11,10 +11,10 @@ from pimper_torch.geometry.topology import graph_components
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeComponents:
-    """Which pixels move together, free of all others.
+    """The connected components without anchor, and their pixels.
 
     Attributes:
-        pixel: Those of all free components, counted row by row.
+        pixel: Indices of the pixels of all free components, row by row.
         component: Of each of these.
         root: One pixel of each component.
         size: Pixels of each component.
@@ -33,15 +33,15 @@ class FreeComponents:
         mean = heights.new_zeros(len(self.root)).index_add(0, self.component, part) / self.size
         return heights.index_add(0, self.pixel, -mean[self.component])
 
-    def grounded(self, heights: Float[Tensor, " pixel"]) -> Float[Tensor, " pixel"]:
+    def rooted(self, heights: Float[Tensor, " pixel"]) -> Float[Tensor, " pixel"]:
         """Subtract from each free component the height of its root."""
         part = heights[self.pixel] - heights[self.root][self.component]
         return heights.index_copy(0, self.pixel, part)
 
-    def held(self, diagonal: Float[Tensor, " pixel"]) -> Float[Tensor, " pixel"]:
-        """Double the diagonal at one pixel of each free component, which makes it definite.
+    def pinned(self, diagonal: Float[Tensor, " pixel"]) -> Float[Tensor, " pixel"]:
+        """Double the diagonal at one pixel of each free component: the matrix becomes definite.
 
-        With a right-hand side of mean zero this holds that pixel at 0 and changes nothing else.
+        With a right-hand side of mean zero this fixes that pixel at 0 and changes nothing else.
         """
         return diagonal.index_add(0, self.root, diagonal[self.root])
 
@@ -51,7 +51,7 @@ def free_components(
     down: Bool[Tensor, "steps_down width"],
     anchored: Bool[Tensor, "height width"],
 ) -> FreeComponents:
-    """Find the components without anchor; a pixel without any edge is none.
+    """Find the components without anchor, but for single pixels.
 
     Args:
         right: Whether a pixel and the next in its row are connected.
@@ -59,16 +59,16 @@ def free_components(
         anchored: Whether a pixel's height is known.
     """
     label = _labels(right, down, anchored.shape)
-    tied = torch.zeros_like(anchored)
-    tied[:, 1:] |= right
-    tied[:, :-1] |= right
-    tied[1:] |= down
-    tied[:-1] |= down
+    connected = torch.zeros_like(anchored)
+    connected[:, 1:] |= right
+    connected[:, :-1] |= right
+    connected[1:] |= down
+    connected[:-1] |= down
     count = int(label.max()) + 1 if label.numel() else 0
-    held = anchored.new_zeros(count).index_put(
+    pinned = anchored.new_zeros(count).index_put(
         (label[anchored.reshape(-1)],), anchored.new_ones(())
     )
-    pixel = (tied.reshape(-1) & ~held[label]).nonzero()[:, 0]
+    pixel = (connected.reshape(-1) & ~pinned[label]).nonzero()[:, 0]
     found, component = torch.unique(label[pixel], return_inverse=True)
     root = pixel.new_full((len(found),), label.numel())
     root = root.scatter_reduce(0, component, pixel, "amin")

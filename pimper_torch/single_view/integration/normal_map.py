@@ -1,4 +1,4 @@
-"""One normal map to one depth map: parallel rays or a pinhole, masks, weights, known depths."""
+"""Integration of a normal map to depth, orthographic or pinhole, with mask, weights and anchors."""
 
 import math
 import warnings
@@ -27,12 +27,12 @@ from pimper_torch.single_view.integration.steps import Steps, orthographic_steps
 Raster = Tensor | np.ndarray
 Integration = Literal["discontinuities", "weighted", "cosine", "frankot-chellappa"]
 
-# Steps over pixels without a normal tie, and no more: their slopes were filled in.
+# Weight of steps over pixels without a normal, whose slopes are inpainted: a choice.
 _FILLED_WEIGHT = 1e-4
 
 # Blocks across a normal map, and curl with y negated over that with y as it is, below which a
 # warning comes. A ball, waves and a vase of 160 pixels, normals 3 degrees off: 0.09 to 0.41 where y
-# is upside down; a plane 0.9 to 1.1 either way. Curl below the floor is what rounding leaves.
+# is upside down; a plane 0.9 to 1.1 either way. Curl below the floor is rounding.
 _BLOCKS, _CURL_RATIO, _CURL_FLOOR = 24, 0.5, 1e-3
 
 
@@ -41,11 +41,11 @@ class IntegratedMap(Record):
     """A surface over a raster.
 
     Attributes:
-        depth: Along z; 0 outside. Under a pinhole up to one factor for each part of the mask,
-            whose depths have the geometric mean 1, and under parallel rays up to a constant,
-            with the mean 0, unless depths of the part were given.
-        valid: True where a normal was given and could be used; the mask's other pixels bridge.
-        continuity: Which steps between pixels the surface takes; ``None`` where all are.
+        depth: Along z; 0 outside. Each component of the mask without known depth is determined
+            up to a factor under a pinhole, its geometric mean being 1, and up to a constant
+            under parallel rays, its mean being 0.
+        valid: True where a normal was used; the mask's other pixels are interpolated.
+        continuity: Which steps between pixels are continuous; ``None`` where all are.
     """
 
     depth: Float[Tensor, "height width"]
@@ -66,35 +66,34 @@ def integrate_normal_map(
     config: DiscontinuityConfig | None = None,
     solver: Solver = "auto",
 ) -> IntegratedMap:
-    """Find the surface that has the normals.
+    """Integrate a normal map to depth.
 
     Args:
         normals: ``height width 3``: x right, y down, z forward into the surface; facing the
-            viewer. Of any length; where not finite, zero or turned away the surface is bridged.
-            Arrays of numpy are taken for this and the other rasters, too.
+            viewer. Of any length; where not finite, zero or facing away the surface is
+            interpolated. Like the other rasters, tensors or numpy arrays.
         mask: Pixels of the surface; all if not given.
         intrinsics: Of the pinhole, in pixels from the corner of the top-left one; without it
             rays are parallel.
         spacing: Distance of neighbouring pixels in a row and in a column, under parallel rays.
-        weight: How far each normal is to be trusted; 1 if not given, 0 like not finite.
-        known_depth: Where not NaN, the depth there.
-        known_weight: Of the known depths, next to that of one normal; 1 if not given.
-        method: ``"discontinuities"`` lets depth jump; see
-            :mod:`.discontinuities`. ``"weighted"`` is least squares,
-            under masks and weights. ``"cosine"`` and ``"frankot-chellappa"`` take the
-            rectangle round the mask, normals outside it filled in smoothly: published, quick,
-            and for rectangles without mask and weights.
-        config: When a step is given up.
+        weight: Of each normal; 1 if not given, 0 like not finite.
+        known_depth: Depth at some pixels, NaN at the others.
+        known_weight: Of the known depths, in units of that of one normal; 1 if not given.
+        method: ``"discontinuities"`` preserves depth discontinuities; see
+            :mod:`.discontinuities`. ``"weighted"`` is least squares with mask and weights.
+            ``"cosine"`` and ``"frankot-chellappa"`` integrate the bounding rectangle of the mask,
+            normals outside it inpainted: published, fast, and for rectangles without mask and
+            weights.
+        config: When a step is rejected.
         solver: Of the linear systems: ``"cholesky"``, ``"multigrid"`` or ``"auto"``.
 
     Raises:
         InputError: Shapes that differ, a mask without pixels, weights that are negative, a
-            method that does not take what was given, normals of another convention: coded as
+            method without mask or weights given these, normals of another convention: coded as
             colours, or with z to the viewer.
 
     Warns:
-        PimperWarning: Normals that are those of a surface once y is negated, and are not as they
-            come.
+        PimperWarning: Normals that are integrable only with y negated.
 
     Differentiable in normals, weights and known depths, by one more solve; which steps are
     continuous is constant.
@@ -170,7 +169,7 @@ def _integrated(
             continuity = find_discontinuities(steps, *weights, anchor, unknown, settings, solver)
             weights = weights[0] * continuity.right, weights[1] * continuity.down
         system = RasterSystem(*weights, anchor, method=solver, what="the integration")
-        found = system.fit_steps(*steps.wanted, unknown)
+        found = system.fit_steps(*steps.target, unknown)
     depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(depth=depth.to(normals), valid=steps.valid & mask, continuity=continuity)
 
@@ -179,7 +178,7 @@ Box = tuple[slice, slice]
 
 
 def _box(mask: Bool[Tensor, "height width"]) -> Box:
-    """Give the rows and columns that have pixels: work and memory are spent on those only."""
+    """Give the bounding rows and columns of the mask, to save time and memory."""
     rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
@@ -189,7 +188,7 @@ def _from_corner(intrinsics: Float[Tensor, "3 3"], box: Box) -> Float[Tensor, "3
 
 
 def _placed(part: IntegratedMap, box: Box, height: int, width: int) -> IntegratedMap:
-    """Put what was found in a box back where the box was."""
+    """Pad the result of a box to the full raster."""
     rows, columns = box
     frame = (columns.start, width - columns.stop, rows.start, height - rows.stop)
     continuity = part.continuity
@@ -207,7 +206,7 @@ def _usable(
     mask: Bool[Tensor, "height width"],
     weight: Float[Tensor, "height width"] | None,
 ) -> Float[Tensor, "height width 3"]:
-    """Give unit normals, NaN where there is none to be used."""
+    """Give unit normals, NaN where there is none."""
     length = normals.norm(dim=-1)
     usable = mask & (length > 0) & length.isfinite()
     if weight is not None:
@@ -222,8 +221,8 @@ def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> tupl
     reliability = torch.where(steps.valid, 1.0 if weight is None else weight.double(), 0).double()
     parts = []
     for axis, known, unit in (
-        (1, steps.known_right, steps.unit_right),
-        (0, steps.known_down, steps.unit_down),
+        (1, steps.reliable_right, steps.unit_right),
+        (0, steps.reliable_down, steps.unit_down),
     ):
         last = reliability.shape[axis] - 1
         both = inside.narrow(axis, 1, last) & inside.narrow(axis, 0, last)
@@ -260,7 +259,7 @@ def _whole_rectangle(steps: Steps, method: Integration) -> Float[Tensor, "height
         return integrate_fourier(right, down, steps.unit_right, steps.unit_down)
     right = torch.full_like(steps.right, steps.unit_right**-2)
     down = torch.full_like(steps.down, steps.unit_down**-2)
-    return RasterSystem(right, down, method="cosine").fit_steps(*steps.wanted)
+    return RasterSystem(right, down, method="cosine").fit_steps(*steps.target)
 
 
 def _tensor(values: Raster | None) -> Tensor | None:
@@ -300,9 +299,9 @@ def _refuse_convention(
 def _curl(
     normals: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"], sign: float
 ) -> float:
-    """Give the median of how much slopes fail to be a surface's, round squares of four blocks.
+    """Give the median absolute curl of the slopes, around squares of four blocks.
 
-    Slopes are averaged over blocks, which noise does not outlive.
+    Slopes are averaged over blocks, which reduces noise.
     """
     slopes = -normals[..., :2] / normals[..., 2:]
     usable = mask & slopes.isfinite().all(dim=-1) & (normals[..., 2] < 0)

@@ -1,4 +1,4 @@
-r"""Least squares over a raster whose neighbours are tied by weighted steps.
+r"""Weighted least squares on the differences of neighbouring pixels: a graph Laplacian.
 
 .. math:: \min_z \sum_e w_e (z_{e+} - z_{e-} - g_e)^2 + \sum_i a_i (z_i - c_i)^2
 
@@ -44,18 +44,18 @@ class RasterSystem:
         method: ``"cholesky"``: exact, on the CPU; ``"multigrid"``: conjugate gradients, memory
             and time grow with the pixels only; ``"cosine"``: one division, for full rectangles
             with equal weights. ``"auto"`` takes the quickest that can.
-        free: What to do with pixels that hang together without any anchor, whose height has
-            a free constant: ``"mean_zero"`` gives each such component the mean 0, and ignores
-            the mean of its right-hand side; ``"refuse"`` raises.
+        free: Of connected components without anchor, whose height has a free constant:
+            ``"mean_zero"`` gives each the mean 0, and ignores the mean of its right-hand side;
+            ``"refuse"`` raises.
         tolerance: Of multigrid: of the error, in the energy norm, relative.
         what: Names the system in errors.
 
     Raises:
         InputError: Weights that are negative or not finite; ``"cosine"`` where they differ.
-        SingularSystemError: Free constants, if they are to be refused.
+        SingularSystemError: Free components, with ``"refuse"``.
 
-    Weights that vary over ten orders, holes, islands and single pixels are all in order. Heights
-    are float64 inside, and go back to the device and dtype of the right-hand side.
+    Weights may vary over ten orders, with holes, islands and single pixels. Heights are computed
+    in float64, and returned in the device and dtype of the right-hand side.
 
     >>> system = RasterSystem(torch.ones(2, 1), torch.ones(1, 2))
     >>> system.fit_steps(torch.ones(2, 1), torch.zeros(1, 2))
@@ -74,7 +74,7 @@ class RasterSystem:
         tolerance: float = DEFAULT_TOLERANCE,
         what: str = "the raster",
     ) -> None:
-        self._wish, self._refuses = method, free == "refuse"
+        self._requested, self._refuses = method, free == "refuse"
         self._tolerance, self._what = tolerance, what
         self._take(weight_right, weight_down, anchor, None)
 
@@ -85,7 +85,7 @@ class RasterSystem:
 
     @property
     def anchored(self) -> Bool[Tensor, "height width"]:
-        """Whether a pixel's height is determined by anchors: not outside, and no constant free."""
+        """Whether a pixel's height is determined: inside, and in no free component."""
         fixed = self._inside.reshape(-1).index_fill(0, self._components.pixel, False)
         return fixed.view(self._inside.shape)
 
@@ -112,11 +112,11 @@ class RasterSystem:
         down: Float[Tensor, "steps_down width"],
         heights: Float[Tensor, "height width"] | None = None,
     ) -> Float[Tensor, "height width"]:
-        """Find the heights whose steps and anchored pixels come nearest to those given.
+        """Give the heights whose steps and anchored pixels are nearest to those given.
 
         Args:
-            right: Wanted steps to the right; anything, NaN included, without weight.
-            down: Wanted steps down.
+            right: Target steps to the right; ignored, NaN included, without weight.
+            down: Target steps down.
             heights: Known heights, likewise where there is no anchor; None for zero.
         """
         weight_right, weight_down, anchor = self._given
@@ -130,21 +130,21 @@ class RasterSystem:
         source: Float[Tensor, "height width"],
         start: Float[Tensor, "height width"] | None = None,
     ) -> Iterate:
-        """Solve once and say how; not differentiable.
+        """Solve once, and give the iterations; not differentiable.
 
         Args:
             source: As for :meth:`solve`.
-            start: Heights near the solution, such as those of the round before, save cycles.
+            start: Initial heights, such as those of the iteration before.
         """
         with torch.no_grad():
             diagonal, groups = self._stencil.diagonal, self._components
-            wanted = torch.where(self._inside, source.detach().to(diagonal), 0)
-            rhs = groups.centered(wanted.reshape(-1)).view(diagonal.shape)
-            near = None
+            source_inside = torch.where(self._inside, source.detach().to(diagonal), 0)
+            rhs = groups.centered(source_inside.reshape(-1)).view(diagonal.shape)
+            initial = None
             if start is not None:
-                near = torch.where(self._inside, start.detach().to(diagonal), 0)
-                near = groups.grounded(near.reshape(-1)).view(diagonal.shape)
-            found = self._solver.iterate(rhs, near)
+                initial = torch.where(self._inside, start.detach().to(diagonal), 0)
+                initial = groups.rooted(initial.reshape(-1)).view(diagonal.shape)
+            found = self._solver.iterate(rhs, initial)
             return dataclasses.replace(found, values=groups.centered(found.values))
 
     def refreshed(
@@ -158,19 +158,19 @@ class RasterSystem:
         """Prepare the same raster with other weights.
 
         The coarse levels of multigrid are kept, as a slightly worse preconditioner, while
-        every weight stays within a factor two of the one they were made from: the usual
-        case in late rounds of reweighting. Else this is as a new system, but for the search
-        of free components, which is left out while the same weights are positive.
+        no weight changes by more than a factor two: the usual case in late iterations of
+        reweighting. Otherwise a new system is prepared; free components are searched again if
+        other weights are positive.
 
         Args:
             weight_right: As for a new system.
             weight_down: Likewise.
             anchor: Likewise.
-            keep: Keep the coarse levels whatever the weights. The answer is the same, but may
-                take many more cycles: for who watches them, round by round.
+            keep: Keep the coarse levels whatever the weights. The solution is the same, but may
+                take many more cycles.
         """
         other = object.__new__(RasterSystem)
-        other._wish, other._refuses = self._wish, self._refuses
+        other._requested, other._refuses = self._requested, self._refuses
         other._tolerance, other._what = self._tolerance, self._what
         other._take(weight_right, weight_down, anchor, self, keep)
         return other
@@ -188,16 +188,16 @@ class RasterSystem:
         self._given = (weight_right, weight_down, anchor)
         self._refuse_unusable()
         with torch.no_grad():
-            right, down, held = (part.detach().double().contiguous() for part in self._given)
-            tied = _row_sums(right, down) + held
-            self._inside = tied > 0
-            self._components = _components(right, down, held, former)
+            right, down, anchors = (part.detach().double().contiguous() for part in self._given)
+            row_sum = _row_sums(right, down) + anchors
+            self._inside = row_sum > 0
+            self._components = _components(right, down, anchors, former)
             self._refuse_free()
-            diagonal = torch.where(self._inside, tied, 1).reshape(-1)
-            diagonal = self._components.held(diagonal).view(tied.shape)
+            diagonal = torch.where(self._inside, row_sum, 1).reshape(-1)
+            diagonal = self._components.pinned(diagonal).view(row_sum.shape)
             self._stencil = Stencil(right=right, down=down, diagonal=diagonal)
             kept = former._solver.refreshed(self._stencil, keep) if former else None
-            self._solver: RasterSolver = kept or self._prepared(held)
+            self._solver: RasterSolver = kept or self._prepared(anchors)
 
     def _refuse_unusable(self) -> None:
         right, down, anchor = (tuple(part.shape) for part in self._given)
@@ -212,11 +212,11 @@ class RasterSystem:
         for name, part in zip(names, self._given, strict=True):
             bad = ~(part.detach().isfinite() & (part.detach() >= 0))
             if bool(bad.any()):
-                first = [int(place) for place in bad.nonzero()[0]]
+                first = bad.nonzero()[0].tolist()
                 raise InputError(
                     f"{self._what}: {int(bad.sum())} weights of {name} are negative or not "
                     f"finite (the first at row {first[0]}, column {first[1]}); each must be 0 or "
-                    "more. Give weight 0 to what is not known."
+                    "more. Give unknown steps weight 0."
                 )
 
     def _refuse_free(self) -> None:
@@ -234,15 +234,15 @@ class RasterSystem:
             bool((part > 0).all() & (part == part[:1, :1]).all())
             for part in (stencil.right, stencil.down)
         ) and bool((anchor == anchor[:1, :1]).all())
-        if self._wish == "cosine" and not equal:
+        if self._requested == "cosine" and not equal:
             raise InputError(
-                f"{self._what}: the cosine transform was asked for, but the weights are not the "
-                "same everywhere, or some are 0. Use another method, or 'auto'."
+                f"{self._what}: the cosine transform needs weights that are the same everywhere "
+                "and not 0. Use another method, or 'auto'."
             )
-        if self._wish == "cosine" or (self._wish == "auto" and equal):
+        if self._requested == "cosine" or (self._requested == "auto" and equal):
             return CosineRaster(stencil, float(anchor[0, 0]))
         small = anchor.numel() <= _CHOLESKY_PIXELS and anchor.device.type == "cpu"
-        if self._wish == "cholesky" or (self._wish == "auto" and small):
+        if self._requested == "cholesky" or (self._requested == "auto" and small):
             return CholeskyRaster(stencil, self._what)
         return MultigridRaster(stencil, self._tolerance, self._what)
 
@@ -256,8 +256,8 @@ def _components(
     """Find the free components; those of the former weights where the same are positive."""
     pattern = (right > 0, down > 0, anchor > 0)
     if former is not None:
-        stencil, (_, _, held) = former._stencil, former._given
-        before = (stencil.right > 0, stencil.down > 0, held.detach() > 0)
+        stencil, (_, _, anchors) = former._stencil, former._given
+        before = (stencil.right > 0, stencil.down > 0, anchors.detach() > 0)
         if all(torch.equal(new, old) for new, old in zip(pattern, before, strict=True)):
             return former._components
     return free_components(*pattern)
@@ -273,7 +273,7 @@ def _row_sums(
 
 
 def _times(weight: Float[Tensor, "..."], value: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """Multiply in float64, so that nothing without weight matters."""
+    """Multiply in float64, ignoring values without weight."""
     return weight.double() * torch.where(weight > 0, value, 0).double()
 
 

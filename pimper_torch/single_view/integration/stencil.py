@@ -1,4 +1,4 @@
-"""The five-point matrix of a raster, and the three ways to solve with it.
+"""The five-point stencil of a raster, and three solvers for it.
 
 Products shift slices of the raster: up to a million pixels, compressed rows take 2 to 5 times
 as long on the CPU, by ``benchmarks/linear_systems.py --products``.
@@ -18,15 +18,15 @@ from pimper_torch.linalg.multigrid import Iterate, solve_with_hierarchy
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.paper.poisson import solve_poisson
 
-# Coarse levels of other values are kept if none of them has left this factor. Measured: noise
-# of a factor 1.26 (one sigma) on weights over 8 decades takes 27 cycles instead of 16; one new
-# strong tie in a thousand makes all that is kept useless.
+# Coarse levels are kept if no entry has changed by more than this factor. Measured: noise of a
+# factor 1.26 (one sigma) on weights over 8 decades takes 27 cycles instead of 16; with one new
+# strong connection in a thousand the former levels are useless.
 _KEPT_FACTOR = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stencil:
-    """A symmetric matrix that ties pixels to their four neighbours.
+    """A symmetric matrix that connects pixels with their four neighbours.
 
     Attributes:
         right: Minus the entries between each pixel and the next in its row, float64.
@@ -101,7 +101,7 @@ class CholeskyRaster:
     def iterate(
         self, rhs: Float[Tensor, "height width"], start: Float[Tensor, "height width"] | None
     ) -> Iterate:
-        """Substitute; a start is of no use."""
+        """Substitute; the start is ignored."""
         found = self._factor.solve_values(rhs.reshape(-1))
         return Iterate(values=found, iterations=1, residual=0.0)
 
@@ -114,7 +114,7 @@ class CosineRaster:
     """Division by frequencies, for equal weights on a full rectangle.
 
     Args:
-        stencil: Whose diagonal does not matter.
+        stencil: Its diagonal is ignored.
         anchor: Of every pixel.
     """
 
@@ -130,7 +130,7 @@ class CosineRaster:
     def iterate(
         self, rhs: Float[Tensor, "height width"], start: Float[Tensor, "height width"] | None
     ) -> Iterate:
-        """Transform, divide and transform back; a start is of no use."""
+        """Transform, divide and transform back; the start is ignored."""
         found = solve_poisson(rhs, self._right, self._down, self._anchor)
         return Iterate(values=found.reshape(-1), iterations=1, residual=0.0)
 
@@ -170,7 +170,7 @@ class MultigridRaster:
         )
 
     def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
-        """Keep the coarse levels if told so, or the weights are near those they were made from."""
+        """Keep the coarse levels if ``keep``, or if the weights have changed little."""
         pairs = (
             (getattr(stencil, name), getattr(self._origin, name)) for name in stencil.__slots__
         )
@@ -186,7 +186,7 @@ class MultigridRaster:
 
 
 def may_keep(new: Float[Tensor, "..."], old: Float[Tensor, "..."]) -> bool:
-    """Tell whether a hierarchy made from ``old`` entries serves for ``new`` ones."""
+    """Tell whether a hierarchy of ``old`` entries preconditions ``new`` ones."""
     ordered = torch.minimum(new.abs(), old.abs()), torch.maximum(new.abs(), old.abs())
     same_signs = bool((new.sign() == old.sign()).all())
     return same_signs and bool((ordered[1] <= _KEPT_FACTOR * ordered[0]).all())

@@ -1,4 +1,4 @@
-r"""What normals say of the step from one pixel to the next.
+r"""Differences of depth between neighbouring pixels, from normals.
 
 The unknown is the depth along z for parallel rays, and its logarithm for rays through a
 pinhole: then, with :math:`x` the unknown and the ray :math:`(u, v, 1)`,
@@ -23,41 +23,42 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.paper.filling import fill_smoothly
 from pimper_torch.records import Record
 
-# Cosine between ray and normal below which a slope is nothing but rounding.
+# Cosine between ray and normal below which a normal is not used: a choice, its slope is 1000.
 _GRAZING = 1e-3
 
-# The cubic through four slopes is followed where it bends no more than this from the chord,
-# and where no crease (a slope that changes by so much more than beside it) is near.
-_SMOOTH_BEND, _SMOOTH_EXCESS = 0.5, 0.3
+# The cubic through four slopes is used where it differs from the chord by less than the first,
+# and where no crease (a change of slope that exceeds its neighbours' by the second) is near:
+# choices.
+_MAX_DIFFERENCE, _MAX_KINK = 0.5, 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Steps(Record):
-    """Wanted differences between neighbouring pixels, in units of ``unit_right, unit_down``.
+    """Target differences between neighbouring pixels, in units of ``unit_right, unit_down``.
 
     Attributes:
-        slopes: At every pixel of the raster, right and down; filled in smoothly where not valid.
+        slopes: At every pixel of the raster, right and down; inpainted where not valid.
         right: From each pixel to the next in its row; 0 outside.
         down: From each pixel to that below.
-        known_right: True where both pixels are inside with normals to be trusted.
-        known_down: Likewise.
-        kink_right: By how much more the slope along the step changes on it than on those before
-            and after: 0 on smooth surface, the size of the kink at a crease or an edge of depth.
+        reliable_right: True where both pixels are inside and their normals are usable.
+        reliable_down: Likewise.
+        kink_right: Change of the slope along the step, less that of the steps before and after:
+            0 on a smooth surface, the size of the kink at a crease or a depth discontinuity.
         kink_down: Likewise.
-        twist_right: Likewise of the slope across the step, which changes where the surface
-            tears: the sides of a step that rise differently meet in one point at most.
+        twist_right: Likewise of the slope across the step, which changes at a depth
+            discontinuity: sides of different slope meet in one point at most.
         twist_down: Likewise.
         unit_right: Change of the unknown on a step of slope 1.
         unit_down: Likewise.
         inside: The pixels.
-        valid: Those of them with a normal to be trusted.
+        valid: Those of them with a usable normal.
     """
 
     slopes: Float[Tensor, "height width 2"]
     right: Float[Tensor, "height steps_right"]
     down: Float[Tensor, "steps_down width"]
-    known_right: Bool[Tensor, "height steps_right"]
-    known_down: Bool[Tensor, "steps_down width"]
+    reliable_right: Bool[Tensor, "height steps_right"]
+    reliable_down: Bool[Tensor, "steps_down width"]
     kink_right: Float[Tensor, "height steps_right"]
     kink_down: Float[Tensor, "steps_down width"]
     twist_right: Float[Tensor, "height steps_right"]
@@ -68,7 +69,7 @@ class Steps(Record):
     valid: Bool[Tensor, "height width"]
 
     @property
-    def wanted(
+    def target(
         self,
     ) -> tuple[Float[Tensor, "height steps_right"], Float[Tensor, "steps_down width"]]:
         """The differences in units of the unknown."""
@@ -83,8 +84,8 @@ def orthographic_steps(
     """Give the steps of depth under parallel rays.
 
     Args:
-        normals: Unit, ``n_z < 0``; where they are not finite, or turned away, inside the mask
-            slopes are filled in smoothly and the steps not known.
+        normals: Unit, ``n_z < 0``; where they are not finite or face away, inside the mask,
+            slopes are inpainted and the steps not reliable.
         mask: Pixels of the surface.
         spacing: Distance of neighbouring pixels in a row and in a column.
 
@@ -143,8 +144,8 @@ def perspective_steps(
     return _steps(slopes, between, mask, valid, unit)
 
 
-# From slopes before and after each step: the step between the pixels' tangent planes, and by
-# how much the second plane turns from the first.
+# From slopes before and after each step: the step between the pixels' tangent planes, and the
+# rotation between the planes.
 Between = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
@@ -160,7 +161,7 @@ def _between_planes_seen(
     # With r_m half-way, n . r_m / n . r_a = 1 - (slope at a) unit / 2.
     ahead = (1 + unit / 2 * second).clamp_min(_GRAZING).log()
     behind = (1 - unit / 2 * first).clamp_min(_GRAZING).log()
-    # The logarithm of a plane's depth bends: its slope changes by the square of itself.
+    # The logarithm of a plane's depth is curved: its slope's derivative is its square.
     rotation = second - first - unit * first * second
     return (ahead - behind) / unit + unit / 24 * (first + second) * rotation, rotation
 
@@ -183,8 +184,8 @@ def _steps(
         slopes=slopes,
         right=torch.where(inside[0], right, 0),
         down=torch.where(inside[1], down.mT, 0),
-        known_right=known[0],
-        known_down=known[1],
+        reliable_right=known[0],
+        reliable_down=known[1],
         kink_right=kink_right,
         kink_down=kink_down.mT,
         twist_right=twist_right,
@@ -201,24 +202,24 @@ def _curved(
     rotation: Float[Tensor, "line step"],
     known: Bool[Tensor, "line step"],
 ) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
-    """Bend steps along the cubic through four slopes, and tell kinks.
+    """Correct steps to those of the cubic through four slopes, and give kinks.
 
     The step between tangent planes is wrong by a twelfth of the surface's third derivative,
-    which on a sphere adds up from pixel to pixel; how planes turn before and after tells it.
+    which on a sphere accumulates from pixel to pixel; the neighbouring rotations estimate it.
     """
     before, after = _beside(rotation, known)
     has_before, has_after = _beside(known.to(rotation), known)
     kink = _excess(rotation, known)
-    bend = after - before
+    difference = after - before
     smooth = known & (has_before * has_after > 0)
-    smooth = smooth & (bend.abs() < _SMOOTH_BEND) & (kink < _SMOOTH_EXCESS)
-    return step - torch.where(smooth, bend, 0) / 24, kink
+    smooth = smooth & (difference.abs() < _MAX_DIFFERENCE) & (kink < _MAX_KINK)
+    return step - torch.where(smooth, difference, 0) / 24, kink
 
 
 def _excess(
     change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
 ) -> Float[Tensor, "line step"]:
-    """Tell by how much more a slope changes on a step than beside it; no gradient."""
+    """Give the excess of a slope's change over its neighbours'; no gradient."""
     before, after = _beside(change.detach(), known)
     beside = torch.maximum(before.abs(), after.abs())
     return torch.where(known, (change.detach().abs() - beside).clamp_min(0), 0)
@@ -227,7 +228,7 @@ def _excess(
 def _beside(
     change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
 ) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
-    """Give the changes on the steps before and after each; 0 where those are not known."""
+    """Give the changes on the steps before and after each; 0 where those are not reliable."""
     wide = pad(torch.where(known, change, 0), (1, 1))
     return wide[:, :-2], wide[:, 2:]
 

@@ -1,7 +1,7 @@
-r"""Bas-relief resolved by the surface having few albedos.
+r"""Bas-relief resolved by minimum entropy of albedo.
 
-A wrong relief spreads the albedo of a region of one paint over many values, by how its normals
-lean. The right one is where the histogram of albedo has the least entropy.
+A wrong transformation makes the albedo of a region of one paint vary with its normals. The right
+one minimizes the entropy of the histogram of albedo.
 
 Source: Alldrin, Mallick & Kriegman, Resolving the generalized bas-relief ambiguity by entropy
 minimization, CVPR 2007.
@@ -21,19 +21,19 @@ from pimper_torch.single_view.photometric_stereo.factors import (
     usable_pixels,
 )
 
-# In the standard form a ball cut at 75 degrees has lambda 0.9 and a relief with slopes of 0.15
-# has 0.15; the object's mean slope, which the form takes away, is rarely above one.
-_FLATTEST, _STEEPEST, _LAMBDAS = 0.125, 4.0, 23
+# Range and size of the grid of lambda and of tilts. In the standard form a ball cut at 75 degrees
+# has lambda 0.9 and a surface with slopes of 0.15 has 0.15; mean slopes are rarely above one.
+_MIN_LAMBDA, _MAX_LAMBDA, _LAMBDAS = 0.125, 4.0, 23
 _MAX_TILT, _TILTS = 1.0, 17
 
-# The kernel's width in logarithm of albedo at first. A wider one smooths the right minimum away
-# where albedos are close, a narrower one needs a finer grid.
+# Initial width of the kernel in logarithm of albedo: a choice. A wider one smooths the right
+# minimum away where albedos are close, a narrower one needs a finer grid.
 _FIRST_WIDTH = 0.03
-# How far from the mean, a factor of 20, the histogram reaches.
+# Half the range of the histogram, in logarithm of albedo: a choice, a factor of 20.
 _REACH = 3.0
-# Places of the grid that are followed, half of them to the next kernel; pixels looked at meanwhile.
-_FOLLOWED, _FEW_PIXELS = 200, 1000
-# Pixels by candidates at a time: few enough to stay in a processor's cache.
+# Grid points that are refined, halved with every kernel, and pixels used meanwhile: choices.
+_CANDIDATES, _FEW_PIXELS = 200, 1000
+# Products of pixels and candidates at a time: a choice, they fit a processor's cache.
 _CHUNK_ENTRIES = 250_000
 
 
@@ -44,28 +44,27 @@ def resolve_by_albedo_entropy(
     width: float = 0.015,
     max_pixels: int = 20_000,
 ) -> BasRelief:
-    r"""Find the bas-relief transformation under which the fewest albedos remain.
+    r"""Find the bas-relief transformation of minimum albedo entropy.
 
-    Minimises the entropy of :math:`\log \lVert G b \rVert`, whose distribution does not change
-    with the scale of albedo, smoothed by a kernel: on a grid in the standard form of
-    the surface (:func:`.standard_relief`) first,
-    then, from its best places, by steps that are halved as the kernel narrows.
+    Minimizes the entropy of :math:`\log \lVert G b \rVert`, which is invariant to the scale of
+    albedo, smoothed by a kernel: first on a grid in the standard form of the surface
+    (:func:`.standard_relief`), then, from its best points, by a local search whose steps are
+    halved as the kernel narrows.
 
     Args:
         shading: Albedo times normal, right up to a bas-relief transformation; vectors that are
             zero or not finite are left out.
-        groups: Pixels of equal chromaticity
-            (:func:`.chromaticity_groups`). The
-            entropy of colour albedo is that of chromaticity, which no relief changes, plus that
-            of brightness within each group, which is minimised. Without it all are one group.
+        groups: Pixels of equal chromaticity (:func:`.chromaticity_groups`). The entropy of colour
+            albedo is that of chromaticity, which is invariant, plus that of brightness within
+            each group, which is minimized. Without it all are one group.
         width: Of the last kernel, as a fraction of albedo; about the noise of shading.
         max_pixels: Evenly chosen from more.
 
     Returns:
-        The transformation with lambda above zero: hills stay hills. Constant to autograd.
+        The transformation with lambda above zero: convex stays convex. Constant to autograd.
 
-    Fails where the surface has as many albedos as pixels, or so few different normals that all
-    reliefs leave albedo as sharp; the last digits are those of the kernel's width.
+    Fails where the surface has as many albedos as pixels, or so few different normals that the
+    entropy hardly depends on the transformation; precise to the kernel's width.
 
     Raises:
         InputError: Fewer than 50 vectors, or all parallel.
@@ -85,7 +84,7 @@ def resolve_by_albedo_entropy(
         b = start.on_shading(shading[:, usable].double())
         labels = torch.zeros_like(b[0]).long() if groups is None else groups[usable]
         labels = torch.unique(labels, return_inverse=True)[1]
-        found = _minimised(b, labels, width, max_pixels)
+        found = _minimized(b, labels, width, max_pixels)
         whole = BasRelief(mu=found[0], nu=found[1], lam=found[2].exp()).after(start)
         return cast(whole, shading)
 
@@ -96,7 +95,7 @@ def albedo_entropy(
     candidates: Float[Tensor, "candidate 3"],
     width: float,
 ) -> Float[Tensor, " candidate"]:
-    """Give the entropy that log-albedo has within groups after each transformation.
+    """Give the entropy of log-albedo within groups after each transformation.
 
     Args:
         shading: Albedo times normal.
@@ -112,32 +111,32 @@ def albedo_entropy(
     return torch.cat(parts)
 
 
-def _minimised(
+def _minimized(
     b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], width: float, max_pixels: int
 ) -> Float[Tensor, " 3"]:
-    few, few_labels = _chosen(b, labels, _FEW_PIXELS)
+    few, few_labels = _subsampled(b, labels, _FEW_PIXELS)
     tilts = torch.linspace(-_MAX_TILT, _MAX_TILT, _TILTS).to(b)
-    flat, steep = (torch.tensor(value).to(b).log() for value in (_FLATTEST, _STEEPEST))
+    flat, steep = (torch.tensor(value).to(b).log() for value in (_MIN_LAMBDA, _MAX_LAMBDA))
     lambdas = torch.linspace(float(flat), float(steep), _LAMBDAS).to(b)
     grid = torch.cartesian_prod(tilts, tilts, lambdas)
-    best = grid[albedo_entropy(few, few_labels, grid, _FIRST_WIDTH).argsort()[:_FOLLOWED]]
+    best = grid[albedo_entropy(few, few_labels, grid, _FIRST_WIDTH).argsort()[:_CANDIDATES]]
     step = torch.stack([tilts[1] - tilts[0], tilts[1] - tilts[0], lambdas[1] - lambdas[0]]) / 2
     narrow = _FIRST_WIDTH
     while narrow > width:
-        best, entropy = _descended(few, few_labels, best, step, narrow)
+        best, entropy = _local_search(few, few_labels, best, step, narrow)
         best = torch.unique(best[entropy.argsort()[: -(-len(best) // 2)]], dim=0)
         step, narrow = step / 2, narrow / 1.4142
     final = albedo_entropy(few, few_labels, best, width).argmin()
-    many, many_labels = _chosen(b, labels, max_pixels)
+    many, many_labels = _subsampled(b, labels, max_pixels)
     best = best[final][None]
     # Down to a step that changes albedo by a tenth of the kernel.
     while float(step.max()) > width / 10:
-        best, _ = _descended(many, many_labels, best, step, width)
+        best, _ = _local_search(many, many_labels, best, step, width)
         step = step / 2
     return best[0]
 
 
-def _descended(
+def _local_search(
     b: Float[Tensor, "3 pixel"],
     labels: Int[Tensor, " pixel"],
     best: Float[Tensor, "candidate 3"],
@@ -147,16 +146,18 @@ def _descended(
 ) -> tuple[Float[Tensor, "candidate 3"], Float[Tensor, " candidate"]]:
     """Move each candidate to its best neighbour a step away until none is better."""
     around = torch.tensor(list(itertools.product((-1, 0, 1), repeat=3))).to(b) * step
-    stay = len(around) // 2
+    centre = len(around) // 2
     best = best.clone()
     least = torch.full_like(best[:, 0], torch.inf)
     moving = torch.arange(len(best), device=b.device)
     for _ in range(iterations):
-        near = best[moving, None] + around
-        entropy = albedo_entropy(b, labels, near.flatten(0, 1), width).reshape(near.shape[:2])
+        neighbours = best[moving, None] + around
+        entropy = albedo_entropy(b, labels, neighbours.flatten(0, 1), width).reshape(
+            neighbours.shape[:2]
+        )
         least[moving], chosen = entropy.min(dim=1)
-        best[moving] = near[torch.arange(len(near), device=b.device), chosen]
-        moving = moving[chosen != stay]
+        best[moving] = neighbours[torch.arange(len(neighbours), device=b.device), chosen]
+        moving = moving[chosen != centre]
         if len(moving) == 0:
             break
     return best, least
@@ -176,11 +177,11 @@ def _entropy(
     # A cubic B-spline is a Gaussian of width 1 / sqrt(3) bins, and its samples' entropy hardly
     # depends on where in a bin they are taken.
     bins_per_unit = 1 / (3**0.5 * width)
-    place = (log - log.mean(dim=1, keepdim=True)).clamp(-_REACH, _REACH) + _REACH
-    place = place * bins_per_unit
+    position = (log - log.mean(dim=1, keepdim=True)).clamp(-_REACH, _REACH) + _REACH
+    position = position * bins_per_unit
     bins = int(2 * _REACH * bins_per_unit) + 4
-    below = place.long()
-    t = place - below
+    below = position.long()
+    t = position - below
     index = labels * bins + below
     histogram = b.new_zeros(len(candidates), (int(labels.max()) + 1) * bins)
     u, double = 1 - t, t * t
@@ -192,7 +193,7 @@ def _entropy(
     return -torch.special.xlogy(probability, probability).sum(dim=1)
 
 
-def _chosen(
+def _subsampled(
     b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], limit: int
 ) -> tuple[Tensor, Tensor]:
     every = -(-b.shape[1] // limit)

@@ -1,4 +1,4 @@
-r"""Pixels of one paint, told by their colour across all photographs.
+r"""Groups of pixels of one paint, by their chromaticity in all photographs.
 
 A Lambertian pixel's channels differ by albedo and by the point light's colour alone: shading,
 shadow and normal multiply all of them. In logarithm :math:`\log J_{vci} = s_{vi} + e_{vc} +
@@ -11,13 +11,13 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 
-# Channels darker than this fraction of a photograph's brightest value say nothing about colour.
+# Channels darker than this fraction of a photograph's brightest value are ignored: a choice.
 _DARK = 0.02
-# Alternations between lights and pixels; each at least halves what is left where point lights
-# overlap.
+# Alternations between lights and pixels: a choice; each at least halves the residual where point
+# lights overlap.
 _ALTERNATIONS = 20
-# Pixels among which the colours are sought; all are then assigned.
-_SOUGHT_AMONG = 2000
+# Pixels that are clustered; all are then assigned: a choice.
+_CLUSTERED = 2000
 
 
 def chromaticities(
@@ -30,11 +30,11 @@ def chromaticities(
 
     Args:
         images: Linear radiance.
-        mask: Pixels that count, in raster order.
+        mask: Pixels to use, in raster order.
 
     Returns:
-        Colours whose sum over channels is zero, up to one colour that all pixels share, and
-        which pixels have one: those bright enough in all channels of some view.
+        Colours whose sum over channels is zero, up to one colour that all pixels share; and
+        whether a pixel has one: bright enough in all channels of some view.
     """
     values = images[:, :, mask].double()
     brightest = values.flatten(1).amax(dim=1)[:, None]
@@ -61,15 +61,15 @@ def chromaticity_groups(
     radius: float = 0.05,
     smallest: float = 0.01,
 ) -> Int[Tensor, " pixel"]:
-    """Group the pixels whose colours agree.
+    """Cluster pixels of similar chromaticity.
 
-    The colour with the most pixels near it is taken first, all near it left out, and so on; then
-    every pixel joins the nearest colour that is no farther than the radius. Colours that change
-    smoothly have no groups, only arbitrary ones.
+    The colour with the most neighbours becomes the first cluster, its neighbours are removed, and
+    so on; then every pixel is assigned to the nearest cluster within the radius. Colours that
+    change smoothly give arbitrary clusters.
 
     Args:
         images: Linear radiance, of two channels or more.
-        mask: Pixels that count, in raster order.
+        mask: Pixels to use, in raster order.
         radius: In logarithm of colour; a few times its noise, less than half the distance of
             different paints.
         smallest: Groups with less than this fraction of the pixels are dropped.
@@ -83,24 +83,24 @@ def chromaticity_groups(
     if images.shape[1] < 2:
         raise InputError(
             f"images have {images.shape[1]} channel; needed: two at least, pixels of one paint "
-            "are told by colour. Use another method for grey images."
+            "are grouped by colour. Use another method for grey images."
         )
     colour, known = chromaticities(images, mask)
     labels = torch.full_like(known, -1, dtype=torch.int64)
     if not bool(known.any()):
         raise InputError("no pixel inside the mask is bright in all channels; needed: some.")
     colour = colour[:, known].mT.double().contiguous()
-    sample = colour[:: -(-len(colour) // _SOUGHT_AMONG)]
-    near = torch.cdist(sample, sample) < radius
-    left = torch.ones(len(sample), dtype=torch.bool, device=sample.device)
+    sample = colour[:: -(-len(colour) // _CLUSTERED)]
+    neighbours = torch.cdist(sample, sample) < radius
+    remaining = torch.ones(len(sample), dtype=torch.bool, device=sample.device)
     leaders = []
-    while bool(left.any()):
-        votes = (near & left).sum(dim=1) * left
+    while bool(remaining.any()):
+        votes = (neighbours & remaining).sum(dim=1) * remaining
         best = int(votes.argmax())
         if int(votes[best]) < max(2, smallest * len(sample)):
             break
-        leaders.append(sample[near[best] & left].mean(dim=0))
-        left = left & ((sample - leaders[-1]).norm(dim=1) > 2 * radius)
+        leaders.append(sample[neighbours[best] & remaining].mean(dim=0))
+        remaining = remaining & ((sample - leaders[-1]).norm(dim=1) > 2 * radius)
     if leaders:
         distance, nearest = torch.cdist(colour, torch.stack(leaders)).min(dim=1)
         labels[known] = torch.where(distance < radius, nearest, -1)

@@ -1,10 +1,9 @@
 r"""Bas-relief resolved by pixels of one albedo, and by pixels of one normal.
 
-Pixels of one paint, told by their colour across the photographs, have one albedo whatever their
+Pixels of one paint, found by their chromaticity, have one albedo whatever their
 normal: :math:`b_i^\top M b_i = b_j^\top M b_j`, linear in the metric ``M``. Pixels of one normal,
-told by brightness that is proportional across the photographs, say nothing of ``M``, but their
-ratio is that of their paints' albedos, whatever the relief; through it groups of different paint
-become one.
+found by brightness that is proportional across the photographs, do not constrain ``M``, but their
+ratio is that of their paints' albedos; it joins groups of different paint.
 
 Source: Shi, Matsushita, Wei, Xu & Tan, Self-calibrating photometric stereo, CVPR 2010.
 """
@@ -30,12 +29,12 @@ from pimper_torch.single_view.photometric_stereo.factors import (
 )
 from pimper_torch.single_view.photometric_stereo.relief_metric import metric_row, relief_of_metric
 
-# Pixels a group that are compared with other groups' normals.
+# Pixels of a group that are compared with other groups' normals: a choice.
 _COMPARED = 1000
-# Pairs of pixels with one normal that link two groups; fewer may be chance.
+# Minimum number of pairs of pixels with one normal that join two groups: a choice.
 _LINKING = 20
 _JOININGS = 3
-# Spread of albedo within groups above which paints were mixed: noise of shading is well below.
+# Deviation of albedo within groups above which a warning comes: a choice, well above shading noise.
 _UNEVEN = 0.1
 _STEPS = 50
 
@@ -51,11 +50,10 @@ def resolve_by_colour_profiles(
 ) -> BasRelief:
     r"""Find the bas-relief transformation under which pixels of one paint have one albedo.
 
-    Groups come from
-    :func:`.chromaticity_groups`, and are joined
-    where enough pixels of two have the same normal. The metric is first that of least variance
-    of squared albedo within groups, relative to its mean: an eigenvalue problem. From there, and
-    from the standard form, Gauss-Newton steps minimise Cauchy's loss of
+    Groups come from :func:`.chromaticity_groups`, and are joined where enough pixels of two have
+    the same normal. The initial metric minimizes the variance of squared albedo within groups,
+    relative to its mean: an eigenvalue problem. From there, and from the standard form,
+    Gauss-Newton steps minimize Cauchy's loss of
 
     .. math:: \log \lVert G b_i \rVert - \log \rho_{k(i)}
 
@@ -63,7 +61,7 @@ def resolve_by_colour_profiles(
 
     Args:
         images: Linear radiance, of two channels or more. Point lights may have different colours.
-        mask: Where the surface is.
+        mask: True on the surface.
         shading: Albedo times normal of the pixels inside the mask, right up to a bas-relief
             transformation. Vectors that are zero or not finite are left out.
         lights: Of the same factorization; its views must be those of the images.
@@ -72,10 +70,11 @@ def resolve_by_colour_profiles(
             same; about their angle.
 
     Returns:
-        The transformation with lambda above zero: hills stay hills. Constant to autograd.
+        The transformation with lambda above zero: convex stays convex. Constant to autograd.
 
-    Fails where paints of one colour differ in brightness, as greys do, of which it warns, or
-    where each paint covers normals on a cone: those have one albedo under several reliefs.
+    Fails where paints of one colour differ in brightness, as greys do, which it warns of, or
+    where each paint covers normals on a cone: those have one albedo under several
+    transformations.
 
     Raises:
         InputError: Grey images, sizes that do not fit, or no group that holds 10 pixels.
@@ -97,8 +96,8 @@ def resolve_by_colour_profiles(
         b, labels = shading[:, kept].double(), groups[kept]
         relief = require_standard(b)
         pairs = same_normals(profiles[:, kept], labels, same_normal)
-        # Normals of a pair are alike, not the same: once a relief is known, the ratio of the
-        # albedos it gives errs less than the ratio of brightness does.
+        # Normals of a pair are only similar: once a transformation is known, the ratio of its
+        # albedos is more accurate than that of brightness.
         log_albedo = profiles[:, kept].norm(dim=0).clamp_min(1e-30).log()
         for _ in range(_JOININGS):
             joined, log_ratio = join_groups(pairs, log_albedo, labels)
@@ -109,8 +108,8 @@ def resolve_by_colour_profiles(
         if left > _UNEVEN:
             warnings.warn(
                 f"within groups of one colour albedo still varies by {100 * left:.0f} %; the "
-                "relief is doubtful. Paints of one colour but different brightness call for "
-                "`resolve_by_albedo_entropy`.",
+                "transformation is unreliable. For paints of one colour but different brightness "
+                "use `resolve_by_albedo_entropy`.",
                 PimperWarning,
                 stacklevel=2,
             )
@@ -159,8 +158,7 @@ def join_groups(
 
     Args:
         pairs: Pixels of different groups with one normal.
-        log_albedo: Anything whose difference between the pixels of a pair is that of the
-            logarithms of albedo.
+        log_albedo: Logarithm of albedo, up to a term that is the same for the pixels of a pair.
         groups: Labels from 0.
 
     Returns:
@@ -185,7 +183,7 @@ def join_groups(
 def _offsets(
     links: list[tuple[int, int, float, float]], count: int
 ) -> tuple[Int[Tensor, " group"], Float[Tensor, " group"]]:
-    """Give connected groups one name, and each its logarithm of albedo in least squares."""
+    """Label connected components of groups; give each group's least-squares log-albedo."""
     normal = 1e-9 * torch.eye(count, dtype=torch.float64)
     rhs = torch.zeros(count, dtype=torch.float64)
     for one, other, ratio, pairs in links:
@@ -202,7 +200,7 @@ def _offsets(
 
 
 def _resolved(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> BasRelief:
-    """Take the better of the minima reached from the linear solution and from no change."""
+    """Give the better of the minima from the linear solution and from the identity."""
     one, none = torch.ones_like(b[0, 0]), torch.zeros_like(b[0, 0])
     starts = [BasRelief(mu=none, nu=none, lam=one)]
     linear = _linear(b, labels)
@@ -219,7 +217,7 @@ def _resolved(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> Bas
 
 
 def _linear(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> BasRelief:
-    """Minimise the variance of squared albedo within groups over its squared mean."""
+    """Minimize the variance of squared albedo within groups over its squared mean."""
     rows = metric_row(b)
     size = torch.bincount(labels).to(b)
     level = torch.zeros_like(size).index_add(0, labels, (b * b).sum(dim=0)) / size
@@ -239,7 +237,7 @@ def _linear(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> BasRe
 def _descended(
     b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], start: BasRelief
 ) -> BasRelief:
-    """Take Levenberg and Marquardt's steps on Cauchy's loss, its scale following the fit."""
+    """Minimize Cauchy's loss by Levenberg-Marquardt, its scale re-estimated at every step."""
     relief, damping = start, 1e-3
     everywhere = torch.ones_like(labels, dtype=torch.bool)
     for _ in range(_STEPS):

@@ -1,14 +1,14 @@
-r"""Bas-relief resolved by the places where the surface faces a point light.
+r"""Bas-relief resolved by local maxima of diffuse shading.
 
-Where brightness under one point light has a maximum on a surface of one paint, the normal points to
-the point light: albedo times normal is parallel to the light. For a factorization right up to a
-bas-relief transformation this reads
+At a local maximum of brightness under one point light, on a surface of one paint, the normal points
+to the point light: albedo times normal is parallel to the light. For a factorization right up to
+a bas-relief transformation this reads
 
 .. math:: \hat l \times M \hat b = 0, \qquad M = G^\top G,
 
-two independent equations a maximum, linear in the four entries of the metric: two maxima
+two independent equations per maximum, linear in the four entries of the metric: two maxima
 determine it in closed form. Maxima are also found where paint changes, along ridges and beside
-shadows; the right ones agree with one another.
+shadows; these outliers are rejected by consensus.
 
 Source: Favaro & Papadhimitri, A closed-form solution to uncalibrated photometric stereo via
 diffuse maxima, CVPR 2012; Papadhimitri & Favaro, IJCV 107(2), 2014.
@@ -33,34 +33,33 @@ from pimper_torch.single_view.photometric_stereo.factors import (
 )
 from pimper_torch.single_view.photometric_stereo.relief_metric import relief_of_metric
 
-# Maxima whose pairs are tried; pairs are half their square.
+# Maxima whose pairs are tried: a choice; pairs are half their square.
 _MAX_MAXIMA = 120
 _REFINEMENTS = 30
-# Fraction of a view's brightest value below which a pixel may be in shadow.
+# Fraction of a view's brightest value below which a pixel may be in shadow: a choice.
 _SHADOW = 0.05
-# Fraction of the maxima that are expected where the surface faces the point light; on one paint
-# more are.
-_RIGHT = 0.2
-# From the standard form hardly a surface is flatter than this, and none as steep.
+# Expected fraction of inliers among the maxima: a choice; on one paint it is higher.
+_INLIER_FRACTION = 0.2
+# Maximum logarithm of lambda from the standard form: a choice, hardly a surface is flatter.
 _MAX_LOG_LAMBDA = 2.0
-# Point lights that each maximum is tried with to learn how near it comes by chance.
-_OTHERS = 10
+# Other point lights, by which the likelihood of chance agreement is estimated: a choice.
+_CHANCE_LIGHTS = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DiffuseMaxima(Record):
-    """Places where brightness under one point light has a maximum.
+    """Local maxima of brightness under one point light.
 
     Attributes:
-        view: Whose point light.
-        place: Column and row, top-left centre at (0.5, 0.5).
+        view: Of the point light.
+        pixel: Column and row, top-left centre at (0.5, 0.5).
         shading: Albedo times normal there, interpolated.
-        deviation: Standard deviation of the vector's direction, as far as the maximum's place
-            is uncertain because brightness departs from a quadratic; radians.
+        deviation: Standard deviation of the vector's direction, from that of the maximum's
+            position under the residuals of its quadratic; radians.
     """
 
     view: Int[Tensor, " maximum"]
-    place: Float[Tensor, "maximum 2"]
+    pixel: Float[Tensor, "maximum 2"]
     shading: Float[Tensor, "3 maximum"]
     deviation: Float[Tensor, " maximum"]
 
@@ -74,12 +73,12 @@ def resolve_by_diffuse_maxima(
     radius: int = 3,
     agreement_deg: float = 1.0,
 ) -> BasRelief:
-    r"""Find the bas-relief transformation that turns normals at maxima towards their point lights.
+    r"""Find the bas-relief transformation that aligns normals at maxima with their point lights.
 
     Every pair of maxima gives a metric in closed form, the least singular vector of its six
-    equations. The one that most maxima agree with is refined by all of them: written in the
-    frame it leads to, where ``M`` is near the identity, the equations are sines of the angles
-    between normals and lights, and are solved with Cauchy's weights until the frame stays.
+    equations. The one of highest consensus is refined on all maxima: in the frame of the current
+    solution, where ``M`` is near the identity, the equations are sines of the angles between
+    normals and lights, and are solved with Cauchy's weights until convergence.
 
     Args:
         images: Linear radiance.
@@ -89,21 +88,21 @@ def resolve_by_diffuse_maxima(
         lights: Of the same factorization.
         radius: Of the square in pixels in which a maximum is the largest value, and which lies
             inside the mask and out of shadow.
-        agreement_deg: Angle between normal and light that is expected even of a maximum whose
-            place is certain.
+        agreement_deg: Expected angle between normal and light of a maximum whose position is
+            exact.
 
     Returns:
-        The transformation with lambda above zero: hills stay hills. Constant to autograd.
+        The transformation with lambda above zero: convex stays convex. Constant to autograd.
 
-    Fails where fewer than about three point lights are faced by visible surface, and where the
-    paint changes more than the shading everywhere.
+    Fails where fewer than about three point lights have a maximum on the visible surface, and
+    where albedo varies more than the shading everywhere.
 
     Raises:
         InputError: Sizes that do not fit, fewer than two maxima, or none that agree.
 
     Source: Favaro & Papadhimitri, CVPR 2012 and IJCV 107(2), 2014, for the equations. They
-    choose among the answers of pairs otherwise; the consensus, the refinement and the
-    localisation by quadratics are ours.
+    select among the solutions of pairs otherwise; the consensus, the refinement and the
+    localization by quadratics are ours.
     """
     require_matching(images, mask, shading, lights)
     with torch.no_grad():
@@ -118,7 +117,7 @@ def resolve_by_diffuse_maxima(
         light = start.on_lights(lights.double())[maxima.view[best]].mT
         floor = torch.deg2rad(maxima.deviation.new_tensor(agreement_deg))
         scale = (maxima.deviation[best].square() + floor * floor).sqrt()
-        found = _agreed(maxima.shading[:, best], light, scale).after(start)
+        found = _consensus(maxima.shading[:, best], light, scale).after(start)
         return cast(found, shading)
 
 
@@ -130,9 +129,8 @@ def find_maxima(
 ) -> DiffuseMaxima:
     """Find local maxima of brightness inside the surface, to a fraction of a pixel.
 
-    A quadratic is fitted to the square round the largest value. Kept are those that it curves
-    down from in all directions and whose top lies within the square; shading is read off a
-    plane fitted to the same square.
+    A quadratic is fitted to the square around the largest value. Those with a maximum within the
+    square are kept; shading is interpolated by a plane fitted to the same square.
 
     Args:
         images: Linear radiance; channels are added.
@@ -141,7 +139,7 @@ def find_maxima(
             be about Euclidean.
         radius: Of the square.
     """
-    found = [_tops(image.sum(dim=0), mask, radius) for image in images]
+    found = [_local_maxima(image.sum(dim=0), mask, radius) for image in images]
     counts = torch.tensor([len(tops) for tops in found], device=mask.device)
     view = torch.arange(len(images), device=mask.device).repeat_interleave(counts)
     row, column = torch.cat(found).mT
@@ -149,21 +147,21 @@ def find_maxima(
     raster[:, mask] = shading.double().nan_to_num()
     y, x = _offsets(radius, mask)
     rows, columns = row[:, None] + y, column[:, None] + x
-    near = images[view[:, None], :, rows, columns].double().sum(dim=-1)
+    window = images[view[:, None], :, rows, columns].double().sum(dim=-1)
     u, v = x.double(), y.double()
     one = torch.ones_like(u)
     basis = torch.stack([one, u, v, u * u / 2, u * v, v * v / 2], dim=1)
-    fitted = torch.linalg.lstsq(basis, near.mT).solution
+    fitted = torch.linalg.lstsq(basis, window.mT).solution
     _, gx, gy, hxx, hxy, hyy = fitted
     determinant = hxx * hyy - hxy * hxy
     safe = torch.where(determinant > 0, determinant, 1)
     du, dv = -(hyy * gx - hxy * gy) / safe, -(hxx * gy - hxy * gx) / safe
     kept = (determinant > 0) & (hxx < 0) & (torch.maximum(du.abs(), dv.abs()) < radius)
-    error = (near.mT - basis @ fitted).square().sum(dim=0) / (len(basis) - basis.shape[1])
+    error = (window.mT - basis @ fitted).square().sum(dim=0) / (len(basis) - basis.shape[1])
     plane = torch.linalg.lstsq(basis[:, :3], raster[:, rows, columns].permute(2, 0, 1).flatten(1))
     level, along, down = plane.solution.reshape(3, 3, -1)
     vector = level + along * du + down * dv
-    # The gradient's error over the square moves the top by minus the inverse Hessian times it.
+    # An error of the gradient moves the maximum by minus the inverse Hessian times it.
     by_gx = -(hyy * along - hxy * down) / safe
     by_gy = -(hxx * down - hxy * along) / safe
     size = vector.norm(dim=0).clamp_min(1e-30)
@@ -172,42 +170,42 @@ def find_maxima(
         (by - unit * (unit * by).sum(dim=0)).square().sum(dim=0) for by in (by_gx, by_gy)
     )
     deviation = (error / (u * u).sum() * rotation).sqrt() / size
-    place = torch.stack([column + 0.5 + du, row + 0.5 + dv], dim=1)
+    pixel = torch.stack([column + 0.5 + du, row + 0.5 + dv], dim=1)
     return DiffuseMaxima(
-        view=view[kept], place=place[kept], shading=vector[:, kept], deviation=deviation[kept]
+        view=view[kept], pixel=pixel[kept], shading=vector[:, kept], deviation=deviation[kept]
     )
 
 
-def _agreed(
+def _consensus(
     b: Float[Tensor, "3 maximum"],
     light: Float[Tensor, "3 maximum"],
     scale: Float[Tensor, " maximum"],
 ) -> BasRelief:
-    """Take the pair's relief that most maxima agree with, and refine it."""
+    """Select the pair's transformation of highest consensus, and refine it."""
     equations = _equations(b, light)
     one, other = torch.triu_indices(b.shape[1], b.shape[1], 1, device=b.device)
     pairs = torch.cat([equations[one], equations[other]], dim=1)
     metrics = torch.linalg.svd(pairs, full_matrices=False).Vh[:, -1]
     reliefs = relief_of_metric(metrics)
     angles = _angles(reliefs, b, light).nan_to_num(nan=torch.pi)
-    # How much likelier each angle is for a right maximum than with some other maximum's point
-    # light, which a relief that gathers all normals or all lights brings as near.
-    alike = torch.exp(-((angles / scale) ** 2) / 2)
-    chance = torch.zeros_like(alike)
-    shifts = range(1, min(_OTHERS, b.shape[1] - 1) + 1)
+    # Likelihood ratio of an inlier against the point light of some other maximum: transformations
+    # that make all normals or all lights parallel give every pair a small angle.
+    likelihood = torch.exp(-((angles / scale) ** 2) / 2)
+    chance = torch.zeros_like(likelihood)
+    shifts = range(1, min(_CHANCE_LIGHTS, b.shape[1] - 1) + 1)
     for shift in shifts:
         other = _angles(reliefs, b, light.roll(shift, dims=1)).nan_to_num(nan=torch.pi)
         chance += torch.exp(-((other / scale) ** 2) / 2) / len(shifts)
-    # Above what it is on the whole sphere.
-    likelier = alike / (chance + scale**2 / 2)
-    support = (_RIGHT * likelier).log1p().sum(dim=1)
+    # The second term is the likelihood of chance on the whole sphere.
+    likelier = likelihood / (chance + scale**2 / 2)
+    support = (_INLIER_FRACTION * likelier).log1p().sum(dim=1)
     extreme = reliefs.lam.log().abs().nan_to_num(nan=99.0) > _MAX_LOG_LAMBDA
     support = torch.where(extreme, 0, support)
     best = int(support.argmax())
     if int((angles[best] < 3 * scale).sum()) < 2 or bool(extreme[best]):
         raise InputError(
-            f"no two of {b.shape[1]} maxima of brightness agree on one relief; needed: places "
-            "that face their point lights. Lower `radius`, or use another method."
+            f"no two of {b.shape[1]} maxima of brightness agree on one transformation; needed: "
+            "pixels that face their point lights. Lower `radius`, or use another method."
         )
     return _refined(
         BasRelief(mu=reliefs.mu[best], nu=reliefs.nu[best], lam=reliefs.lam[best]), b, light, scale
@@ -220,7 +218,7 @@ def _refined(
     light: Float[Tensor, "3 maximum"],
     scale: Float[Tensor, " maximum"],
 ) -> BasRelief:
-    """Solve all maxima's equations in the frame of the last solution, until it stays."""
+    """Solve all maxima's equations in the frame of the last solution, until convergence."""
     for _ in range(_REFINEMENTS):
         moved = relief.on_shading(b)
         point_light = relief.on_lights(light.mT).mT
@@ -261,12 +259,12 @@ def _angles(
     return torch.atan2(cross, (normal * point_light).sum(dim=-2))
 
 
-def _tops(
+def _local_maxima(
     image: Float[Tensor, "height width"], mask: Bool[Tensor, "height width"], radius: int
 ) -> Int[Tensor, "top 2"]:
-    """Find rows and columns of largest values, their squares inside the mask and out of shadow.
+    """Find rows and columns of local maxima, their squares inside the mask and out of shadow.
 
-    The image is blurred by the binomial kernel of five first, as noise makes maxima of its own.
+    The image is blurred by the binomial kernel of five first, to remove maxima of noise.
     """
     kernel = image.new_tensor([1.0, 4, 6, 4, 1]) / 16
     smooth = conv2d(image[None, None], (kernel[:, None] * kernel)[None, None], padding=2)
@@ -277,7 +275,7 @@ def _tops(
     return (top & inside)[0, 0].nonzero()
 
 
-def _offsets(radius: int, like: Tensor) -> tuple[Int[Tensor, " place"], Int[Tensor, " place"]]:
+def _offsets(radius: int, like: Tensor) -> tuple[Int[Tensor, " offset"], Int[Tensor, " offset"]]:
     side = torch.arange(-radius, radius + 1, device=like.device)
     y, x = torch.meshgrid(side, side, indexing="ij")
     return y.flatten(), x.flatten()

@@ -1,4 +1,4 @@
-r"""Photographs of one viewpoint as a product of few factors, indifferent to shadows.
+r"""Low-rank factorization of photographs from one viewpoint, robust to shadows.
 
 :math:`X = L S`, one row of ``L`` a view, one column of ``S`` a pixel: unique at best up to one
 invertible matrix between them.
@@ -21,11 +21,11 @@ from pimper_torch.single_view.photometric_stereo.regression import (
     reweigh,
 )
 
-# Lights are found from so many pixels at most; the rest follows pixel by pixel.
+# Lights are estimated from so many pixels at most, shading for all: a choice.
 _MAX_PIXELS = 4000
-# Of variable projection: the first solution, and each one after a change of weights.
+# Steps of variable projection: for the first solution, and after every change of weights: choices.
 _FIRST_STEPS, _NEXT_STEPS = 100, 5
-_ROTATIONS = 20
+_ITERATIONS = 20
 _WIDEST, _NARROWING = 4.0, 0.8
 
 
@@ -35,8 +35,8 @@ class Factored(Record):
 
     Attributes:
         lights: ``L``, orthonormal columns.
-        shading: ``S``; the noise of its components is even.
-        weight: What each sample was given in the end; 0 where missing or in shadow.
+        shading: ``S``; the noise of its components is white.
+        weight: Final weight of each sample; 0 where missing or in shadow.
     """
 
     lights: Float[Tensor, "view rank"]
@@ -54,20 +54,20 @@ def factorize_photographs(
     starts: int = 0,
     generator: torch.Generator | None = None,
 ) -> Factored:
-    """Factorize photographs with holes, shadows and highlights.
+    """Factorize photographs with missing samples, shadows and highlights.
 
-    Without holes and outliers it is the singular value decomposition. Otherwise lights come
-    from pixels spread over the object, by variable projection, with Cauchy's weights if
-    asked for; the shading of all pixels is regressed on them.
+    Complete and without robust weights, it is the singular value decomposition. Otherwise lights
+    are estimated from an even subset of pixels by variable projection, with Cauchy's weights if
+    ``robust``; the shading of all pixels is regressed on them.
 
     Args:
-        radiance: Linear, gray. Samples without weight do not matter.
+        radiance: Linear, gray. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
         rank: 3 for point lights, 4 or 9 for harmonics.
-        robust: Whether to re-weight; see
+        robust: Whether to reweight; see
             :func:`~pimper_torch.single_view.photometric_stereo.regression.regress`.
-        shadows: What lights from behind leave. For harmonics, ``none``.
-        starts: Random starts besides the one from the data, of which the best is taken.
+        shadows: Of lights from behind, see there. For harmonics, ``none``.
+        starts: Random starts besides the one from the data; the best minimum is taken.
         generator: Of the random starts; on the CPU.
 
     Raises:
@@ -114,7 +114,7 @@ def _best_start(
     starts: int,
     generator: torch.Generator | None,
 ) -> Float[Tensor, "view rank"]:
-    """Solve from the filled data and from random places; take the best."""
+    """Solve from the imputed data and from random starts; take the best minimum."""
     begin = [_filled(x, weight, rank)]
     for _ in range(starts):
         assert generator is not None
@@ -134,13 +134,13 @@ def _settle(
     left: Float[Tensor, "view rank"],
     shadows: Shadows,
 ) -> Float[Tensor, "view rank"]:
-    """Alternate weights and factors, weights from wide to their own scale."""
+    """Alternate weights and factors, the scale of the weights falling to its final value."""
     weight = first
-    for rotation in range(_ROTATIONS):
+    for iteration in range(_ITERATIONS):
         problem = low_rank_problem(x[None], weight[None], left[None])
         solved = solve_variable_projection(problem, _NEXT_STEPS)
         left = solved.lights[0]
-        widen = max(1.0, _WIDEST * _NARROWING**rotation)
+        widen = max(1.0, _WIDEST * _NARROWING**iteration)
         reliability, lit = reweigh(x, given, left @ solved.shading[0], widen, shadows)
         weight = reliability * lit
     return left
@@ -149,7 +149,7 @@ def _settle(
 def _filled(
     x: Float[Tensor, "view pixel"], weight: Float[Tensor, "view pixel"], rank: int
 ) -> Float[Tensor, "view rank"]:
-    """Fill what is missing with brightness times brightness, and take singular vectors."""
+    """Impute missing samples by view's times pixel's brightness, and take singular vectors."""
     gain = (weight * x).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
     level = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
     albedo = (weight * x).sum(dim=0, keepdim=True) / level
@@ -159,5 +159,5 @@ def _filled(
 
 
 def evenly(count: int, most: int) -> Int[Tensor, " chosen"]:
-    """Choose places spread evenly over ``range(count)``."""
+    """Give indices spaced evenly over ``range(count)``."""
     return torch.linspace(0, count - 1, min(count, most)).round().long()

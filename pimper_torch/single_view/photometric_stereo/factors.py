@@ -1,4 +1,4 @@
-"""What every method that resolves a factorization asks of it."""
+"""Checks of the factors that methods resolve up to bas-relief."""
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -19,7 +19,7 @@ def require_matching(
     shading: Float[Tensor, "3 pixel"],
     lights: Float[Tensor, "light 3"],
 ) -> None:
-    """Refuse factors that are not those of the images.
+    """Refuse factors whose sizes do not match the images.
 
     Raises:
         InputError: Not one light a view, or not one vector a pixel inside the mask.
@@ -42,11 +42,11 @@ def require_standard(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
     if not bool(relief.lam.isfinite()):
         raise InputError(
             f"the normals of {shading.shape[1]} pixels are parallel; needed: a curved surface, as "
-            "no relief of a plane can be told from another. Enlarge the mask."
+            "a plane does not determine a bas-relief transformation. Enlarge the mask."
         )
     return relief
 
 
 def cast(relief: BasRelief, like: Tensor) -> BasRelief:
-    """Give a transformation the dtype of a tensor."""
+    """Convert a transformation to the dtype and device of a tensor."""
     return BasRelief(mu=relief.mu.to(like), nu=relief.nu.to(like), lam=relief.lam.to(like))

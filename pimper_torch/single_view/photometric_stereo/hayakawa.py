@@ -1,8 +1,8 @@
-r"""Pixels of one albedo, or lights of one strength, make a rank-three factorization metric.
+r"""Metric upgrade of rank-three factorizations by pixels of one albedo or lights of one strength.
 
-Six pixels whose albedo is the same, or six point lights whose strength is, determine the quadratic
-form that measures them; what leaves it unchanged are rotations and mirrors. Where integrability has
-left a bas-relief transformation instead, the same knowledge leaves only convex or concave.
+Six pixels of equal albedo, or six point lights of equal strength, determine the quadratic form of
+their lengths; its ambiguity is an orthogonal matrix. Where the ambiguity is a bas-relief
+transformation, they resolve it up to convex or concave.
 
 Source: Hayakawa, Photometric stereo under a light source with arbitrary motion, JOSA A 11(11),
 1994, for the form; that bas-relief and form have no more in common: Belhumeur, Kriegman & Yuille,
@@ -22,10 +22,10 @@ from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.relief import convex
 
 _ITERATIONS = 20
-# The least singular value of the equations, as a fraction of the largest: below, the vectors lie on
-# a cone, and more than one form measures them alike.
+# Minimum singular value of the equations, as a fraction of the largest: below, the vectors lie on
+# a cone, and the form is not unique. A choice.
 _MIN_FRACTION = 1e-6
-# Depths, as factors of the given one, from which a bas-relief is looked for.
+# Initial depths of the search for a bas-relief, as factors of the given one: a choice.
 _DEPTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _STEPS = 60
 
@@ -37,10 +37,10 @@ _Curve = Callable[
 def metric_from_albedo(
     shading: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"]
 ) -> Float[Tensor, "3 3"]:
-    r"""Find the matrix after which shading has the same length wherever there is weight.
+    r"""Find the matrix after which shading has length 1 wherever there is weight.
 
-    :math:`\lVert A s_k \rVert = 1` is linear in :math:`A^\top A`; Cauchy's weights let pixels of
-    another albedo go, as long as they are few. What remains free is an orthogonal matrix.
+    :math:`\lVert A s_k \rVert = 1` is linear in :math:`A^\top A`; Cauchy's weights reject pixels of
+    another albedo, as long as they are few. The remaining ambiguity is an orthogonal matrix.
 
     Args:
         shading: Up to an invertible matrix.
@@ -50,8 +50,7 @@ def metric_from_albedo(
         ``A``, to be applied to shading. Its inverse goes to the lights.
 
     Raises:
-        InputError: Fewer than six pixels, pixels that several forms measure alike, or that no
-            form does.
+        InputError: Fewer than six pixels, or pixels for which there is no form, or several.
     """
     return _root(_form(shading, weight, "pixels of equal albedo"), "pixels of equal albedo")
 
@@ -60,10 +59,10 @@ def metric_from_strength(lights: Float[Tensor, "view 3"]) -> Float[Tensor, "3 3"
     r"""Find the matrix after which all point lights have the same strength.
 
     :math:`\lVert A^{-\top} l_v \rVert = 1` for all point lights is linear in
-    :math:`A^{-1} A^{-\top}`. What remains free is an orthogonal matrix.
+    :math:`A^{-1} A^{-\top}`. The remaining ambiguity is an orthogonal matrix.
 
     Args:
-        lights: Up to an invertible matrix; zero rows do not matter.
+        lights: Up to an invertible matrix; zero rows are ignored.
 
     Returns:
         ``A``, to be applied to shading. Its inverse goes to the lights.
@@ -87,7 +86,7 @@ def relief_from_albedo(
     Args:
         shading: Albedo times normal up to a bas-relief transformation, raster order.
         weight: Not negative.
-        mask: Where the pixels are.
+        mask: True at the pixels.
 
     Raises:
         InputError: Fewer than four pixels.
@@ -120,11 +119,11 @@ def relief_from_strength(
     """Find the bas-relief transformation that gives most point lights one strength; convex.
 
     Args:
-        lights: That go with the shading; zero rows do not matter.
-        shading: Albedo times normal up to a bas-relief transformation, raster order; it tells
-            convex from concave.
+        lights: Of the same factorization as the shading; zero rows are ignored.
+        shading: Albedo times normal up to a bas-relief transformation, raster order; it
+            distinguishes convex from concave.
         weight: Of the pixels.
-        mask: Where the pixels are.
+        mask: True at the pixels.
 
     Raises:
         InputError: Fewer than four point lights.
@@ -155,7 +154,7 @@ def relief_from_strength(
 def _form(
     vectors: Float[Tensor, "3 item"], weight: Float[Tensor, " item"], what: str
 ) -> Float[Tensor, "3 3"]:
-    """Find the symmetric matrix under which vectors have length 1, by re-weighted squares."""
+    """Find the quadratic form under which vectors have length 1, by reweighted least squares."""
     with torch.no_grad():
         given = weight.double()
         count = int((given > 0).sum())
@@ -171,8 +170,8 @@ def _form(
             singular = torch.linalg.svdvals(root * monomials)
             if not singular[-1] > _MIN_FRACTION * singular[0]:
                 raise InputError(
-                    f"{what}: theirs are on one cone, which more than one measure makes equal; "
-                    "needed: others besides. Take more, in other directions."
+                    f"{what}: theirs are on one cone, so that more than one quadratic form makes "
+                    "them equal; needed: others besides. Take more, in other directions."
                 )
             entries = torch.linalg.lstsq((root * monomials).mT, root[:, None]).solution[:, 0]
             residual = entries @ monomials - 1
@@ -190,8 +189,8 @@ def _root(form: Float[Tensor, "3 3"], what: str) -> Float[Tensor, "3 3"]:
     factor, failed = torch.linalg.cholesky_ex(form)
     if int(failed) != 0:
         raise InputError(
-            f"{what}: no measure makes theirs equal (the best one is not positive); needed: what "
-            "is equal. Leave the others out, or resolve the ambiguity otherwise."
+            f"{what}: no quadratic form makes them equal (the best one is not positive definite); "
+            "needed: what is equal. Leave the others out, or resolve the ambiguity otherwise."
         )
     return factor.mT
 
@@ -205,7 +204,7 @@ def _typical(vectors: Float[Tensor, "3 item"], weight: Float[Tensor, " item"]) -
 def _fitted(
     curve: _Curve, weight: Float[Tensor, " item"], begin: Float[Tensor, "start 4"], what: str
 ) -> Float[Tensor, " 4"]:
-    """Bring ``curve`` to 1 by Levenberg-Marquardt with Cauchy's weights, from several places."""
+    """Fit ``curve`` to 1 by Levenberg-Marquardt with Cauchy's weights, from several starts."""
     with torch.no_grad():
         given = weight.double()
         count = int((given > 0).sum())
@@ -230,7 +229,7 @@ def _fitted(
             values = torch.where(better[:, None], after, values)
             slopes = torch.where(better[:, None, None], steeper, slopes)
             damping = (damping * torch.where(better, 0.2, 5.0)).clamp(1e-12, 1e12)
-        # One scale for all, or each start would be judged by its own.
+        # One scale for all, so that the starts' losses are comparable.
         scale = CAUCHY_TUNING * median_deviation(1 - values, (given > 0).expand_as(values)).amin()
         return at[int(_loss(1 - values, given, scale.clamp_min(1e-6)).argmin())]
 

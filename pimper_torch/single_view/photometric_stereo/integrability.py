@@ -1,4 +1,4 @@
-r"""Which combination of pseudo-normals is the normals of a surface.
+r"""Integrability of pseudo-normals: the matrix that makes them normals of a surface.
 
 Pseudo-normals :math:`s(x, y)` are shading vectors up to an unknown matrix, :math:`\rho n = A s`.
 That they belong to a depth :math:`z(x, y)` with slopes :math:`-n_x/n_z, -n_y/n_z` means
@@ -27,25 +27,25 @@ from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust
 from pimper_torch.records import Record
 
 # Differences are taken over cells of 1/64 of the object's size, and equations averaged over blocks
-# of 1/16: averages cost no signal, as the unknowns are the same everywhere, and take out of the
-# coefficients the noise that biases the answer. On the grey sphere of 215 pixels, normals after
-# the best bas-relief are 7.3 degrees off with single pixels in blocks of 4, and 6.1 so.
+# of 1/16: averages lose no signal, as the unknowns are constant, and reduce the noise of the
+# coefficients, which biases the solution. On the grey sphere of 215 pixels, normals after the best
+# bas-relief are 7.3 degrees off with single pixels in blocks of 4, and 6.1 so.
 _CELLS, _BLOCKS = 64, 16
 _ITERATIONS = 10
-# Where the next best solution has a curl, as a fraction of the terms, below this, rounding decides.
-_MIN_RIVAL = 1e-6
+# Minimum curl of the second best solution, as a fraction of the terms: a choice, above rounding.
+_MIN_SECOND_CURL = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Curls(Record):
-    """The coefficients of integrability, one equation a square of cells.
+    """The coefficients of integrability, one equation per block of cells.
 
     Attributes:
         across: ``s ^ ds/dx``, pairs (0, 1), (0, 2), ... of components.
         down: ``s ^ ds/dy``.
         weight: Of each equation.
-        noise: What the noise of the pseudo-normals does to ``across``, and to ``down``: a
-            covariance up to a factor.
+        noise: Covariance of ``across``, and of ``down``, from the noise of the pseudo-normals;
+            up to a factor.
     """
 
     across: Float[Tensor, "equation pair"]
@@ -56,14 +56,14 @@ class Curls(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Integrable(Record):
-    """What integrability says about pseudo-normals of three dimensions.
+    """The matrix that makes pseudo-normals of three dimensions integrable.
 
     Attributes:
         matrix: ``A``, up to a bas-relief transformation and a factor: shading is ``A s``.
-        curl: Root mean square of the equations' sums over that of their terms: 0 is a surface,
-            1 is no relation at all.
-        certainty: How many times more noise the next best solution would take, in standard
-            deviations; near 1 the answer is a guess.
+        curl: Root mean square of the equations' residuals over that of their terms: 0 for a
+            surface, 1 for unrelated terms.
+        certainty: Residual of the second best solution over that of the best; near 1 the solution
+            is arbitrary.
     """
 
     matrix: Float[Tensor, "3 3"]
@@ -85,33 +85,32 @@ def curls(
     mask: Bool[Tensor, "height width"],
     noise: Float[Tensor, "size size"] | None = None,
 ) -> Curls:
-    """Collect the equations of integrability over a raster.
+    """Assemble the equations of integrability over a raster.
 
-    Pseudo-normals are brought to unit length first, after their second moments are made
-    equal, so that neither albedo nor its edges enter the differences. They are taken over the
-    four corners of a square; a square with a pixel outside the mask, or without weight, has no
-    equation.
+    Pseudo-normals are whitened and normalized first, so that neither albedo nor its edges enter
+    the differences. These are taken over the four corners of a square; a square with a pixel
+    outside the mask, or without weight, has no equation.
 
     Args:
         pseudo: ``s`` of the pixels inside the mask, in raster order.
         weight: Of the pixels; 0 leaves one out.
-        mask: Where they are.
-        noise: Covariance of ``s``, up to a factor; by default noise is even in all components,
-            as after a singular value decomposition.
+        mask: True at the pixels.
+        noise: Covariance of ``s``, up to a factor; by default noise is white, as after a singular
+            value decomposition.
 
     Raises:
         InputError: Fewer equations than unknowns.
     """
     s, w = pseudo.double(), weight.double()
     moment = (w * s) @ s.mT
-    # A plane's normals span one dimension only.
+    # The normals of a plane span one dimension only.
     ridge = 1e-12 * moment.diagonal().mean() + torch.finfo(s.dtype).tiny
     root = torch.linalg.cholesky(moment + ridge * torch.eye(len(s)).to(s))
     length = torch.linalg.solve_triangular(root, s, upper=False).norm(dim=0)
     known = (w > 0) & (length > 0)
     inverse = torch.where(known, 1 / torch.where(known, length, 1), 0)
     unit = s * inverse
-    # Noise of the direction goes with 1 / length; beyond the median nothing is gained.
+    # Noise of the direction is proportional to 1 / length; the weight is bounded at the median.
     centre = length[known].median() if known.any() else length.new_ones(())
     reliability = torch.where(known, w * (length / centre).clamp_max(1) ** 2, 0)
     raster, heavy = s.new_zeros(*mask.shape, len(s)), s.new_zeros(mask.shape)
@@ -154,16 +153,15 @@ def integrable(
     r"""Find the matrix that makes pseudo-normals the normals of a surface.
 
     The six unknowns are the least generalised eigenvector of the equations' squares against
-    what noise alone would make of them, total least squares, so that they do not depend on the
-    basis of ``s``; equations lose weight by Cauchy's function, as across depth edges there is
-    no surface. Of the bas-relief transformations left free the one whose rows are orthogonal
-    is taken, which means nothing: see :mod:`.relief`. The
+    those of noise alone (total least squares), so that they do not depend on the basis of ``s``;
+    equations get Cauchy's weights, as they do not hold across depth edges. The remaining
+    bas-relief transformation is set by orthogonal rows, arbitrarily: see :mod:`.relief`. The
     third component of most normals is negative.
 
     Args:
         pseudo: ``s`` of the pixels inside the mask, in raster order.
         weight: Of the pixels; 0 leaves one out.
-        mask: Where they are.
+        mask: True at the pixels.
         noise: Covariance of ``s``; see :func:`curls`.
 
     Raises:
@@ -172,7 +170,7 @@ def integrable(
 
     Constant to autograd.
 
-    Source: Yuille & Snow, CVPR 1997; the metric, the averaging and the weights are ours.
+    Source: Yuille & Snow, CVPR 1997; the noise model, the averaging and the weights are ours.
     """
     with torch.no_grad():
         found, curl, certainty = _least(curls(pseudo, weight, mask, noise))
@@ -192,15 +190,15 @@ def rotation_to_surface(
     mask: Bool[Tensor, "height width"],
     noise: Float[Tensor, "3 3"] | None = None,
 ) -> Float[Tensor, "3 3"]:
-    """Find the orthogonal matrix that makes shading known up to one that of a surface.
+    """Find the orthogonal matrix that makes shading integrable.
 
-    The two bivectors are then its first two rows. The third component of most normals comes
-    out negative; of the two matrices still left one is convex where the other is concave.
+    The two bivectors are then its first two rows. The third component of most normals is
+    negative; the remaining ambiguity is convex or concave.
 
     Args:
         shading: Albedo times normal of the pixels inside the mask, in an unknown frame.
         weight: Of the pixels; 0 leaves one out.
-        mask: Where they are.
+        mask: True at the pixels.
         noise: Covariance of the shading; see :func:`curls`.
 
     Raises:
@@ -220,7 +218,7 @@ def rotation_to_surface(
 
 
 def moments(equations: Curls) -> tuple[Float[Tensor, "both both"], Float[Tensor, "both both"]]:
-    """Give the quadratic forms of the equations' sums, and of their terms."""
+    """Give the quadratic forms of the equations' residuals, and of their terms."""
     both = torch.cat([equations.across, equations.down], dim=1)
     full = (equations.weight[:, None] * both).mT @ both
     terms = full.clone()
@@ -231,12 +229,12 @@ def moments(equations: Curls) -> tuple[Float[Tensor, "both both"], Float[Tensor,
 
 
 def both_ways(noise: Float[Tensor, "pair pair"]) -> Float[Tensor, "both both"]:
-    """Give the covariance of ``across`` and ``down`` together: they do not correlate."""
+    """Give the joint covariance of ``across`` and ``down``, which are uncorrelated."""
     return torch.kron(torch.eye(2).to(noise), noise)
 
 
-def reweighed(equations: Curls, solution: Float[Tensor, " both"]) -> Float[Tensor, " equation"]:
-    """Give equations the weights that their sums deserve under a solution."""
+def reweighted(equations: Curls, solution: Float[Tensor, " both"]) -> Float[Tensor, " equation"]:
+    """Update the equations' weights by their residuals under a solution."""
     both = torch.cat([equations.across, equations.down], dim=1)
     residual = both @ solution
     scale = CAUCHY_TUNING * robust_deviation(residual, equations.weight > 0)
@@ -244,23 +242,23 @@ def reweighed(equations: Curls, solution: Float[Tensor, " both"]) -> Float[Tenso
 
 
 def _least(equations: Curls) -> tuple[Float[Tensor, " both"], float, float]:
-    """Solve by total least squares, re-weighting; with the curl left and its certainty."""
+    """Solve by reweighted total least squares; give the curl and the certainty, too."""
     metric = both_ways(equations.noise)
     eye = torch.eye(len(metric)).to(metric)
     root = torch.linalg.cholesky(metric + 1e-12 * metric.diagonal().mean() * eye)
-    weighed = equations
+    reweighted_equations = equations
     for _ in range(_ITERATIONS):
-        full, terms = moments(weighed)
+        full, terms = moments(reweighted_equations)
         inner = torch.linalg.solve_triangular(root, full, upper=False)
         inner = torch.linalg.solve_triangular(root, inner.mT, upper=False)
         values, vectors = torch.linalg.eigh((inner + inner.mT) / 2)
         vectors = torch.linalg.solve_triangular(root.mT, vectors, upper=True)
-        weighed = equations.replace(weight=reweighed(equations, vectors[:, 0]))
+        reweighted_equations = equations.replace(weight=reweighted(equations, vectors[:, 0]))
     fraction = [_curl(full, terms, vectors[:, one]) for one in (0, 1)]
-    if not fraction[1] > _MIN_RIVAL:
+    if not fraction[1] > _MIN_SECOND_CURL:
         raise InputError(
             "integrability: more than one matrix makes these pseudo-normals a surface, as for a "
-            "plane or a cylinder; needed: normals that turn both ways. Widen the mask."
+            "plane or a cylinder; needed: curvature in two directions. Widen the mask."
         )
     least = float(values[0].clamp_min(torch.finfo(values.dtype).tiny))
     return vectors[:, 0], fraction[0], (float(values[1]) / least) ** 0.5
@@ -281,7 +279,7 @@ def _pairs(size: int) -> tuple[list[int], list[int]]:
 
 
 def _vector(bivector: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
-    """Turn a bivector of space into the vector across it."""
+    """Give the vector dual to a bivector of space."""
     xy, xz, yz = bivector
     return torch.stack([yz, -xz, xy])
 

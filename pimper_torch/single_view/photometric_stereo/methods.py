@@ -1,4 +1,4 @@
-"""The methods by name, each from a problem to a solution."""
+"""The methods of photometric stereo by name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ def _by_maxima(given: Problem, found: Surfaced) -> BasRelief:
 def _reliable(
     given: Problem, found: Surfaced
 ) -> tuple[Float[Tensor, "view channel height width"], Bool[Tensor, "height width"]]:
-    """Give the photographs, and the pixels that are trusted."""
+    """Give the photographs, and the reliable pixels."""
     mask = torch.zeros_like(given.mask)
     mask[given.mask] = found.reliability > 0
     return _without_holes(given), mask
@@ -74,9 +74,9 @@ def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]
     return images
 
 
-# How a bas-relief transformation is chosen. "rounded" is a convention; the others measure.
-# Entropy comes first, as the default: nearest to known lights on the rendered objects and, with
-# diffuse maxima, on the photographs (benchmarks/photometric_stereo.py).
+# Methods that resolve the bas-relief ambiguity; "rounded" is a convention. Entropy comes first, as
+# the default: nearest to known lights on the rendered objects and, with diffuse maxima, on the
+# photographs (benchmarks/photometric_stereo.py).
 RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "albedo_entropy": _by_entropy,
     "rounded": lambda given, found: rounded_relief(found.shading, found.reliability, given.mask),
@@ -193,7 +193,7 @@ def _by_harmonics(
 
 
 def _lambertian(given: Problem, found: Surfaced, applied: BasRelief | None, free: str) -> Solution:
-    """Read normals and the albedo of each colour off shading and point lights."""
+    """Give normals and the albedo of each colour from shading and point lights."""
     size = found.shading.norm(dim=0)
     normals = found.shading / torch.where(size > 0, size, 1)
     shade = (found.lights @ normals).clamp_min(0)
@@ -210,7 +210,7 @@ def _lambertian(given: Problem, found: Surfaced, applied: BasRelief | None, free
 
 
 def _scaled(found: Solution) -> Solution:
-    """Give lights the median length 1."""
+    """Scale lights to the median length 1, and albedo inversely."""
     length = found.lights.norm(dim=1)
     shining = length[length > 0]
     factor = shining.median() if len(shining) else length.new_ones(())
@@ -220,7 +220,7 @@ def _scaled(found: Solution) -> Solution:
 def _reliability(
     weight: Float[Tensor, "view pixel"], lights: Float[Tensor, "view unknown"]
 ) -> Float[Tensor, " pixel"]:
-    """Trust pixels by the samples that are left to them."""
+    """Give each pixel's weight, from those of its samples; 0 where it is underdetermined."""
     enough, spanned = determined(weight, lights)
     total = weight.sum(dim=0)
     return torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)
@@ -231,9 +231,9 @@ class Method:
     """A method by its name.
 
     Attributes:
-        solve: The method; told what to resolve by.
-        unknowns: Numbers that a pixel has to be told: so many views it takes.
-        resolvers: What it can resolve by; the first is the default.
+        solve: From the problem and the name of a resolver.
+        unknowns: Of a pixel, which is the minimum number of views.
+        resolvers: Of its ambiguity; the first is the default.
         calibrated: Whether it needs lights.
         perspective: Whether it needs intrinsics.
         robust: Whether shadows and highlights lose weight by default.

@@ -1,4 +1,4 @@
-r"""Uncalibrated photometric stereo through a pinhole, which leaves nothing free but scale.
+r"""Uncalibrated photometric stereo under perspective projection, unique up to scale.
 
 With rays :math:`r = (x, y, 1)` the surface is :math:`z r`, and a vector b along its normal gives
 :math:`(\log z)_x = -b_1 / (b \cdot r)`, :math:`(\log z)_y = -b_2 / (b \cdot r)`. That these are
@@ -6,11 +6,11 @@ the slopes of one function reads
 
 .. math:: (b \times b_x)_1 + (b \times b_y)_2 - x (b \times b_x)_3 - y (b \times b_y)_3 = 0.
 
-For factors known up to an invertible matrix, :math:`b = A \hat b`, cross products turn by the
+For factors known up to an invertible matrix, :math:`b = A \hat b`, cross products transform by the
 cofactors of A: :math:`b \times b_x = P (\hat b \times \hat b_x)`, P proportional to the inverse
-of A's transpose. This is an equation a pixel, linear in all nine entries of P. Without the last
-two terms, which grow with the field of view, the last row of P stays free: that is the bas-relief
-ambiguity. On some surfaces, balls and all quadrics among them, a second P solves them even so.
+of A's transpose. This is one equation per pixel, linear in the nine entries of P. Without the last
+two terms, which grow with the field of view, the last row of P is free: that is the bas-relief
+ambiguity. On some surfaces, balls and all quadrics among them, a second P is a solution, too.
 
 Source: Papadhimitri & Favaro, A new perspective on uncalibrated photometric stereo, CVPR 2013.
 """
@@ -27,12 +27,12 @@ from pimper_torch.photometry.quadratics import solve_packed
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.single_view.factorization.low_rank import low_rank_problem
 
-# Columns on which missing entries are filled in; the lights' span needs no more.
+# Columns by which the lights are estimated where entries are missing: a choice.
 _COLUMNS = 4000
-# Equations for nine unknowns up to scale; with fewer than this many the noise decides.
+# Minimum number of equations, for nine unknowns up to scale: a choice.
 _FEWEST = 50
 _REWEIGHTINGS = 4
-# On a ball noise leaves two misfits that are the same but for chance.
+# Minimum ratio of the second smallest residual to the smallest: a choice; on a ball it is about 1.
 _DISTINCT = 1.5
 
 
@@ -44,39 +44,38 @@ def factorize_in_perspective(
     *,
     radius: int = 3,
 ) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "view 3"]]:
-    r"""Find albedo times normal and the lights from one viewpoint's photographs alone.
+    r"""Estimate albedo times normal and the lights from photographs of one viewpoint.
 
-    The images, channels added, are factored to rank three; the integrability of vectors made
-    unit, which is a matter of their direction only, gives the matrix between the factors.
-    Derivatives are those of cubics fitted to squares. Their noise bends the least squares
-    solution, so the equations' moment is compared with the moment that noise alone would have:
-    the generalised eigenvector of least ratio.
+    The images, channels added, are factorized to rank three; the integrability of the normalized
+    vectors gives the matrix between the factors. Derivatives are those of cubics fitted to
+    squares. Their noise biases least squares; the solution is the generalised eigenvector of the
+    equations' moments against those of noise alone.
 
     Args:
         images: Linear radiance.
-        mask: Where the surface is, without breaks in depth.
+        mask: True on the surface, without depth discontinuities.
         intrinsics: Pinhole K in pixels, centre of the top-left pixel at (0.5, 0.5).
-        seen: Which values count, pixels in raster order; shadows and highlights do not. All
-            without it.
+        seen: False for missing values, shadows and highlights, pixels in raster order; by default
+            all are seen.
         radius: Of the squares, which lie inside the mask.
 
     Returns:
-        Shading and lights in the camera frame, right up to one factor between them, which is set
-        so that lights are 1 in the root mean square. The factors leave one sign, which is fixed
-        by normals facing the viewer; hills and valleys are told apart. Pixels seen in fewer
-        than three views have the vector zero. Constant to autograd.
+        Shading and lights in the camera frame, unique up to one factor between them, which is set
+        so that the lights' root mean square is 1. The sign is that of normals facing the viewer;
+        convex and concave are distinguished. Pixels seen in fewer than three views have the
+        vector zero. Constant to autograd.
 
-    Fails where the field of view is so small that noise drowns the perspective: the error grows
-    with its inverse. Then only a bas-relief transformation separates the result from the truth,
-    and the methods that resolve it apply. On a ball, as on some other surfaces, the images do not
-    determine the result; with noise that is noticed, without it need not be.
+    Fails where the field of view is small: the error is proportional to its inverse. The result
+    is then right up to a bas-relief transformation, and the methods that resolve it apply. On a
+    ball, as on some other surfaces, the images do not determine the result; this is detected with
+    noise, but may not be without.
 
     Raises:
         InputError: Fewer than three views, ``seen`` or intrinsics that do not fit, fewer than 50
             squares inside the mask, or a second surface that explains the images.
 
-    Source: Papadhimitri & Favaro, CVPR 2013, for the idea; the cofactors' form, unit vectors and
-    the account of noise are ours.
+    Source: Papadhimitri & Favaro, CVPR 2013, for the idea; the cofactors' form, normalization and
+    the noise model are ours.
     """
     _check(images, mask, intrinsics, seen)
     with torch.no_grad():
@@ -176,14 +175,14 @@ def _between(
     rays = _rays(mask, intrinsics)[whole].mT
     (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
     rows = integrability_equations(b, fx * bu, skew * bu + fy * bv, rays)
-    spread = _noise_of_crosses(b, size_raster[whole], white @ white.mT)
+    noise_covariance = _noise_of_crosses(b, size_raster[whole], white @ white.mT)
     by_u, by_v = _by_derivatives(rays, intrinsics)
     weight = torch.ones_like(b[0])
     for _ in range(_REWEIGHTINGS):
-        cofactors, ratio = _least(rows, weight, spread, by_u, by_v)
+        cofactors, ratio = _least(rows, weight, noise_covariance, by_u, by_v)
         rotated_u, rotated_v = by_u @ cofactors, by_v @ cofactors
-        variance = torch.einsum("pi,pij,pj->p", rotated_u, spread, rotated_u)
-        variance = variance + torch.einsum("pi,pij,pj->p", rotated_v, spread, rotated_v)
+        variance = torch.einsum("pi,pij,pj->p", rotated_u, noise_covariance, rotated_u)
+        variance = variance + torch.einsum("pi,pij,pj->p", rotated_v, noise_covariance, rotated_v)
         weight = 1 / variance.clamp_min(1e-3 * variance.median())
         weight = weight / weight.mean()
     if ratio < _DISTINCT:
@@ -204,18 +203,18 @@ def _between(
 def _least(
     rows: Float[Tensor, "pixel 9"],
     weight: Float[Tensor, " pixel"],
-    spread: Float[Tensor, "pixel 3 3"],
+    noise_covariance: Float[Tensor, "pixel 3 3"],
     by_u: Float[Tensor, "pixel 3"],
     by_v: Float[Tensor, "pixel 3"],
 ) -> tuple[Float[Tensor, "3 3"], float]:
-    """Find the cofactors whose residual is least beside what noise makes it.
+    """Find the cofactors of minimum residual relative to that of noise.
 
     Returns:
-        The cofactors, and the second least ratio over the least.
+        The cofactors, and the second smallest ratio over the smallest.
     """
     both = by_u[:, :, None] * by_u[:, None] + by_v[:, :, None] * by_v[:, None]
     both = both * weight[:, None, None]
-    noise = torch.einsum("pij,pkl->ikjl", both, spread).reshape(9, 9)
+    noise = torch.einsum("pij,pkl->ikjl", both, noise_covariance).reshape(9, 9)
     root = torch.linalg.cholesky(noise + 1e-12 * noise.trace() * torch.eye(9).to(noise))
     moment = (weight[:, None] * rows).mT @ rows
     reduced = torch.linalg.solve_triangular(root, moment, upper=False)
@@ -230,8 +229,8 @@ def _noise_of_crosses(
 ) -> Float[Tensor, "pixel 3 3"]:
     """Give the covariance of the cross product of each vector with noise.
 
-    Noise of the images is even over the factors; whitened, it has the covariance given, and
-    making vectors unit divides it by their size.
+    Noise of the factors is white; after whitening it has the given covariance, and normalization
+    divides it by the vectors' length.
     """
     zero = torch.zeros_like(b[0])
     x, y, z = b
@@ -249,7 +248,7 @@ def _noise_of_crosses(
 def _by_derivatives(
     rays: Float[Tensor, "3 pixel"], intrinsics: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
-    """Give the weights with which noise of b_u and of b_v enters, for each row of P."""
+    """Give the coefficients of noise of b_u and of b_v, for each row of P."""
     (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
     x, y, _ = rays
     by_u = torch.stack([fx + 0 * x, skew + 0 * x, -x * fx - y * skew], dim=1)
@@ -260,7 +259,7 @@ def _by_derivatives(
 def _derivatives(
     raster: Float[Tensor, "channel height width"], radius: int
 ) -> tuple[Float[Tensor, "channel height width"], ...]:
-    """Fit a cubic to the square round each pixel: its value, and derivatives by column and row."""
+    """Fit a cubic to the square around each pixel; give its value and derivatives by u and v."""
     side = torch.arange(-radius, radius + 1).to(raster)
     v, u = torch.meshgrid(side, side, indexing="ij")
     powers = [(i, j) for i in range(4) for j in range(4 - i)]
@@ -291,7 +290,7 @@ def _check(
         )
     if seen is not None and seen.shape[1] != int(mask.sum()):
         raise InputError(
-            f"seen tells of {seen.shape[1]} pixels, and {int(mask.sum())} are inside the mask; "
+            f"seen has {seen.shape[1]} pixels, and {int(mask.sum())} are inside the mask; "
             "needed: one column a pixel."
         )
     last = intrinsics.new_tensor([0.0, 0, 1])

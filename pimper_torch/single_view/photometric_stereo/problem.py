@@ -1,4 +1,4 @@
-"""What methods of photometric stereo are given, and what they give back."""
+"""Input and output of the methods of photometric stereo."""
 
 from dataclasses import dataclass
 
@@ -13,18 +13,18 @@ from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Problem(Record):
-    """What methods are given: the pixels inside the mask, in raster order, in float64.
+    """Input of a method: the pixels inside the mask, in raster order, in float64.
 
     Attributes:
-        images: As they came, those views that have samples.
+        images: As given, those views that have samples.
         radiance: Linear; zero where missing.
         weight: 0 where missing.
-        mask: Where the pixels are.
+        mask: True at the pixels.
         lights: If known.
-        intrinsics: Of a camera near by; ``None`` for one far away.
+        intrinsics: Of a perspective camera; ``None`` for an orthographic one.
         generator: On the CPU.
-        robust: Whether shadows and highlights are to lose weight.
-        ambient: Whether pixels have a radiance of their own.
+        robust: Whether shadows and highlights lose weight.
+        ambient: Whether pixels have ambient radiance.
     """
 
     images: Float[Tensor, "view channel height width"]
@@ -45,15 +45,15 @@ class Problem(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Solution(Record):
-    """What methods give back.
+    """Output of a method.
 
     Attributes:
         normals: Unit or zero.
         albedo: Of each colour.
         lights: Of the views that have samples.
-        weight: What each sample was given in the end.
-        applied: What was chosen of the transformations that the method leaves free.
-        free: What is still free, in words.
+        weight: Final weight of each sample.
+        applied: The transformation that resolved the method's ambiguity, if any.
+        free: The remaining ambiguity, in words.
     """
 
     normals: Float[Tensor, "3 pixel"]
@@ -66,11 +66,11 @@ class Solution(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Surfaced(Record):
-    """A factorization that is a surface's, up to a bas-relief transformation.
+    """An integrable factorization, right up to a bas-relief transformation.
 
     Attributes:
         shading: Albedo times normal.
-        lights: That go with it.
+        lights: Of the same factorization.
         reliability: Of each pixel; 0 leaves it out.
         weight: Of each sample.
     """

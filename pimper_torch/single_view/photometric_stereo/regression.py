@@ -1,8 +1,8 @@
-r"""Radiance on known lights, pixel by pixel: plain least squares, and indifferent to outliers.
+r"""Regression of each pixel's radiance on known lights, by plain or robust least squares.
 
 A pixel's radiance under lights ``l`` is :math:`x_v = l_v^\top b`; the rows of the lights may
-be directions, harmonics, or the left factor of a factorization, of which only the product
-with ``b`` has a meaning.
+be directions, harmonics, or the left factor of a factorization, which is defined up to an
+invertible matrix.
 """
 
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ from pimper_torch.photometry.quadratics import PackedCholesky, diagonal, outer
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
 
-# Of the rounds of re-weighting: the scale starts this many times too wide and narrows to its own
-# value, so that a bad start does not decide which samples are outliers.
+# The scale of the weights starts at this multiple and is multiplied by the second per iteration,
+# down to 1: choices, so that the initial fit does not decide which samples are outliers.
 _WIDEST, _NARROWING = 4.0, 0.7
-# Residuals below this fraction of the brightness are never outliers: 8 bits have 4e-3 steps.
+# Minimum scale, as a fraction of the brightness: a choice, far below the 4e-3 of 8-bit steps.
 _MIN_SCALE = 1e-4
 
 Shadows = Literal["attached", "none"]
@@ -27,12 +27,12 @@ Shadows = Literal["attached", "none"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Regressed(Record):
-    """What a regression found.
+    """The result of a regression.
 
     Attributes:
-        shading: ``b`` of every pixel; zero where nothing was seen.
-        weight: What each sample was given in the end; 0 where it lies in shadow.
-        base: What every view of a pixel has in common besides ``l . b``; zero if not asked for.
+        shading: ``b`` of every pixel; zero without samples.
+        weight: Final weight of each sample; 0 where it lies in shadow.
+        base: Radiance besides ``l . b`` that is the same in all views; zero without ``base``.
     """
 
     shading: Float[Tensor, "unknown pixel"]
@@ -53,26 +53,26 @@ def regress(
     r"""Fit each pixel's shading vector to its radiance.
 
     Plain: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
-    weights, whose scale is 2.385 spreads of the residuals of all pixels together; a view whose
-    light would fall on the back (:math:`l_v^\top b \le 0`) says nothing, if shadows are
-    attached. The start trusts samples by their brightness, up to the pixel's median: shadows
-    are dark.
+    weights, whose scale is 2.385 robust deviations of the residuals of all pixels; with attached
+    shadows, a view whose light comes from behind (:math:`l_v^\top b \le 0`) has weight 0. The
+    initial fit weights samples by their brightness, up to the pixel's median: shadows are dark.
 
     Args:
-        radiance: Linear, gray. Samples without weight do not matter.
+        radiance: Linear, gray. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
         lights: One row a view.
-        robust: Whether to re-weight.
-        shadows: What a light from behind leaves: ``attached`` nothing, ``none`` less than nothing.
-        base: Whether radiance has a part that all views of a pixel share, such as ambient light.
-        iterations: Of re-weighting.
+        robust: Whether to reweight.
+        shadows: Of a light from behind: ``attached``, radiance is 0; ``none``, it is linear in
+            the light, and negative.
+        base: Whether radiance has a part that is the same in all views, such as ambient light.
+        iterations: Of reweighting.
 
     Returns:
-        In float64. A pixel with less to go on than it has unknowns takes one of its best fits;
-        see :func:`determined`. Constant to autograd.
+        In float64. An underdetermined pixel has one of its minima; see :func:`determined`.
+        Constant to autograd.
 
-    Source: Holland & Welsch 1977 for the weights; that they replace thresholds on shadows and
-    highlights is common practice since Ikehata et al., CVPR 2012.
+    Source: Holland & Welsch 1977 for the weights; robust weights in place of thresholds on
+    shadows and highlights are common practice since Ikehata et al., CVPR 2012.
     """
     with torch.no_grad():
         seen = weight > 0
@@ -82,10 +82,10 @@ def regress(
         if not robust:
             return _fit(x, given, torch.zeros_like(given), rows, base)
         found = _fit(x, given * brightness(x, seen, base), torch.zeros_like(given), rows, base)
-        for rotation in range(iterations):
+        for iteration in range(iterations):
             direct = rows @ found.shading
             reliability, lit = reweigh(
-                x - found.base, given, direct, max(1.0, _WIDEST * _NARROWING**rotation), shadows
+                x - found.base, given, direct, max(1.0, _WIDEST * _NARROWING**iteration), shadows
             )
             found = _fit(x, reliability * lit, reliability * ~lit, rows, base)
         return found
@@ -98,14 +98,14 @@ def reweigh(
     widen: float,
     shadows: Shadows,
 ) -> tuple[Float[Tensor, "view pixel"], Bool[Tensor, "view pixel"]]:
-    """Give samples the weights that their residuals deserve.
+    """Update the samples' weights by their residuals.
 
     Args:
-        radiance: What was seen.
-        weight: What was given.
-        predicted: What a fit expects, below zero for lights from behind.
-        widen: Times the scale.
-        shadows: Whether lights from behind leave darkness.
+        radiance: Observed.
+        weight: Given.
+        predicted: By a fit; below zero for lights from behind.
+        widen: Multiple of the scale.
+        shadows: Of lights from behind; see :func:`regress`.
 
     Returns:
         The weights, and whether a light comes from the front.
@@ -121,7 +121,7 @@ def reweigh(
 def brightness(
     radiance: Float[Tensor, "view pixel"], seen: Bool[Tensor, "view pixel"], base: bool = False
 ) -> Float[Tensor, "view pixel"]:
-    """Trust samples by their brightness, up to the median of the pixel."""
+    """Give weights proportional to brightness, up to the median of the pixel."""
     x = torch.where(seen, radiance, torch.nan)
     if base:
         x = x - x.nan_to_num(nan=torch.inf).amin(dim=0)
@@ -139,10 +139,10 @@ def determined(
     """Tell which pixels have as many samples as unknowns, and lights that span them.
 
     Args:
-        weight: Of the samples, as a regression left them.
+        weight: Of the samples, after a regression.
         lights: The scale of each column does not matter.
-        least: Variance of the best direction over that of the worst. Below 1e-4, noise of 1 %
-            in the images is as large as the answer.
+        least: Smallest eigenvalue of the normal equations over the largest. Below 1e-4, noise of
+            1 % in the images is as large as the solution.
 
     Returns:
         Enough samples with a tenth of the largest weight or more; lights that span.
@@ -168,7 +168,7 @@ def _fit(
     rows: Float[Tensor, "view unknown"],
     base: bool,
 ) -> Regressed:
-    """Solve the normal equations; samples in the dark inform the base only."""
+    """Solve the normal equations; samples in shadow constrain the base only."""
     if base:
         rows = torch.cat([rows, torch.ones_like(rows[:, :1])], dim=1)
     packed = outer(rows.mT) @ lit

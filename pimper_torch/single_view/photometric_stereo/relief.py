@@ -1,4 +1,4 @@
-r"""Of all bas-relief transformations of a surface, one to begin with."""
+r"""Conventions for the bas-relief transformation: upright and rounded, and convex."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,17 +12,17 @@ def rounded_relief(
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
 ) -> BasRelief:
-    r"""Give the transformation that makes a surface lean nowhere, and as deep as a ball.
+    r"""Give the transformation that makes a surface upright on average, and as deep as a ball.
 
     :math:`\sum w b_x b_z = \sum w b_y b_z = 0` and
     :math:`\sum w (b_x^2 + b_y^2) = \sum w b_z^2`, as on the image of a sphere of even albedo; of
-    the two signs of ``lambda`` the convex one, whose normals point outwards on the whole. It is
-    a choice, not a measurement: nothing in the data decides it.
+    the two signs of ``lambda`` the convex one, whose normals point outwards on average. It is
+    a convention: the data do not determine it.
 
     Args:
         shading: Of a surface, up to a bas-relief transformation, ``b_z < 0``, raster order.
         weight: Not negative.
-        mask: Where the pixels are.
+        mask: True at the pixels.
 
     Differentiable; degenerate for a plane, where ``lambda`` is 1.
     """
@@ -43,13 +43,13 @@ def convex(
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
 ) -> BasRelief:
-    """Choose between a transformation and its mirror image, which albedo and lights fit alike.
+    """Choose the convex one of a transformation and its mirror image, which fit equally well.
 
     Args:
         relief: Either of them.
-        shading: What it applies to, raster order.
+        shading: It is applied to this, raster order.
         weight: Not negative.
-        mask: Where the pixels are.
+        mask: True at the pixels.
     """
     mu, nu, lam = (part.to(shading) for part in (relief.mu, relief.nu, relief.lam))
     found = BasRelief(mu=mu, nu=nu, lam=lam)
@@ -62,15 +62,15 @@ def bulge(
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
 ) -> Float[Tensor, ""]:
-    """Tell whether normals point outwards on the whole (1) or inwards (-1).
+    """Tell whether normals point outwards on average (1) or inwards (-1).
 
     Args:
-        sideways: The parts of shading along x and y, free of leaning.
+        sideways: The parts of shading along x and y, uncorrelated with z.
         weight: Not negative.
-        mask: Where the pixels are.
+        mask: True at the pixels.
     """
     rows, columns = torch.nonzero(mask, as_tuple=True)
-    place = torch.stack([columns, rows]).to(sideways)
+    position = torch.stack([columns, rows]).to(sideways)
     total = weight.sum().clamp_min(torch.finfo(sideways.dtype).tiny)
-    place = place - (weight * place).sum(dim=1, keepdim=True) / total
-    return torch.where((weight * place * sideways).sum() < 0, -1.0, 1.0).to(sideways)
+    position = position - (weight * position).sum(dim=1, keepdim=True) / total
+    return torch.where((weight * position * sideways).sum() < 0, -1.0, 1.0).to(sideways)

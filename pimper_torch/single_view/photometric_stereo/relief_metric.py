@@ -8,7 +8,7 @@ its square :math:`b^\top M b` is linear in the four entries that ``M`` has:
           = \begin{pmatrix} m_0 & 0 & m_1 \\ 0 & m_0 & m_2 \\ m_1 & m_2 & m_3 \end{pmatrix}.
 
 ``M`` is the same for ``G`` and for ``G`` with hills turned into valleys (all of lambda, mu and
-nu negated): nothing that only measures albedo, or angles, can tell the two apart.
+nu negated): albedos and angles do not distinguish the two.
 
 Source: Belhumeur, Kriegman & Yuille, IJCV 35(1), 1999, for ``G``; the rest follows.
 """
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
-# Squares of parallel vectors in float32 differ by about this fraction.
+# Relative rounding of squares of parallel vectors in float32.
 _FLAT = 1e-12
 
 
@@ -32,8 +32,7 @@ def metric_row(shading: Float[Tensor, "3 pixel"]) -> Float[Tensor, "pixel 4"]:
 def relief_of_metric(metric: Float[Tensor, "*batch 4"]) -> BasRelief:
     """Give the transformation, with lambda above zero, that a metric belongs to.
 
-    Entries may have any common factor; where they are no metric, all three of the result are
-    not a number.
+    Entries may have any common factor; where they are no metric, the result is NaN.
     """
     metric = metric * metric[..., :1].sign()
     m0, m1, m2, m3 = metric.unbind(dim=-1)
@@ -45,18 +44,18 @@ def relief_of_metric(metric: Float[Tensor, "*batch 4"]) -> BasRelief:
 
 
 def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
-    r"""Find the transformation to the form all bas-reliefs of a surface share.
+    r"""Find the transformation to a canonical form, the same for all bas-reliefs of a surface.
 
     After it :math:`\sum x z = \sum y z = 0` and :math:`\sum x^2 + y^2 = \sum z^2`: the surface
-    faces the viewer on the whole, and normals lean by 45 degrees in the mean. What starts from
-    here gives one answer whichever relief it was handed. Lambda is above zero.
+    faces the viewer on average, at a mean tilt of 45 degrees. Methods that start here do not
+    depend on the transformation they were given. Lambda is above zero.
 
-    Not a number where all normals are parallel. Differentiable.
+    NaN where all normals are parallel. Differentiable.
     """
     x, y, z = shading.double()
     depth = (z * z).sum()
-    lean_x, lean_y = (x * z).sum() / depth, (y * z).sum() / depth
-    slant = (x - lean_x * z).square().sum() + (y - lean_y * z).square().sum()
+    tilt_x, tilt_y = (x * z).sum() / depth, (y * z).sum() / depth
+    slant = (x - tilt_x * z).square().sum() + (y - tilt_y * z).square().sum()
     curved = slant > _FLAT * (depth + (x * x + y * y).sum())
     lam = (depth / torch.where(curved, slant, torch.nan)).sqrt()
-    return BasRelief(mu=lam * lean_x, nu=lam * lean_y, lam=lam)
+    return BasRelief(mu=lam * tilt_x, nu=lam * tilt_y, lam=lam)

@@ -1,9 +1,9 @@
-r"""Photometric stereo under light of any kind: photographs as four or nine harmonics.
+r"""Photometric stereo under general, unknown lighting, by four or nine spherical harmonics.
 
 A convex Lambertian surface under distant light reflects, to first order,
-:math:`\rho\, l^\top (1, n)`, and to second order nine harmonics of the normal. Four dimensions
-hold a constraint that three do not: shading vectors lie on a cone, so a factorization is unique
-up to a scaled Lorentz transformation before integrability is asked.
+:math:`\rho\, l^\top (1, n)`, and to second order nine harmonics of the normal. Shading vectors of
+four dimensions lie on a cone, so that a factorization is unique up to a scaled Lorentz
+transformation even without integrability.
 
 Source: Basri, Jacobs & Kemelmacher, Photometric stereo with general, unknown lighting, IJCV
 72(3), 2007.
@@ -26,34 +26,35 @@ from pimper_torch.single_view.photometric_stereo.integrability import (
     both_ways,
     curls,
     moments,
-    reweighed,
+    reweighted,
     wedge,
 )
 from pimper_torch.single_view.photometric_stereo.regression import regress
 from pimper_torch.single_view.photometric_stereo.relief import bulge
 
-# Random Lorentz transformations from which the integrable one is looked for: boosts of this
-# rapidity from where the mean of all shading vectors has no direction.
+# Random Lorentz transformations from which the search for the integrable one starts, and the
+# rapidity of their boosts from the rest frame of the mean shading vector: choices.
 _STARTS, _RAPIDITY = 48, 1.0
-# Boosts without end make all normals the same, and every field of one normal is integrable. The
-# mean normal of a visible half ball has a Lorentz factor of 1.3, of normals within 20 degrees 6.
+# Scale of the penalty on boosts: an unbounded boost makes all normals equal, which is integrable.
+# The mean normal of a visible half ball has a Lorentz factor of 1.3, of normals within 20 degrees
+# 6.
 _LORENTZ_FACTOR = 6.0
 _STEPS, _ITERATIONS = 40, 5
 _NUDGE = 1e-6  # of forward differences in float64
-_MIN_GAIN = 1e-6  # a step that gains less of the misfit is the last
+_MIN_GAIN = 1e-6  # relative decrease of the residual at convergence
 _MAX_PIXELS = 1000  # for the map from nine dimensions to normals, which has 27 numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Harmonic(Record):
-    """Photographs explained by harmonics.
+    """Shading and lights of a factorization by harmonics.
 
     Attributes:
         shading: ``rho (1, n)`` of the pixels inside the mask, raster order, on the cone.
         lights: Of four or nine harmonics; see :func:`nine_harmonics`.
-        weight: What each sample was given in the end.
-        ambiguity: The Lorentz transformation that integrability chose, after the cone.
-        curl: What is left of the equations of integrability; 0 is a surface.
+        weight: Final weight of each sample.
+        ambiguity: The Lorentz transformation found by integrability, after the cone.
+        curl: Relative residual of integrability; 0 for a surface.
     """
 
     shading: Float[Tensor, "4 pixel"]
@@ -73,19 +74,18 @@ def four_harmonic_stereo(
 ) -> Harmonic:
     """Recover shading and lights from photographs under first-order light; convex.
 
-    Rank-four factorization, the quadric through the shading vectors for the cone, and of the
-    Lorentz transformations left the one whose normals are those of a surface: as boosts mix
-    albedo into the normals, and of rotations bas-relief knows none, only convex or concave
-    remains, and one factor between albedo and light.
+    Rank-four factorization, the quadric through the shading vectors for the cone, and the Lorentz
+    transformation under which normals are integrable: the remaining ambiguity is convex or
+    concave, and one factor between albedo and light.
 
-    The paper solves integrability for the rows of the matrix linearly and repairs them; here
-    the same equations are minimised within the Lorentz group from many starts, which keeps
+    The paper solves integrability for the rows of the matrix linearly and projects them; here
+    the same equations are minimized within the Lorentz group from many starts, which keeps
     the cone.
 
     Args:
         radiance: Linear, gray, of the pixels inside the mask in raster order.
         weight: Not negative; 0 where missing.
-        mask: Where the pixels are.
+        mask: True at the pixels.
         generator: Of the starts; on the CPU.
         robust: Whether what harmonics do not explain loses weight: highlights, but also what
             point lights leave in attached shadow, so leave it for soft light.
@@ -93,10 +93,10 @@ def four_harmonic_stereo(
     Raises:
         InputError: Fewer than four views, or too few pixels for integrability.
 
-    Fails where shadows are cast, which no harmonics of the normal make; where all lights come
-    from a narrow cone, as point lights without shadows are of rank three and leave the quadric
-    free; and for a surface of revolution seen along its axis, where boosts along the axis are
-    integrable too. Constant to autograd.
+    Fails with cast shadows, which are not functions of the normal; where all lights come
+    from a narrow cone, as point lights without shadows are of rank three and do not determine
+    the quadric; and for a surface of revolution seen along its axis, where boosts along the axis
+    are integrable, too. Constant to autograd.
     """
     with torch.no_grad():
         found = factorize_photographs(radiance, weight, 4, robust=robust, shadows="none")
@@ -104,7 +104,7 @@ def four_harmonic_stereo(
         reliability = reliability / reliability.amax()
         upgraded = upgrade_to_cone(found.lights[None], found.shading[None], reliability[None])
         L, S = upgraded.lights[0], upgraded.shading[0]
-        applied, curl = _upright(S, reliability, mask, torch.linalg.inv(L.mT @ L), generator)
+        applied, curl = _resolved(S, reliability, mask, torch.linalg.inv(L.mT @ L), generator)
         on_cone = project_to_cone(applied.on_shading(S).mT).mT
         return Harmonic(
             shading=on_cone,
@@ -126,13 +126,13 @@ def nine_harmonic_stereo(
     r"""Refine the first-order solution by light of second order; convex.
 
     In the nine dimensions of a factorization the normals are a linear map of it, 3 x 9. The map
-    is regressed on the first-order solution and moved until the nine harmonics of its normals
-    explain the factorization best. Lorentz transformations are free again: the nine harmonics
-    are the quadratic forms of :math:`k = (1, n)` on the cone, so :math:`n \to n'` with
-    :math:`\Lambda k = t (1, n')` and :math:`\rho \to t^2 \rho` leaves their span. Integrability
-    chooses among them as for four. That the map is found by Gauss-Newton on the misfit, the
-    mixing matrix of 9 x 9 eliminated, is our reading of how the paper ties the nine dimensions
-    together; that the freedom is Lorentz again is our observation, pinned by a test.
+    is regressed on the first-order solution and refined until the nine harmonics of its normals
+    best fit the factorization. The ambiguity is again Lorentz: the nine harmonics are the
+    quadratic forms of :math:`k = (1, n)` on the cone, so :math:`n \to n'` with
+    :math:`\Lambda k = t (1, n')` and :math:`\rho \to t^2 \rho` preserves their span.
+    Integrability resolves it as for four. The paper does not say how the map is found; here it
+    is by Gauss-Newton on the residual, the mixing matrix of 9 x 9 eliminated. That the ambiguity
+    is Lorentz is our observation, checked by a test.
 
     Args:
         radiance: As in :func:`four_harmonic_stereo`.
@@ -162,7 +162,7 @@ def nine_harmonic_stereo(
         noise = torch.zeros(4, 4).to(linear)
         noise[1:, 1:] = linear @ linear.mT
         noise[0, 0] = noise.trace() / 3
-        applied, curl = _upright(cone, reliability, mask, noise, generator)
+        applied, curl = _resolved(cone, reliability, mask, noise, generator)
         moved = applied.on_shading(cone)
         normal = split_shading(project_to_cone(moved.mT))[1].mT
         # From rho (1, n) to t rho (1, n'), and then to t^2 rho.
@@ -187,7 +187,7 @@ def nine_harmonic_stereo(
 def _explain(
     linear: Float[Tensor, "3 9"], S: Float[Tensor, "9 pixel"], weight: Float[Tensor, " pixel"]
 ) -> Float[Tensor, "3 9"]:
-    """Move the map to normals until their harmonics explain the factorization best."""
+    """Refine the map to normals until their harmonics best fit the factorization."""
     root = weight.sqrt()
 
     def misfit(flat: Float[Tensor, " entry"]) -> Float[Tensor, " residual"]:
@@ -195,7 +195,7 @@ def _explain(
         albedo = vector.norm(dim=0)
         normal = vector / torch.where(albedo > 0, albedo, 1)
         basis = root * albedo * second_order(normal.mT).mT
-        # An orthonormal basis of the rows: what of S is not in it is the misfit.
+        # An orthonormal basis of the rows: the part of S outside their span is the residual.
         rows = torch.linalg.qr(basis.mT).Q
         heavy = root * S
         return (heavy - (heavy @ rows) @ rows.mT).flatten()
@@ -220,18 +220,18 @@ def _explain(
     return at.reshape(3, 9) * linear.norm()
 
 
-def _upright(
+def _resolved(
     cone: Float[Tensor, "4 pixel"],
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
     noise: Float[Tensor, "4 4"],
     generator: torch.Generator,
 ) -> tuple[Ambiguity, float]:
-    """Find the Lorentz transformation after which normals are a convex surface's."""
+    """Find the Lorentz transformation after which normals are those of a convex surface."""
     mean = (weight * cone).sum(dim=1)
     matrix, curl = _surface(curls(cone, weight, mask, noise), mean, generator)
     signs = torch.ones(4).to(matrix)
-    # Slopes may change their sign with n_z, or with n_x and n_y: integrability cannot tell.
+    # Integrability does not determine the sign of n_z, nor the common one of n_x and n_y.
     signs[3] = torch.where((weight * (matrix @ cone)[3].sign()).sum() > 0, -1.0, 1.0)
     signs[1:3] = bulge((matrix @ cone)[1:3], weight, mask)
     return Ambiguity(matrix=signs[:, None] * matrix), curl
@@ -251,33 +251,33 @@ def _surface(
     drawn[:, :3] *= _RAPIDITY
     drawn[:, 3:] *= 2.0  # rotations of any angle
     drawn[0] = 0
-    static_background = lorentz(drawn).to(mean) @ _to_rest(mean)
-    matrix = torch.cat([torch.eye(4).to(mean)[None], static_background])
-    weighed = equations
+    boosted = lorentz(drawn).to(mean) @ _rest_frame_boost(mean)
+    matrix = torch.cat([torch.eye(4).to(mean)[None], boosted])
+    reweighted_equations = equations
     metric = both_ways(equations.noise)
-    for rotation in range(_ITERATIONS):
-        full, terms = moments(weighed)
+    for iteration in range(_ITERATIONS):
+        full, terms = moments(reweighted_equations)
         values, vectors = torch.linalg.eigh(full)
         root = values.clamp_min(0).sqrt()[:, None] * vectors.mT
         matrix, cost = _descend(matrix, root, metric, mean)
         best = int(cost.argmin())
         solution = _bivectors(matrix[best])
-        weighed = equations.replace(weight=reweighed(equations, solution))
-        if rotation == 0:
+        reweighted_equations = equations.replace(weight=reweighted(equations, solution))
+        if iteration == 0:
             matrix = matrix[cost.argsort()[:4]]
             best = 0
     fraction = (solution @ full @ solution) / (solution @ terms @ solution)
     return matrix[best], float(fraction.clamp_min(0).sqrt())
 
 
-def _to_rest(vector: Float[Tensor, " 4"]) -> Float[Tensor, "4 4"]:
-    """Give the boost after which a vector inside the cone has no space part; else nothing."""
+def _rest_frame_boost(vector: Float[Tensor, " 4"]) -> Float[Tensor, "4 4"]:
+    """Give the boost to a vector's rest frame; the identity for vectors outside the cone."""
     length = vector[1:].norm()
     if not bool((length > 0) & (length < vector[0])):
         return torch.eye(4).to(vector)
     rapidity = torch.atanh(length / vector[0])
-    still = torch.zeros_like(vector[1:])
-    return lorentz(torch.cat([-rapidity * vector[1:] / length, still]))
+    zero = torch.zeros_like(vector[1:])
+    return lorentz(torch.cat([-rapidity * vector[1:] / length, zero]))
 
 
 def _descend(
@@ -315,7 +315,7 @@ def _residual(
     metric: Float[Tensor, "both both"],
     mean: Float[Tensor, " 4"],
 ) -> Float[Tensor, "*batch row"]:
-    """Give the equations' sums in units of what noise would make of them, dearer with boosts."""
+    """Give the equations' residuals in units of noise, with a penalty on boosts."""
     both = _bivectors(matrix)
     noise = ((both @ metric) * both).sum(dim=-1, keepdim=True)
     moved = matrix @ mean

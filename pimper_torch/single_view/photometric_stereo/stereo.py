@@ -1,4 +1,4 @@
-"""One call for every method of photometric stereo from one viewpoint."""
+"""Photometric stereo from one viewpoint, by any of the methods."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -18,13 +18,13 @@ from pimper_torch.single_view.photometric_stereo.visibility_subspaces import vis
 
 
 class Finding(IntEnum):
-    """What became of a pixel."""
+    """The status of a pixel."""
 
     FOUND = 0
     OUTSIDE = 1  # of the mask
     TOO_FEW = 2  # samples with weight, for the unknowns of the method
-    FLAT = 3  # the lights that reach it lie in a plane, so that its normal is free across it
-    BLACK = 4  # no light comes from it
+    FLAT = 3  # the lights that reach it lie in a plane, and do not determine its normal
+    BLACK = 4  # its radiance is zero
     AVERTED = 5  # its normal does not face the viewer
 
 
@@ -34,16 +34,16 @@ class PhotometricStereo(Record):
 
     Attributes:
         normals: Unit, camera frame: x right, y down, z forward, ``n_z < 0`` where valid. Where
-            not valid, the best guess there is, or zero.
+            not valid, an estimate or zero.
         albedo: Of each colour, not negative. With unknown lights up to one factor, such that
             lights have the median length 1.
-        lights: One row a view: towards the point light, as long as it is strong; or four or nine
+        lights: One row a view: direction to the point light times its irradiance; or four or nine
             harmonics. Zero for a view without samples.
-        lit: True where a sample agrees with the result: seen, in no shadow, no highlight.
+        lit: True where a sample is an inlier: seen, in no shadow, no highlight.
         valid: Where the normal is determined and faces the viewer.
         finding: A :class:`Finding` for each pixel.
-        applied: What was chosen of the transformations that the method leaves free.
-        free: What is still free, in words.
+        applied: The transformation that resolved the method's ambiguity, if any.
+        free: The remaining ambiguity, in words.
         unused_views: Without any sample.
     """
 
@@ -74,48 +74,45 @@ def photometric_stereo(
 ) -> PhotometricStereo:
     """Recover normals and albedo from photographs of one viewpoint under changing light.
 
-    ========================  ============================================  =================
-    method                    light                                         left free
-    ========================  ============================================  =================
-    ``calibrated``            point lights, known                                  nothing
-    ``hayakawa``              point lights of one strength, or pixels of one       convex or concave
-                              albedo (``resolve``)
-    ``integrability``         point lights                                         bas-relief,
-    chosen
-                                                                            by ``resolve``
-    ``perspective``           point lights, camera near by (``intrinsics``)        nothing
-    ``four_harmonics``        any, from all sides of the viewer, without    convex or concave
-                              cast shadows
-    ``nine_harmonics``        the same, more exactly                        convex or concave
-    ========================  ============================================  =================
+    ==================  ==========================================  =================
+    method              light                                       ambiguity
+    ==================  ==========================================  =================
+    ``calibrated``      known point lights                          none
+    ``hayakawa``        point lights of one strength, or pixels     convex or concave
+                        of one albedo (``resolve``)
+    ``integrability``   point lights                                bas-relief,
+                                                                    by ``resolve``
+    ``perspective``     point lights, pinhole (``intrinsics``)      none
+    ``four_harmonics``  any, around the viewer, no cast shadows     convex or concave
+    ``nine_harmonics``  the same, to second order                   convex or concave
+    ==================  ==========================================  =================
 
-    Convex is chosen. ``resolve`` is ``rounded`` (a convention: leans nowhere, as deep as a
+    Convex is chosen. ``resolve`` is ``rounded`` (a convention: upright on average, as deep as a
     ball), ``equal_albedo``, ``equal_strength``, ``albedo_entropy`` (few albedos),
     ``colour_profiles`` (paints of different hue) or ``diffuse_maxima``.
 
     Args:
-        images: Linear radiance from one viewpoint far away. NaN inside the mask is missing.
+        images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
         mask: True on the object; of the size of the images.
         method: See the table.
         resolve: For ``integrability`` by default ``albedo_entropy``, for ``hayakawa`` by default
             ``equal_strength``; others have nothing to resolve.
-        lights: For ``calibrated``, one a view: towards the point light, as long as it is strong,
+        lights: For ``calibrated``, one a view: direction to the point light times its irradiance,
             camera frame.
-        intrinsics: ``K``, for methods of a camera near by; others take it to be far away.
+        intrinsics: ``K``, for ``perspective``; the other methods are orthographic.
         weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
             known to be in shadow.
         generator: On the CPU; for harmonics and subspaces, by default with the seed 0.
         robust: Whether shadows and highlights lose weight; by default with point lights, but not
             with harmonics, which explain attached shadows.
-        subspaces: Whether shadows are found first, as visibility subspaces (see
-            :mod:`.visibility_subspaces`), and left out. For point lights
-            whose shadows are black.
-        ambient: For ``calibrated``: whether each pixel has a radiance of its own.
+        subspaces: Whether shadows are found first, by :mod:`.visibility_subspaces`, and left out.
+            For point lights whose shadows are black.
+        ambient: For ``calibrated``: whether pixels have ambient radiance.
 
     Raises:
-        InputError: Unknown names, shapes that disagree, an empty mask, fewer views with samples
-            than unknowns, lights that are missing, not needed or in a plane; or what the
-            method itself refuses.
+        InputError: Unknown names, shapes that do not match, an empty mask, fewer views with
+            samples than unknowns, lights that are missing, not needed or in a plane; or input
+            that the method refuses.
 
     >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
     >>> images = torch.tensor([1.0, 0.8, 0.8]).reshape(3, 1, 1, 1)
@@ -163,7 +160,7 @@ def photometric_stereo(
 def _spread_out(
     found: Solution, given: Problem, used: Bool[Tensor, " view"], like: Tensor
 ) -> PhotometricStereo:
-    """Put pixels back on the raster and views back in their places."""
+    """Scatter pixels to the raster, and views with samples to all views."""
     mask = given.mask
     rows = found.lights
     if given.ambient:
@@ -176,7 +173,7 @@ def _spread_out(
         (~spanned, Finding.FLAT),
         (~enough, Finding.TOO_FEW),
     ]
-    for wrong, name in checks:  # the last one that applies is the one to tell
+    for wrong, name in checks:  # the last one that applies is reported
         finding = torch.where(wrong, int(name), finding)
     raster = torch.full(mask.shape, int(Finding.OUTSIDE), device=mask.device)
     raster[mask] = finding
@@ -243,11 +240,11 @@ def _refuse_settings(
     if not method.calibrated and lights is not None:
         raise InputError(f"{name}: finds the lights itself. Leave them out, or use calibrated.")
     if not method.calibrated and ambient:
-        raise InputError(f"{name}: cannot tell ambient light. Leave it out, or use calibrated.")
+        raise InputError(f"{name}: cannot find ambient light. Leave it out, or use calibrated.")
     if method.perspective and intrinsics is None:
         raise InputError(f"{name}: there are no intrinsics; needed: those of the camera.")
     if not method.perspective and intrinsics is not None:
-        raise InputError(f"{name}: takes the camera to be far away. Leave intrinsics out.")
+        raise InputError(f"{name}: is orthographic. Leave intrinsics out.")
     if resolve is not None and resolve not in method.resolvers:
         raise InputError(
             f"{name}: resolve is {resolve!r}; needed: {', '.join(method.resolvers) or 'none'}."

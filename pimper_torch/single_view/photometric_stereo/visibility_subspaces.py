@@ -1,9 +1,8 @@
-r"""Which point lights light which pixels, told by the subspaces that pixels lie in.
+r"""Visibility of point lights at pixels, by subspace clustering.
 
-Pixels lit by the same point lights have brightness :math:`V L b`, with V the diagonal of ones and
-zeros of those point lights: they lie in one subspace of three dimensions, which has zeros for the
-point lights in shadow. Each set of point lights has its own, and random samples find those that
-many pixels share.
+Pixels lit by the same point lights have brightness :math:`V L b`, with V the diagonal matrix of
+their visibility: they lie in one subspace of three dimensions, which is zero for the point lights
+in shadow. Each set of point lights has its own; random samples find those of many pixels.
 
 Source: Sunkavalli, Zickler & Pfister, Visibility subspaces: uncalibrated photometric stereo with
 shadows, ECCV 2010.
@@ -19,26 +18,26 @@ from pimper_torch.errors import InputError
 from pimper_torch.photometry.quadratics import outer, solve_packed
 from pimper_torch.records import Record
 
-# Triples of pixels tried for each subspace, and how far apart their pixels are.
+# Triples of pixels tried for each subspace, and the distance of their pixels: choices.
 _TRIALS, _NEIGHBOURHOOD = 300, 4
-# Pixels on which triples are compared.
+# Pixels on which triples are compared: a choice.
 _COMPARED = 3000
-# A pixel lies in a subspace if its distance is below this many times what noise makes it.
+# Maximum distance of a pixel from its subspace, in that of noise: a choice.
 _TOLERANCE = 1.5
-# A value departs from its prediction, or from zero, by more than this many deviations.
+# Standard deviations from its prediction, or from zero, that are significant: a choice.
 _DEVIATIONS = 3.0
 _REFITS, _RECLASSIFICATIONS = 4, 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class VisibilitySubspaces(Record):
-    """What the subspaces of a scene tell.
+    """Visibility and lights from the subspaces of a scene.
 
     Attributes:
         lit: Whether a point light lights a pixel.
-        lights: Up to an invertible 3 x 3 matrix, orthonormal columns: where a factorization with
-            shadows masked may start. Zero for point lights that no subspace sees.
-        subspace: The one that each pixel lies in, largest first; -1 for none.
+        lights: Up to an invertible 3 x 3 matrix, orthonormal columns: initial values for a
+            factorization with shadows masked. Zero for point lights that no subspace sees.
+        subspace: Index of each pixel's subspace, largest first; -1 for none.
         visibility: Point lights by subspaces.
     """
 
@@ -68,40 +67,40 @@ def find_subspaces(
     smallest: float = 0.01,
     most: int = 30,
 ) -> VisibilitySubspaces:
-    r"""Find the subspaces of pixels lit by the same point lights, and what they tell of all pixels.
+    r"""Find the subspaces of pixels lit by the same point lights, and the visibility of all pixels.
 
-    Triples of neighbouring pixels, which mostly share their point lights, propose subspaces; the
-    one with the most pixels is refitted to them, taken out, and the search goes on. Bases
-    :math:`Q_k`, orthonormal and zero where point lights are out, are :math:`V_k L` up to a matrix
-    each. Lights that all agree with are the three least eigenvectors of
+    Triples of neighbouring pixels, which mostly have the same visibility, propose subspaces; the
+    one with the most inliers is refitted to them and removed, and the search goes on. Bases
+    :math:`Q_k`, orthonormal and zero at point lights in shadow, are :math:`V_k L` up to a matrix
+    each. The common lights are the three least eigenvectors of
 
     .. math:: \sum_k m_k (V_k - Q_k Q_k^\top)
 
     for :math:`m_k` pixels. With them each pixel is fitted to the views of its subspace, or to its
-    brightest ones if it has none, then to those that its fit explains, the lights following.
+    brightest ones if it has none; then inliers and lights are updated in turn.
 
     Args:
         images: Linear radiance without ambient light; channels are added.
-        mask: Pixels that count, in raster order.
+        mask: Pixels to use, in raster order.
         generator: On the CPU.
         noise: Standard deviation of a value, as a fraction of the brightest.
         smallest: Fraction of the pixels that a subspace must hold.
         most: Subspaces.
 
     Returns:
-        Lit or not, with subspaces and lights. A value that does not fit, because it is too dark,
-        too bright or near zero, counts as not lit, and so do all of a pixel of which fewer than
-        four fit. Constant to autograd.
+        Visibility, subspaces and lights. An outlier, too dark, too bright or near zero, counts as
+        not lit, and so do all values of a pixel with fewer than four inliers. Constant to
+        autograd.
 
     Fails where every pixel has its own set of point lights, where point lights have no subspace in
-    common, and where indirect light keeps shadows brighter than noise: a whole subspace is then
-    taken for lit.
+    common, and where indirect light keeps shadows brighter than noise: all of a subspace then
+    counts as lit.
 
     Raises:
         InputError: Fewer than four views, noise that is not above zero, or no subspace found.
 
     Source: Sunkavalli, Zickler & Pfister, ECCV 2010, for subspaces and their search; the
-    eigenvalue problem for the lights, and that every value is judged by itself, are our reading.
+    eigenvalue problem for the lights, and the classification of single values, are ours.
     """
     if len(images) < 4 or noise <= 0:
         raise InputError(
@@ -112,15 +111,15 @@ def find_subspaces(
         values = images.double().sum(dim=1)[:, mask]
         deviation = noise * float(values.max())
         row, column = mask.nonzero().mT
-        place = torch.full_like(mask, -1, dtype=torch.int64)
-        place[mask] = torch.arange(values.shape[1], device=mask.device)
+        position = torch.full_like(mask, -1, dtype=torch.int64)
+        position[mask] = torch.arange(values.shape[1], device=mask.device)
         subspace = torch.full_like(row, -1)
         bases, visible, counts = list[Tensor](), list[Tensor](), list[float]()
         fewest = max(8, int(smallest * values.shape[1]))
         bright = values.norm(dim=0) > _DEVIATIONS * deviation * len(values) ** 0.5
         while len(bases) < most:
             free = bright & (subspace < 0)
-            triples = _triples(free, row, column, place, generator)
+            triples = _triples(free, row, column, position, generator)
             found = _largest(values, free, triples, deviation)
             if found is None or int(found[1].sum()) < fewest:
                 break
@@ -132,7 +131,7 @@ def find_subspaces(
                 visible.append(lit)
                 counts.append(float(inside.sum()))
             else:
-                subspace[inside] = -2  # seen, and of no use
+                subspace[inside] = -2  # found, but lit by fewer than four point lights
         if not bases:
             raise InputError(
                 f"no {fewest} of {values.shape[1]} pixels lie in one subspace; needed: a matt "
@@ -157,7 +156,7 @@ def _triples(
     free: Bool[Tensor, " pixel"],
     row: Int[Tensor, " pixel"],
     column: Int[Tensor, " pixel"],
-    place: Int[Tensor, "height width"],
+    position: Int[Tensor, "height width"],
     generator: torch.Generator,
 ) -> Int[Tensor, "triple 3"]:
     """Draw neighbouring pixels that are in no subspace yet."""
@@ -169,10 +168,10 @@ def _triples(
     side = 2 * _NEIGHBOURHOOD + 1
     offset = torch.randint(side, (2, 2, draws), generator=generator) - _NEIGHBOURHOOD
     offset = offset.to(pool.device)
-    height, width = place.shape
+    height, width = position.shape
     y = (row[first] + offset[0]).clamp(0, height - 1)
     x = (column[first] + offset[1]).clamp(0, width - 1)
-    other = place[y, x]
+    other = position[y, x]
     usable = (other >= 0).all(dim=0) & free[other.clamp_min(0)].all(dim=0)
     return torch.cat([first[None], other])[:, usable][:, :_TRIALS].mT
 
@@ -183,13 +182,13 @@ def _largest(
     triples: Int[Tensor, "triple 3"],
     deviation: float,
 ) -> tuple[Float[Tensor, "view 3"], Bool[Tensor, " pixel"]] | None:
-    """Take the subspace of the triple that most free pixels lie in, refitted to them."""
+    """Give the triple's subspace with the most inliers among free pixels, refitted to them."""
     if len(triples) == 0:
         return None
     views = len(values)
     proposed = values[:, triples].permute(1, 0, 2)
     basis, triangle = torch.linalg.qr(proposed)
-    # Pixels of nearly one direction span a subspace that noise chose.
+    # Nearly parallel pixels span a subspace of noise.
     sound = triangle.diagonal(dim1=1, dim2=2).abs().amin(dim=1) > 4 * deviation
     basis = basis[sound]
     if len(basis) == 0:
@@ -198,7 +197,7 @@ def _largest(
     some = pool[:, :: max(1, -(-pool.shape[1] // _COMPARED))]
     limit = (_TOLERANCE * deviation) ** 2 * (views - 3)
     off = some.square().sum(dim=0) - (basis.mT @ some).square().sum(dim=1)
-    # The triple's own noise adds to that of the pixel.
+    # The triple's noise adds to that of the pixel.
     votes = (off < 4 * limit).sum(dim=1)
     best = basis[int(votes.argmax())]
     inside = free.clone()
@@ -220,7 +219,7 @@ def _common_lights(
     visibility: Bool[Tensor, "view subspace"],
     counts: Float[Tensor, " subspace"],
 ) -> tuple[Float[Tensor, "view 3"], Bool[Tensor, " view"]]:
-    """Find the lights whose parts lie in all subspaces, and which views have one."""
+    """Find the lights common to all subspaces, and which views have one."""
     total = bases[0].new_zeros(len(visibility), len(visibility))
     for basis, lit, count in zip(bases, visibility.mT, counts, strict=True):
         total = total + count * (torch.diag(lit.to(basis)) - basis @ basis.mT)
@@ -238,9 +237,9 @@ def _explained(
     start: Bool[Tensor, "view pixel"],
     deviation: float,
 ) -> tuple[Bool[Tensor, "view pixel"], Float[Tensor, "view 3"]]:
-    """Tell which values of each pixel one vector explains, lights being fitted in turn.
+    """Give the inliers of each pixel's fit, updating the lights in turn.
 
-    Views that no subspace covers have no lights; there what is not dark counts as lit.
+    Views that no subspace covers have no lights; there values that are not dark count as lit.
     """
     known, L = values[covered], lights[covered]
     lit = start[covered] & (known > _DEVIATIONS * deviation)
@@ -249,7 +248,7 @@ def _explained(
         predicted = L @ vectors
         fits = (known - predicted).abs() < _DEVIATIONS * deviation
         lit = fits & (predicted > _DEVIATIONS * deviation)
-        # Three values are always explained.
+        # Three values always fit.
         lit = lit & (lit.sum(dim=0) >= 4)
         L = torch.linalg.qr(_fitted(vectors.mT, known.mT, lit.mT).mT).Q
     found = values > _DEVIATIONS * deviation

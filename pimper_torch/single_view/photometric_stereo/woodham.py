@@ -1,7 +1,7 @@
-r"""Photometric stereo under known lights, the reference for every method that lacks them.
+r"""Calibrated photometric stereo: normals and albedo under known point lights.
 
-:math:`x_{vc} = \rho_c\, l_v^\top n + a_c`: one normal for all colours, an albedo for each, and, if
-asked for, a part ``a`` that does not depend on the point light.
+:math:`x_{vc} = \rho_c\, l_v^\top n + a_c`: one normal for all colours, an albedo for each, and
+optionally ambient radiance ``a``.
 
 Source: Woodham, Photometric method for determining surface orientation from multiple images,
 Optical Engineering 19(1), 1980.
@@ -20,13 +20,13 @@ from pimper_torch.single_view.photometric_stereo.regression import regress
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Calibrated(Record):
-    """What known lights say about pixels.
+    """Normals, albedo and ambient radiance of pixels.
 
     Attributes:
         normals: Unit, in the frame of the lights; zero where a pixel is black.
         albedo: Of each colour, not negative.
-        ambient: What a pixel shows in the shadow of the point light; zero if not asked for.
-        weight: What each sample was given in the end; 0 where missing or in shadow.
+        ambient: Radiance in the shadow of the point light; zero without ``ambient``.
+        weight: Final weight of each sample; 0 where missing or in shadow.
     """
 
     normals: Float[Tensor, "3 pixel"]
@@ -45,22 +45,20 @@ def calibrated_stereo(
 ) -> Calibrated:
     r"""Recover normals and albedos of pixels under known distant point lights.
 
-    Weights are decided on the mean of the colours; see
-    :func:`.regress`. Normal and albedos are then
+    Weights are those of the mean of the colours; see :func:`.regress`. Normal and albedos are then
     the least-squares solution over all colours: with :math:`A = \sum w\, l l^\top = C C^\top`
     and ``b_c`` the solution of one colour, :math:`C^\top n` is the leading eigenvector of
     :math:`\sum_c C^\top b_c b_c^\top C`.
 
     Args:
-        radiance: Linear. Samples without weight do not matter.
+        radiance: Linear. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
-        lights: Towards the point light, as long as it is strong.
+        lights: Direction to the point light times its irradiance.
         robust: Whether shadows and highlights lose weight.
-        ambient: Whether pixels have a radiance of their own, one more unknown a colour.
+        ambient: Whether pixels have ambient radiance, one more unknown per colour.
 
-    Fails, giving one of the best answers, where a pixel has fewer lit samples than unknowns
-    or lights in one plane; see
-    :func:`.determined`. Constant to autograd.
+    Underdetermined, giving one of the minima, where a pixel has fewer lit samples than unknowns
+    or lights in one plane; see :func:`.determined`. Constant to autograd.
     """
     with torch.no_grad():
         seen = weight > 0
@@ -91,7 +89,7 @@ def chromatic_albedo(
     weight: Float[Tensor, "view pixel"],
     shade: Float[Tensor, "view pixel"],
 ) -> Float[Tensor, "channel pixel"]:
-    """Fit the albedo of each colour, not negative, where what white would show is known."""
+    """Fit the albedo of each colour, not negative, to the shading of albedo 1."""
     x = torch.where((weight > 0)[:, None], radiance, 0).to(shade)
     square = (weight * shade * shade).sum(dim=0)
     product = ((weight * shade)[:, None] * x).sum(dim=0)
@@ -101,7 +99,7 @@ def chromatic_albedo(
 def _shared(
     inner: Float[Tensor, "pixel 3 3"], found: Float[Tensor, "channel 3 pixel"]
 ) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "channel pixel"]]:
-    """Give all colours of a pixel one normal."""
+    """Give each pixel the least-squares normal over all colours, and the albedos under it."""
     vectors = found.permute(2, 1, 0)  # pixel, 3, channel
     scale = inner.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(torch.finfo(inner.dtype).tiny)
     eye = torch.eye(3).to(inner)

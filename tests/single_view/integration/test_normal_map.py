@@ -337,7 +337,7 @@ def test_gradients_take_continuity_as_given():
     (into,) = torch.autograd.grad(found.depth[33, 4] - found.depth[30, 30], slopes)
     steps = orthographic_steps(upright(slopes), torch.ones(40, 40, dtype=torch.bool))
     system = RasterSystem(found.continuity.right, found.continuity.down)
-    again = system.fit_steps(*steps.wanted)
+    again = system.fit_steps(*steps.target)
     (expected,) = torch.autograd.grad(again[33, 4] - again[30, 30], slopes)
     assert_close(into, expected, rtol=1e-5, atol=1e-7)
     assert into.abs().max() > 0.1

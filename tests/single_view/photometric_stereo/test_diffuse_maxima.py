@@ -56,7 +56,7 @@ def test_maxima_on_a_ball_are_where_it_faces_the_point_light(generator):
     assert error_deg(maxima.shading, made.lights[maxima.view].mT) < 0.3
     side = torch.sin(torch.deg2rad(torch.tensor(75.0))).double()
     direction = torch.nn.functional.normalize(made.lights[maxima.view], dim=1)
-    assert_close(maxima.place, 30 + 30 * direction[:, :2] / side, atol=0.4, rtol=0)
+    assert_close(maxima.pixel, 30 + 30 * direction[:, :2] / side, atol=0.4, rtol=0)
 
 
 @pytest.mark.parametrize("shape", ["ball", "bumps"])
