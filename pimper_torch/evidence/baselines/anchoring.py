@@ -1,8 +1,8 @@
-r"""Sparse points anchor an integrated height field: the bas-relief freedom, fixed by depths.
+r"""Resolution of the bas-relief ambiguity of an integrated height field by sparse points.
 
 Shading tells depth only up to :math:`z' = \lambda z + \mu x + \nu y + c` (a constant that
 integration leaves free, and the generalised bas-relief transformation that uncalibrated light
-does). Points from structure from motion know depths and so fix all four.
+does). Points from structure from motion have known depths, and so determine all four.
 
 Source: Belhumeur, Kriegman & Yuille, The bas-relief ambiguity, IJCV 35(1), 1999.
 """
@@ -29,14 +29,14 @@ BESIDE = 0.25
 ITERATIONS = 20
 
 # A direction that the points do not tell (all relief on one plane) is left as it is: the
-# ridge is this fraction of what points of unit spread would say.
+# ridge is this fraction of the normal equations of points of unit variance.
 RIDGE = 1e-4
 
 
 def points_on(
     template: Template, points_world: Float[Tensor, "point 3"], coarse: CoarseMesh
 ) -> Float[Tensor, "kept 3"]:
-    """Keep the points of the cloud that lie on the coarse mesh, in the template's frame.
+    """Select the points of the cloud that lie on the coarse mesh, in the template's frame.
 
     Raises:
         ReconstructionError: Fewer than four.
@@ -62,7 +62,7 @@ def points_on(
 def look_up(
     template: Template, values: Float[Tensor, "height width"], points: Float[Tensor, "point 3"]
 ) -> Float[Tensor, " point"]:
-    """Read a raster under points in the template's frame."""
+    """Sample a raster at points in the template's frame."""
     found = sample_raster(
         values[None, None], points[None, :, :2], template.origin[None], template.spacing[None]
     )
@@ -74,7 +74,7 @@ def bas_relief_through(
     relief: Float[Tensor, " point"],
     reliable: Bool[Tensor, " point"] | None = None,
 ) -> Float[Tensor, " 4"]:
-    r"""Find ``(mu, nu, lambda, c)`` that carries a relief through points.
+    r"""Find ``(mu, nu, lambda, c)`` that fits a height field to points.
 
     Minimises Cauchy's loss of :math:`\mu x + \nu y + \lambda z + c - z_{point}` in float64. A
     direction that the points leave open keeps ``(0, 0, 1, 0)``.
@@ -92,7 +92,7 @@ def bas_relief_through(
     size = (known[:, None] * (columns - center)).norm(dim=0) / known.sum().clamp_min(1).sqrt()
     size = torch.where(size > 0, size, 1)
     design = torch.cat([(columns - center) / size, torch.ones_like(z)[:, None]], dim=1)
-    target = wanted - z  # so that the ridge pulls to the identity
+    target = wanted - z  # so that the ridge is a prior on the identity
     ridge = torch.diag(design.new_tensor([RIDGE, RIDGE, RIDGE, 0])) * known.sum()
     ridge[3, 3] = 1e-12
     found = design.new_zeros(4)
@@ -117,7 +117,7 @@ def apply_bas_relief(
 def rotation_normals(
     bas_relief: Float[Tensor, " 4"], normals: Float[Tensor, "sample 3"]
 ) -> Float[Tensor, "sample 3"]:
-    """Follow :func:`apply_bas_relief` with viewer-facing normals."""
+    """Transform viewer-facing normals as :func:`apply_bas_relief` does heights."""
     mu, nu, scale, _ = bas_relief.unbind()
     x, y, z = normals.unbind(dim=1)
     # Slopes -n_x/n_z become scale times as steep, plus mu.

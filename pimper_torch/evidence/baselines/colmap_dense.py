@@ -187,7 +187,7 @@ def mesh_step(config: ColmapDenseConfig, folder: Path, num_points: int, *, threa
 
 
 def trim_depth(num_points: int) -> float:
-    """Choose the depth of the octree below which Poisson's surface is no longer believed.
+    """Choose the depth of the octree below which Poisson's surface is trimmed.
 
     COLMAP's own default, 10, suits clouds of ten million points; of a small one it trims all
     away. A surface has a quarter of the points on each level up, so that the same density, as
@@ -223,7 +223,7 @@ def _run(program: Path, folder: Path, deadline: Deadline, threads: int, step: St
 
 
 def _explained(step: str, error: ReconstructionError) -> ReconstructionError:
-    """Say what a failing step usually lacks."""
+    """Give the usual cause of a failing step."""
     lines = f"colmap {step}: {error}"
     if "requires CUDA" in str(error) or "CUDA error" in str(error):
         lines = (

@@ -137,7 +137,7 @@ def _numbers(values: list[float]) -> str:
 
 
 def read_surface(path: Path, program: str, printed: str) -> Mesh:
-    """Read the mesh or the points that a program left.
+    """Read the mesh or the points that a program wrote.
 
     Its colours are dropped: they are radiance under this light, no albedo.
 
@@ -157,7 +157,7 @@ def read_surface(path: Path, program: str, printed: str) -> Mesh:
 
 
 def estimate_of(mesh: Mesh, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
-    """Put a surface in the scene's frame beside the scene's cameras."""
+    """Give the estimate of a surface in the scene's frame, with the scene's cameras."""
     like = scene.points_world
     return Estimate(
         mesh=mesh.replace(

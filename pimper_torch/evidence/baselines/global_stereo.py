@@ -1,4 +1,4 @@
-"""Rival: photometric stereo on the whole object at once, one light a view."""
+"""Baseline: photometric stereo on the whole object at once, one light a view."""
 
 import math
 from dataclasses import dataclass, field
@@ -58,7 +58,7 @@ class GlobalStereoConfig:
             exact views, registered on facets, the solver ends elsewhere from singular
             vectors (normals of a sphere 8.5 degrees off instead of 0.7), so the mesh is the
             default.
-        start_samples: The solver first runs on this many samples, which know the lights
+        start_samples: The solver first runs on this many samples, which determine the lights
             nearly as well as all do; the whole matrix goes on from there. 0 leaves it out.
         min_views: Views a sample must be lit in.
         max_iterations: Of each run of the solver.
@@ -97,7 +97,7 @@ class GlobalStereoConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class WholePhotometry(Record):
-    """What one matrix says of the object, template frame.
+    """The factorization of the whole object, template frame.
 
     Attributes:
         lights: First order, one a view.
@@ -123,7 +123,7 @@ class GlobalStereo(Stage):
 
     The published comparison factorizes the whole object, registered on the coarse mesh, as
     one F x K matrix with the published solver (augmented Lagrangian on the photometric
-    cone, no robust weights, nothing that pulls to the mesh). Here it is the same problem:
+    cone, no robust weights, no prior from the mesh). Here it is the same problem:
 
     1. a raster over all of the reference view's side of the coarse mesh, all views looked up
        on it with visibility, shadows and saturation masked;
@@ -192,7 +192,7 @@ class GlobalStereo(Stage):
         whole: Whole,
         points: Float[Tensor, "point 3"],
     ) -> tuple[WholePhotometry, Float[Tensor, "height width"]]:
-        """Fix the ambiguity and integrate, and again with the normals that the points correct."""
+        """Resolve the ambiguity and integrate; repeat with the normals corrected by the points."""
         config, normals = self.config, matrix.normals
         for last in [False] * config.upgrades + [True]:
             fixed = fix_ambiguity(matrix.replace(normals=normals), whole, config.min_views)
@@ -228,7 +228,7 @@ def fit_distant_lights(
     seen: Bool[Tensor, "sample view"],
     normals: Float[Tensor, "sample 3"],
 ) -> Float[Tensor, "view 4"]:
-    """Fit lights that are the same everywhere, as the chain fits its own.
+    """Fit lights that are constant over the scene, as the chain fits its own.
 
     See :func:`~pimper_torch.photometry.lights.fit_light_field`.
 
@@ -240,7 +240,7 @@ def fit_distant_lights(
 
 
 def fix_ambiguity(matrix: Matrix, whole: Whole, min_views: int) -> Whole:
-    """Bring a factorization nearest to given normals by one Lorentz transformation.
+    """Align a factorization with given normals by one Lorentz transformation.
 
     What it should come near to are the shading vectors that the normals have under the lights
     that fit them best.
@@ -248,7 +248,7 @@ def fix_ambiguity(matrix: Matrix, whole: Whole, min_views: int) -> Whole:
     Args:
         matrix: With the normals.
         whole: Its factors.
-        min_views: Samples that fewer views see say nothing.
+        min_views: Samples that fewer views see are ignored.
     """
     often = matrix.seen.sum(dim=0) >= min_views
     (observed,) = often.nonzero(as_tuple=True)
@@ -280,7 +280,7 @@ def refuse_few_views(num_views: int, needed: int, what: str) -> None:
 
 
 def refuse_little_overlap(matrix: Matrix, min_views: int) -> None:
-    """Refuse matrices in which next to no sample is seen often enough.
+    """Refuse matrices in which hardly any sample is seen in enough views.
 
     Raises:
         ReconstructionError: Says how often samples are seen.
@@ -314,7 +314,7 @@ def _stride(samples: int, number: int) -> int:
 
 
 def _well_seen(matrix: Matrix, min_views: int, number: int) -> Matrix:
-    """Pick about so many samples, evenly among those that enough views see."""
+    """Choose about so many samples, evenly spaced among those that enough views see."""
     (observed,) = (matrix.seen.sum(dim=0) >= min_views).nonzero(as_tuple=True)
     return matrix.columns(observed[:: _stride(len(observed), number)])
 
@@ -332,7 +332,7 @@ def _best_shading(matrix: Matrix, lights: Float[Tensor, "view 4"]) -> Float[Tens
 
 
 def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
-    """Take every sample to its exact minimum, and say how sure it is."""
+    """Give every sample's minimum, and the inverse variance of its normal."""
     lit = matrix.seen.sum(dim=0) >= min_views
     none = torch.zeros(1, dtype=torch.long, device=lit.device)
     convergence = Convergence(iterations=none, residual=none.to(whole.lights), cause=none)
@@ -350,8 +350,8 @@ def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
         normals.append(found.normals[0])
         information.append(found.information[0])
     photometric, gray = torch.cat(normals), torch.cat(albedo)
-    sure = photometric.isfinite().all(dim=1) & (gray > 0) & (photometric[:, 2] < 0)
-    valid = lit & sure
+    finite = photometric.isfinite().all(dim=1) & (gray > 0) & (photometric[:, 2] < 0)
+    valid = lit & finite
     return WholePhotometry(
         lights=whole.lights,
         normals=torch.where(valid[:, None], photometric, matrix.normals),

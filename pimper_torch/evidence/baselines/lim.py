@@ -1,4 +1,4 @@
-"""Rival: Lim, Ho, Yang and Kriegman's passive photometric stereo from motion."""
+"""Baseline: Lim, Ho, Yang and Kriegman's passive photometric stereo from motion."""
 
 import math
 from dataclasses import dataclass, field
@@ -48,11 +48,11 @@ from pimper_torch.patches.warp import WarpConfig
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, Record, SparseScene
 from pimper_torch.stage import Stage
 
-# A relief that hides samples from a view needs no more vertices than this many samples apart.
+# Spacing of the vertices of the surface that occludes samples, in samples: a choice.
 OCCLUDER_STRIDE = 4
 
-# Places along an edge where slopes are read.
-PLACES = 24
+# Points along an edge at which slopes are sampled: a choice.
+EDGE_POINTS = 24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +62,7 @@ class LimConfig:
     Attributes:
         samples_per_pixel: Of each round, coarse to fine: samples of the raster per pixel of
             the reference view.
-        light_samples: The lights are factorized from this many samples, which know them as
+        light_samples: The lights are factorized from this many samples, which determine them as
             well as all do; every sample's vector then follows from all its views.
         min_views: Views a sample must be seen in.
         alternations: Of the masked factorization, at most.
@@ -92,9 +92,9 @@ class LimConfig:
 
 
 class Lim(Stage):
-    """Photometric stereo on views registered by the surface, and the surface from it, in turn.
+    """Alternate registration of views by the surface and photometric stereo on them.
 
-    A round registers all views on the present surface (first the facets through the sparse
+    An iteration registers all views on the current surface (first the facets through the sparse
     points), factorizes what it sees under one distant point light a view (rank three: no ambient
     light), finds the factors' 3 x 3 ambiguity, integrates the normals, and takes the relief
     for the next surface. The depths of the sparse points fix the ambiguity, and the distance.
@@ -116,7 +116,7 @@ class Lim(Stage):
     - what the points add after integration, a bas-relief transformation and the
       distance, is fitted robustly (Cauchy's loss), as points of
       real clouds may be wrong;
-    - rounds go from a quarter of the resolution to the whole.
+    - iterations go from a quarter of the resolution to the whole.
 
     What limits it: ambient light, a near point light and interreflection are no rank-three matrix;
     cast shadows and highlights are not foreseen; integration runs over depth discontinuities.
@@ -173,7 +173,7 @@ class Lim(Stage):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Round(Record):
-    """What one round finds, template frame.
+    """The result of one iteration, template frame.
 
     Attributes:
         template: What it started from.
@@ -196,7 +196,7 @@ def relief_from(
     points: Float[Tensor, "point 3"],
     config: LimConfig,
 ) -> Round:
-    """Factorize, fix the ambiguity by integrability and points, and integrate."""
+    """Factorize, resolve the ambiguity by integrability and points, and integrate."""
     often = matrix.seen.sum(dim=0) >= config.min_views
     (observed,) = often.nonzero(as_tuple=True)
     some = matrix.columns(observed[:: max(1, -(-len(observed) // config.light_samples))])
@@ -237,9 +237,9 @@ def spans_between(
     factors: Rank3,
     often: Bool[Tensor, " sample"],
 ) -> Spans:
-    """Read the factors along the edges, template frame."""
+    """Sample the factors along the edges, template frame."""
     start, end = edges.unbind(dim=1)
-    along = (torch.arange(PLACES, device=edges.device).to(edges) + 0.5) / PLACES
+    along = (torch.arange(EDGE_POINTS, device=edges.device).to(edges) + 0.5) / EDGE_POINTS
     positions = start[:, None] + along[:, None] * (end - start)[:, None]
     where = positions.reshape(1, -1, 3)[..., :2]
     raster = (template.origin[None], template.spacing[None])
@@ -261,14 +261,14 @@ def bas_relief_matrix(bas_relief: Float[Tensor, " 4"]) -> Float[Tensor, "3 3"]:
 
 
 def facing(factors: Rank3, often: Bool[Tensor, " sample"]) -> Rank3:
-    """Turn all vectors round if most of them face away from the viewer."""
+    """Negate all vectors if most of them face away from the viewer."""
     away = (factors.vectors[2, often] > 0).sum() > (factors.vectors[2, often] < 0).sum()
     sign = -1.0 if away else 1.0
     return Rank3(lights=sign * factors.lights, vectors=sign * factors.vectors)
 
 
 def transferred(found: Round, template: Template) -> Template:
-    """Carry a relief over to the raster of the next round, which has the same frame."""
+    """Resample a height field on the raster of the next iteration, of the same frame."""
     positions = template.points(template.depth).reshape(-1, 3)
     depth = look_up(found.template, found.depth, positions).reshape(template.depth.shape)
     normals = relief_normals(depth, template) * template.inside[..., None]
@@ -276,7 +276,7 @@ def transferred(found: Round, template: Template) -> Template:
 
 
 def thinned(template: Template) -> Mesh:
-    """Span a relief with few triangles, to test what hides what."""
+    """Triangulate a height field coarsely, to test occlusion."""
     s = slice(OCCLUDER_STRIDE // 2, None, OCCLUDER_STRIDE)
     inside, depth = template.inside[s, s], template.depth[s, s]
     cliff = float(4 * OCCLUDER_STRIDE * template.spacing)
@@ -287,7 +287,7 @@ def thinned(template: Template) -> Mesh:
 def relief_normals(
     depth: Float[Tensor, "height width"], template: Template
 ) -> Float[Tensor, "height width 3"]:
-    """Give the viewer-facing normals of a relief by central differences."""
+    """Give the viewer-facing normals of a height field by central differences."""
     down, right = torch.gradient(depth, spacing=float(template.spacing))
     return normalize(torch.stack([right, down, -torch.ones_like(depth)], dim=-1), dim=-1)
 

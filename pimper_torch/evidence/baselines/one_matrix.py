@@ -1,7 +1,7 @@
 r"""Factorization of a matrix that is too large to be solved in one piece.
 
 The published problem, :math:`\min \lVert D \odot (J - L N) \rVert^2` with ``N`` on the
-photometric cone, for one matrix of a million samples. What samples say to the lights is a sum
+photometric cone, for one matrix of a million samples. The normal equations of the lights are a sum
 over samples, and a sample's own vector depends on nothing but the lights: every step of the
 augmented Lagrangian walks through the samples in chunks, and its memory beyond ``J``, ``D``
 and ``N`` is that of one chunk.
@@ -46,14 +46,14 @@ class Whole(Record):
 
 
 def chunks(num_samples: int) -> list[slice]:
-    """Cut samples into chunks."""
+    """Split samples into chunks."""
     return [slice(first, first + CHUNK) for first in range(0, num_samples, CHUNK)]
 
 
 def as_problem(
     matrix: Matrix, lights: Float[Tensor, "view 4"], shading: Float[Tensor, "4 sample"]
 ) -> Bilinear:
-    """Pose the published problem as a batch of one patch: nothing pulls, nothing is robust."""
+    """Give the published problem, without priors and robust weights, as a batch of one patch."""
     views = lights.new_zeros(1, len(lights))
     return Bilinear(
         radiance=matrix.radiance[None],

@@ -142,7 +142,7 @@ class _Run:
         return read_surface(path, last.name, printed)
 
     def _call(self, program: Program, *arguments: str, leaves: tuple[str, ...]) -> tuple[Path, str]:
-        """Run one program; give the file that it leaves and what it printed."""
+        """Run one program; give the file that it writes and what it printed."""
         command: list[Path | str] = [self._found[program], *arguments]
         command += ["-w", str(self._folder), "--max-threads", str(self._threads)]
         printed = run_program(command, self._folder, self._deadline, threads=self._threads)
@@ -156,7 +156,7 @@ class _Run:
         return path, printed
 
     def _names_points(self) -> bool:
-        """Tell whether the dense points are handed over beside the scene."""
+        """Tell whether the dense points are passed to the program beside the scene."""
         try:
             help_text = run_program(
                 [self._found[RECONSTRUCT], "--help"], self._folder, self._deadline, threads=1

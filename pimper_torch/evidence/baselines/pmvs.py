@@ -44,7 +44,7 @@ class PmvsConfig:
         threshold: Least normalized correlation of a point's views.
         wsize: Side of the window that is compared, samples.
         min_images: Views that a point must be seen in.
-        max_angle_deg: Some two views of a point must be at least so far apart.
+        max_angle_deg: Minimum largest angle between two views of a point.
         quad: Strictness of its filter by quadrics; less is stricter.
         threads: 0 for all cores.
         max_minutes: Then it is stopped.

@@ -1,4 +1,4 @@
-r"""Rank-three photometric stereo: factors of a masked matrix, and what integrability tells.
+r"""Rank-three photometric stereo: masked factorization, its ambiguity reduced by integrability.
 
 A distant point light a view and no ambient light make :math:`J = L B` with L F x 3 and the columns
 of B albedo times normal. The factors are found up to an invertible 3 x 3 matrix
@@ -55,12 +55,12 @@ def factorize_rank_three(
     alternations: int,
     tolerance: float = 1e-5,
 ) -> Float[Tensor, "view 3"]:
-    """Find the lights of the best product of rank three where the matrix is seen.
+    """Give the lights of the masked rank-three factorization.
 
     Missing entries are filled with a sample's brightness times a view's, then with the
     rank-three part of the filled matrix in turn; weighted alternation follows until the
     lights' span turns by less than ``tolerance`` in a step. Lights come out with orthonormal
-    columns: their scale and turn are part of what is free.
+    columns: their scale and rotation are part of the ambiguity.
     """
     J, weight = radiance.double(), seen.double()
     gain = (weight * J).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1)
@@ -89,7 +89,7 @@ def solve_vectors(
     seen: Bool[Tensor, "view sample"],
     lights: Float[Tensor, "view 3"],
 ) -> Float[Tensor, "3 sample"]:
-    """Give every sample's vector by least squares, lights given; the smallest if open."""
+    """Give every sample's vector by least squares, lights given, of minimum norm if not unique."""
     parts = []
     basis = outer(lights.mT)
     for part in chunks(radiance.shape[1]):
@@ -102,7 +102,7 @@ def solve_vectors(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Spans(Record):
-    """What is known between pairs of points on the surface, template frame.
+    """Factors sampled between pairs of points on the surface, template frame.
 
     Attributes:
         step: From one point to the other: x, y and z.
@@ -118,7 +118,7 @@ class Spans(Record):
 def ambiguity_between_points(
     spans: Spans, start: Float[Tensor, "3 3"], iterations: int = 50
 ) -> Float[Tensor, "3 3"]:
-    r"""Find the 3 x 3 matrix under which the slopes lead from point to point.
+    r"""Find the 3 x 3 matrix under which integrated slopes match the points' depths.
 
     Minimises, over spans and in float64, Cauchy's loss of
 
@@ -155,7 +155,7 @@ def ambiguity_between_points(
 def matrix_between_lights(
     lights: Float[Tensor, "view 3"], known: Float[Tensor, "view 3"]
 ) -> Float[Tensor, "3 3"]:
-    """Give the matrix that carries a factorization nearest to lights known from elsewhere.
+    """Give the matrix that aligns a factorization with known lights.
 
     Lights, not normals: those of a coarse surface are smoother than the true ones, and what
     turns the vectors along them may have no rank. Each light counts with its own size.
@@ -172,7 +172,7 @@ def _descended(
     known: Bool[Tensor, " span"],
     iterations: int,
 ) -> Float[Tensor, "3 3"]:
-    """Take Levenberg and Marquardt's steps."""
+    """Minimize by Levenberg-Marquardt."""
     damping = 1e-3
     for round_ in range(iterations):
         residual, slope = _residual(matrix, b, fraction, step, known)
@@ -199,7 +199,7 @@ def _residual(
     step: Float[Tensor, "span 3"],
     known: Bool[Tensor, " span"],
 ) -> tuple[Float[Tensor, " span"], Float[Tensor, "span 9"]]:
-    """Give what the slopes miss the points' depths by, and its derivative by A."""
+    """Give the residuals of the points' depths, and their derivative by A."""
     rotated = b @ matrix.mT
     # A sample without a vector has no slope; its share is 0, but it must stay finite.
     steepest = -(rotated.norm(dim=-1) / STEEPEST).clamp_min(1e-12)

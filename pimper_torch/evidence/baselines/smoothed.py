@@ -1,4 +1,4 @@
-r"""Rival: the coarse mesh itself, smoothed; no photometry at all.
+r"""Baseline: the coarse mesh itself, smoothed; no photometry at all.
 
 The surface of least bending through the coarse mesh's vertices: with the flat facets as the
 domain, the positions S minimise
@@ -110,7 +110,7 @@ class Smoothed(Stage):
 def thin_plate(
     subdivision: Subdivision, mesh: Mesh, weights: Float[Tensor, " corner"]
 ) -> Float[Tensor, "vertex 3"]:
-    """Give the subdivided mesh's vertices their positions on the surface of least bending.
+    """Give the positions of the subdivided mesh's vertices on the surface of least bending.
 
     Args:
         subdivision: Of the coarse mesh.
@@ -173,7 +173,7 @@ def _laplacian(subdivision: Subdivision) -> tuple[Entries, Float[Tensor, " verte
 def _gram(
     entries: Entries, num_rows: int, num_columns: int
 ) -> tuple[Int[Tensor, " product"], Int[Tensor, " product"], Float[Tensor, " product"]]:
-    """Give ``B^T B`` of a sparse matrix; entries named twice add up."""
+    """Give ``B^T B`` of a sparse matrix; duplicate entries add up."""
     rows, cols, values = (part.cpu().numpy() for part in entries)
     matrix = coo_array((values, (rows, cols)), shape=(num_rows, num_columns)).tocsr()
     gram = (matrix.T @ matrix).tocoo()
@@ -186,7 +186,7 @@ def _gram(
 
 
 def _rim_differences(subdivision: Subdivision, edge: Float[Tensor, ""]) -> Entries:
-    """Give the second differences along the rim, scaled to the plate's units."""
+    """Give the second differences along the border, in the plate's units."""
     ends = _rim_edges(subdivision.faces)
     count = len(subdivision.points)
     # Every vertex of the rim with one edge in and one out has a second difference.
@@ -205,7 +205,7 @@ def _rim_differences(subdivision: Subdivision, edge: Float[Tensor, ""]) -> Entri
 
 
 def _rim_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
-    """List the edges that only one face has, in its direction."""
+    """List the border edges, in the direction of their face."""
     _, index = face_edges(faces)
     return half_edges(faces)[face_counts(index)[index.flatten()] == 1]
 
@@ -213,7 +213,7 @@ def _rim_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
 def _fixed_vertices(
     subdivision: Subdivision, mesh: Mesh
 ) -> tuple[Int[Tensor, " fixed"], Int[Tensor, " fixed"]]:
-    """Find the subdivided mesh's vertices that are vertices of the coarse mesh, and which."""
+    """Find the subdivided mesh's vertices of the coarse mesh, and their indices."""
     (fixed,) = (subdivision.barycentric == 1).any(dim=1).nonzero(as_tuple=True)
     slot = subdivision.barycentric[fixed].argmax(dim=1)
     return fixed, mesh.faces[subdivision.facet[fixed], slot]

@@ -1,4 +1,4 @@
-"""One template for the whole surface: a raster over everything that the reference view sees.
+"""One template for the whole surface: a raster over all that the reference view sees.
 
 The baselines that factorize the whole object as one matrix need one raster instead of one a
 facet. It is orthographic and faces the reference camera: x and y as in its image, z along the
@@ -63,7 +63,7 @@ class Template(Record):
         return torch.cat([xy, depth[..., None]], dim=-1)
 
     def to_world(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Carry points from the template's frame to the world."""
+        """Transform points from the template's frame to the world."""
         rows = transform(invert_rigid(self.template_from_world), points.reshape(-1, 3))
         return rows.reshape(points.shape)
 
@@ -155,7 +155,7 @@ class Matrix(Record):
 def register(
     template: Template, views: Views, cameras: Cameras, occluder: Mesh, config: WarpConfig
 ) -> Matrix:
-    """Look all views up on the template, one view at a time.
+    """Resample all views on the template, one at a time.
 
     Args:
         template: Where.
@@ -189,7 +189,7 @@ def registered_views(
     template: Template, views: Views, cameras: Cameras, occluder: Mesh, config: WarpConfig
 ) -> Iterator[tuple[Float[Tensor, "channel sample"], Bool[Tensor, " sample"]]]:
     """Give the radiance of the template's samples in every view in turn, and which are seen."""
-    # The raster's plane says nothing of how the surface is tilted.
+    # The raster's plane is independent of the tilt of the surface.
     warp = Warp(dataclasses.replace(config, max_tilt_deg=89.9))
     tiles = _tiles(template)
     coarse = CoarseMesh(
@@ -240,7 +240,7 @@ def on_template(
     rows: Shaped[Tensor, "sample ..."],
     inside: Bool[Tensor, "height width"],
 ) -> Shaped[Tensor, "height width ..."]:
-    """Put a row of samples back on the raster, zero beside the mesh."""
+    """Scatter samples to the raster, zero beside the mesh."""
     raster = rows.new_zeros(*inside.shape, *rows.shape[1:])
     raster[inside] = rows
     return raster
@@ -253,7 +253,7 @@ def surface_of(
     albedo: Float[Tensor, "sample channel"] | None = None,
     confidence: Float[Tensor, " sample"] | None = None,
 ) -> Mesh:
-    """Span the raster at a depth with triangles, one vertex a sample inside.
+    """Triangulate the raster at a depth, one vertex a sample inside.
 
     Cliffs are left open, and the largest connected piece is kept.
 
@@ -324,7 +324,7 @@ def _frame(
 
 
 def _tiles(template: Template) -> list[tuple[Templates, slice, slice]]:
-    """Cut the raster into small templates of one patch each, and leave out the empty ones.
+    """Split the raster into small templates of one patch each, without empty ones.
 
     Their facet and barycentric coordinates mean nothing.
     """
@@ -332,7 +332,7 @@ def _tiles(template: Template) -> list[tuple[Templates, slice, slice]]:
     tiles = []
     for top in range(0, height, TILE):
         for left in range(0, width, TILE):
-            # A tile one sample wide could not tell how far samples are apart in a view.
+            # A tile one sample wide has no spacing of samples in a view.
             rows = slice(max(min(top, height - 2), 0), min(top + TILE, height))
             columns = slice(max(min(left, width - 2), 0), min(left + TILE, width))
             inside = template.inside[rows, columns]

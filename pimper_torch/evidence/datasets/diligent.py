@@ -33,7 +33,7 @@ _SHORTEST = 0.5  # a decoded normal shorter than this is background
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class LampFiles(Record):
+class PointLightFiles(Record):
     """The photographs of one viewpoint and their lights, in the files' own axes.
 
     Attributes:
@@ -96,7 +96,7 @@ def read_diligent(
             colour, as the benchmark does. Then 1 is no longer the level of saturation.
 
     Raises:
-        InputError: Another layout; says what was expected and what is there.
+        InputError: Another layout; names what was expected and what was found.
 
     Source: Shi, Mo, Wu, Duan, Yeung & Tan, A Benchmark Dataset and Evaluation for Non-Lambertian
     and Uncalibrated Photometric Stereo, PAMI 41(2), 2019.
@@ -154,7 +154,7 @@ def read_normal_map(folder: Path | str) -> NormalMap:
         folder: Of one object.
 
     Raises:
-        InputError: Another layout; says what was expected and what is there.
+        InputError: Another layout; names what was expected and what was found.
 
     Source: Cao, Santo, Shi, Okura & Matsushita, Bilateral Normal Integration, ECCV 2022.
     """
@@ -177,7 +177,7 @@ def read_normal_map(folder: Path | str) -> NormalMap:
     )
 
 
-def point_light_files(folder: Path, kind: str) -> LampFiles:
+def point_light_files(folder: Path, kind: str) -> PointLightFiles:
     """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``.
 
     Raises:
@@ -200,7 +200,7 @@ def point_light_files(folder: Path, kind: str) -> LampFiles:
         f"{len(names)}, {len(directions)} and {len(intensities)}",
     )
     expect(bool((intensities > 0).all()), folder, kind, "intensities above 0", "others")
-    return LampFiles(
+    return PointLightFiles(
         paths=tuple(inside(folder, name, kind) for name in names),
         directions=normalize(directions, dim=-1),
         intensities=intensities,

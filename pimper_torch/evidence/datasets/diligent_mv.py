@@ -69,7 +69,7 @@ def read_diligent_mv(
         ``truth.lights_world`` has the lights' mean intensity, or 1 after the division.
 
     Raises:
-        InputError: Another layout; says what was expected and what is there.
+        InputError: Another layout; names what was expected and what was found.
 
     Source: Li, Zhou, Wu, Shi, Diao & Tan, Multi-view photometric stereo, IEEE TIP 29, 2020;
     layout and axes as its benchmark page and public loaders (PS-NeRF, SuperNormal) have them.

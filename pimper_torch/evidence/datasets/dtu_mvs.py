@@ -62,7 +62,7 @@ def read_dtu_mvs(
         encoding: Response, saturation and black level of the files.
 
     Raises:
-        InputError: Another layout; says what was expected and what is there.
+        InputError: Another layout; names what was expected and what was found.
 
     Source: Jensen et al., Large Scale Multi-view Stereopsis Evaluation, CVPR 2014,
     roboimagedata.compute.dtu.dk; names as in the set's SampleSet and in MVSNet's loader.

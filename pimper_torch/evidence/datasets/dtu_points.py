@@ -59,7 +59,7 @@ def read_dtu_points(
         encoding: Response, saturation and black level of the files.
 
     Raises:
-        InputError: Another layout; says what was expected and what is there.
+        InputError: Another layout; names what was expected and what was found.
 
     Source: Aanaes, Dahl & Steenstrup Pedersen, Interesting Interest Points, IJCV 97, 2012,
     roboimagedata.compute.dtu.dk; layout as in the set's RobotEvalCode (GetCam.m,

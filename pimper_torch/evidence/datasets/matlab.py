@@ -24,7 +24,7 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
 
     Raises:
         InputError: No such file, not a MATLAB file, or a variable is absent or no array of
-            numbers; says what the file holds.
+            numbers; lists what the file holds.
     """
     present = variables(path, kind)
     try:

@@ -51,7 +51,7 @@ def read_meshroom(
     - Its images are sampled at whole numbers (``UndistortImage``): it counts centres from
       0, so half a pixel is added.
 
-    Views without a pose found no place and are left out.
+    Views without a pose are not registered, and are left out.
 
     Args:
         folder: With ``cameras.sfm`` or ``sfm.json``; or the file itself.
@@ -65,7 +65,7 @@ def read_meshroom(
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
-        InputError: The file says something else or describes a lens or rig that cannot be
+        InputError: The file has another structure or describes a lens or rig that cannot be
             read, or a photograph is missing or damaged.
     """
     given = Path(folder)

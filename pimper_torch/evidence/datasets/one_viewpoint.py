@@ -32,7 +32,7 @@ def read_uw_ps(folder: Path | str, name: str, *, max_size_px: int = 0) -> Captur
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
 
     Raises:
-        InputError: Another layout; says what was expected and what is there.
+        InputError: Another layout; names what was expected and what was found.
     """
     root = Path(folder)
     listed = root / name / f"{name}.txt"

@@ -64,7 +64,7 @@ def file_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def refuse_skew(cameras: Cameras, names: Sequence[str], kind: str) -> None:
-    """Refuse cameras whose pixels are sheared noticeably, for formats that cannot say so.
+    """Refuse cameras whose pixels are sheared noticeably, for formats that cannot represent it.
 
     Raises:
         InputError: Names the photographs.

@@ -28,7 +28,7 @@ _MAX_FROM_ROTATION = 1e-2
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PosedPhotograph(Record):
-    """What a data set says about one photograph.
+    """Camera and file of one photograph.
 
     Attributes:
         name: Unique in the set.

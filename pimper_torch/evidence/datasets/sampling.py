@@ -1,4 +1,4 @@
-"""Which photographs of a multi-light set are read: all, some, or one light a position."""
+"""Selection of photographs of a multi-light set: all, some, or one light a position."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -78,7 +78,7 @@ def choose_photographs(
         Indices of photographs, by position and then light.
 
     Raises:
-        InputError: A position or light that was asked for is not there.
+        InputError: A position or light that does not exist.
     """
     _refuse_absent(position, positions, "positions", path, kind)
     _refuse_absent(light, lights, "lights", path, kind)

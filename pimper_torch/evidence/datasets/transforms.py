@@ -66,7 +66,7 @@ def read_transforms(
         max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
 
     Raises:
-        InputError: The file says something else, or a photograph is missing or damaged.
+        InputError: The file has another structure, or a photograph is missing or damaged.
     """
     given = Path(folder)
     path = given if given.is_file() else first_of([given / name for name in _FILES])
@@ -102,7 +102,7 @@ def write_transforms(
         points_world: A cloud, written as ``sparse_pc.ply`` and named in the file.
 
     Raises:
-        InputError: A camera has a skew, which the format cannot say.
+        InputError: A camera has a skew, which the format cannot represent.
     """
     folder = Path(folder)
     refuse_skew(cameras, views.names, "transforms.json")
