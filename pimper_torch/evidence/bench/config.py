@@ -1,4 +1,4 @@
-"""What the table is made of."""
+"""Settings of the table."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The peak memory of a part of the program, not of the program as a whole."""
+"""The peak memory of a part of the program."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -11,7 +11,7 @@ _RESET_PEAK = "5"  # see proc(5), clear_refs
 
 @contextmanager
 def peak_memory() -> Iterator[Callable[[], float | None]]:
-    """Forget the former peak of resident memory when the ``with`` block begins.
+    """Measure the peak of resident memory within the ``with`` block.
 
     The operating system's own peak is of the whole life of a process, so that a frugal method
     would inherit that of the one before. What was in use before counts, what external programs

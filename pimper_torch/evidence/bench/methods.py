@@ -25,7 +25,7 @@ from pimper_torch.records import (
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Outcome(Record):
-    """What a method gave, and what it cost.
+    """A method's estimate, and its cost.
 
     Attributes:
         estimate: Surface, cameras, lights.

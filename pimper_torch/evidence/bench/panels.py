@@ -55,7 +55,7 @@ def method_panels(
 
 
 def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> SceneRow:
-    """Put what all methods made of a scene beside its photograph and the truth."""
+    """Give a scene's row: photograph, truth, and the panels of all methods."""
     maps = inputs.maps
     assert maps.cameras is not None
     assert maps.truth.normals_world is not None

@@ -1,4 +1,4 @@
-"""A table's rows: what every method cost and how near it came, and where that was measured."""
+"""Rows of the table: cost and errors of every method; the machine; JSON files."""
 
 import dataclasses
 import json
@@ -180,7 +180,7 @@ potatoes, in Matlab, 2014. The error is not defined there."""
 
 
 def with_published(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Put scenes together, and before each what was published on its namesake."""
+    """Group rows by scene, each after the published figures for that scene."""
     scenes = dict.fromkeys(row.scene for row in rows)
     return tuple(row for name in scenes for row in (*PUBLISHED, *rows) if row.scene == name)
 

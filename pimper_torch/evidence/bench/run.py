@@ -247,7 +247,7 @@ def _percent(fraction: float | None) -> float | None:
 
 @contextmanager
 def _shown(observer: Observer, name: str) -> Iterator[None]:
-    """Tell the observer of a piece of work as if it were a stage."""
+    """Report a piece of work to the observer as a stage."""
     began = time.perf_counter()
     observer.started(name)
     progressed: Callable[[int, int], None] = observer.progressed

@@ -154,7 +154,7 @@ def _line(words: Sequence[str], widths: Sequence[int], right: Sequence[bool]) ->
 
 
 def terminal(table: Table) -> Group:
-    """Make what the terminal shows: tables no wider than it, then why figures are missing.
+    """Give tables no wider than the terminal, then why figures are missing.
 
     A row without any figure of a table's kind is left out of that table.
     """
@@ -186,7 +186,7 @@ def _grid(title: str, shown: Sequence[Column], rows: Sequence[Row]) -> Grid:
 
 
 def legend(table: Table) -> list[str]:
-    """Say in sentences what the columns mean, and what they were measured on."""
+    """Explain the columns and the measurement in sentences."""
     sentences = [
         "Samples count every template's pixels times the views, missing ones included. Minutes "
         "are of the method alone; structure from motion is shared and stands apart. The 3D error "
