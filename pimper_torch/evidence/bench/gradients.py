@@ -1,11 +1,11 @@
-"""Gradients of every stage, and of the chain whole, beside finite differences.
+"""Gradients of every stage, and of the whole chain, against finite differences.
 
-The chain runs once on a small closed-form scene; every stage is then asked again, with what it was
-handed moved a little. Photographs, cameras and whatever a record carries from stage to stage are
-inputs; the coarse mesh that structure from motion gives is brought.
+The chain runs once on a small closed-form scene; every stage is then evaluated again with its
+arguments perturbed. Photographs, cameras and the tensors of records between stages are inputs;
+the coarse mesh is given in place of structure from motion.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,26 +22,26 @@ from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.patches.sources import Sources
 from pimper_torch.records import (
-    Cameras,
     CoarseMesh,
     PatchViews,
     PhotometricPatches,
-    Record,
+    Reconstruction,
     Silhouettes,
     SparseScene,
-    Views,
+    Surface,
 )
 from pimper_torch.stage import Given, Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Probe:
-    """A stage as a function of named tensors, and where it is asked.
+    """A stage as a function of named tensors, and where it is evaluated.
 
     Attributes:
         function: From tensors to tensors, all in float64.
-        inputs: What the chain handed to the stage.
+        inputs: The tensors that the chain passed to the stage.
         scales: See :func:`~pimper_torch.evidence.metrics.derivatives.check_derivatives`.
     """
 
@@ -75,7 +75,7 @@ class Probe:
 def small_scene(
     seed: int = 31, num_views: int = 6, width: int = 64, num_points: int = 24
 ) -> tuple[SparseScene, CoarseMesh]:
-    """Give photographs of a speckled sphere under wandering point lights, its cloud, and facets.
+    """Render a speckled sphere under wandering point lights; give its cloud and facets, too.
 
     Args:
         seed: Of point lights, speckle and cloud.
@@ -117,57 +117,198 @@ class Whole(Stage):
         return self.factorize(seen)
 
 
-def probes(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str, Probe]:
-    """Run the chain once, and make a probe of every stage that took part, and of the whole.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Paths:
+    """Inputs and outputs of a stage: paths through its arguments, and through its result.
 
-    Args:
-        chain: Its stages may be swapped; structure from motion and the coarse mesh are replaced
-            by ``scene`` and ``coarse``, and no silhouettes are looked for.
-        scene: Float64.
-        coarse: In the same frame.
+    A path runs through fields, and through all records of a tuple: ``0.buckets.depth`` is the
+    depth in every bucket of the first argument. Paths that end in ``None`` are left out.
+
+    Attributes:
+        inputs: By name; several paths, where arguments share a tensor.
+        outputs: By name.
     """
-    calls = _calls(chain, scene, coarse)
-    makers: dict[str, Callable[..., Probe]] = {
-        "warp": _warp,
-        "factorize": _factorize,
-        "integrate": _integrate,
-        "align": _align,
-        "refine": _refine,
-        "sweep": _sweep,
-        "fuse": _fuse,
-        "repair": _mend,
-        "remesh": _adapt,
-    }
-    found = {
-        name: make(getattr(chain, name), *calls[name])
-        for name, make in makers.items()
-        if name in calls
-    }
-    if "remesh" in calls:
-        found["decompose"] = _decompose(chain.decompose, *calls["decompose"])
-    return {**found, "chain": _chain(chain, scene, coarse)}
+
+    inputs: dict[str, tuple[str, ...]]
+    outputs: dict[str, str]
 
 
-def moved_cameras(cameras: Cameras, motion: Float[Tensor, "view 6"]) -> Cameras:
-    """Turn and shift cameras: rotation vectors, then shifts, in the cameras' frames."""
+_SURFACE = {
+    "vertices": "vertices_world",
+    "normals": "normals_world",
+    "albedo": "albedo",
+    "confidence": "confidence",
+}
+_STAGES = {
+    "warp": _Paths(
+        inputs={
+            "photographs": ("0.images",),
+            "cameras": ("1.cam_from_world",),
+            "depth": ("2.buckets.depth",),
+        },
+        outputs={"radiance": "buckets.radiance"},
+    ),
+    "factorize": _Paths(
+        inputs={
+            "radiance": ("0.buckets.radiance",),
+            "template normals": ("0.patches.buckets.normals_patch",),
+        },
+        outputs={
+            "normals": "buckets.normals_patch",
+            "albedo": "buckets.albedo",
+            "lights": "buckets.lights_patch",
+            "confidence": "buckets.confidence",
+            "residual": "buckets.convergence.residual",
+        },
+    ),
+    "integrate": _Paths(
+        inputs={
+            "normals": ("0.buckets.normals_patch",),
+            "information": ("0.buckets.information",),
+        },
+        outputs={"depth": "buckets.depth"},
+    ),
+    "align": _Paths(
+        inputs={"depth": ("0.buckets.depth",)},
+        outputs={"depth": "buckets.depth"},
+    ),
+    "refine": _Paths(
+        inputs={
+            "depth": ("0.buckets.depth",),
+            "normals": ("0.photometric.buckets.normals_patch",),
+            "albedo": ("0.photometric.buckets.albedo",),
+        },
+        outputs=_SURFACE,
+    ),
+    "sweep": _Paths(
+        inputs={
+            "photographs": ("0.images",),
+            "cameras": ("1.cam_from_world",),
+            "normals": ("3.buckets.normals_patch",),
+            "lights": ("3.buckets.lights_patch",),
+            "depth": ("2.patches.buckets.depth", "3.patches.buckets.depth"),
+        },
+        outputs={"offset": "buckets.offset", "information": "buckets.information"},
+    ),
+    "fuse": _Paths(
+        inputs={
+            "normals": ("0.photometric.buckets.normals_patch",),
+            "albedo": ("0.photometric.buckets.albedo",),
+            "normal information": ("0.photometric.buckets.information",),
+            "offset": ("0.buckets.offset",),
+            "information": ("0.buckets.information",),
+            "depth": ("0.photometric.patches.buckets.depth",),
+            "cloud": ("0.photometric.patches.coarse.points.points_world",),
+        },
+        outputs=_SURFACE,
+    ),
+    "repair": _Paths(
+        inputs={"vertices": ("0.vertices_world",)},
+        outputs={"vertices": "vertices_world"},
+    ),
+    "remesh": _Paths(
+        inputs={
+            "vertices": ("1.vertices_world",),
+            "normals": ("1.normals_world",),
+            "information": ("1.information",),
+        },
+        outputs={"vertices": "mesh.vertices_world", "normals": "mesh.normals_world"},
+    ),
+    "decompose": _Paths(
+        inputs={
+            "vertices": ("2.vertices_world",),
+            "normals": ("2.normals_world",),
+            "facets": ("0.mesh.vertices_world",),
+        },
+        outputs={
+            "depth": "buckets.depth",
+            "normals": "buckets.normals_patch",
+            "frames": "buckets.patch_from_world",
+        },
+    ),
+}
+_CHAIN = _Paths(
+    inputs={
+        "photographs": ("0.views.images",),
+        "cameras": ("0.cameras.cam_from_world",),
+        "mesh": ("1.mesh.vertices_world",),
+    },
+    outputs={
+        "vertices": "mesh.vertices_world",
+        "normals": "mesh.normals_world",
+        "albedo": "mesh.albedo",
+        "lights": "patches.photometric.buckets.lights_patch",
+    },
+)
+
+# Inputs that are lengths: a unit step is the spacing of samples, or the edge of a face.
+_LENGTHS = ("depth", "offset", "vertices", "facets", "cloud", "mesh")
+
+
+def moved_poses(
+    cam_from_world: Float[Tensor, "view 4 4"], motion: Float[Tensor, "view 6"]
+) -> Float[Tensor, "view 4 4"]:
+    """Move cameras by rotation vectors and translations in their frames."""
     rotation, shift = motion[:, :3], motion[:, 3:]
     none = torch.zeros_like(rotation[:, 0])
     x, y, z = rotation.unbind(dim=1)
     rows = [[none, -z, y, shift[:, 0]], [z, none, -x, shift[:, 1]], [-y, x, none, shift[:, 2]]]
     rows.append([none] * 4)
     generator = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-    moved = torch.linalg.matrix_exp(generator) @ cameras.cam_from_world
-    return cameras.replace(cam_from_world=moved)
+    return torch.linalg.matrix_exp(generator) @ cam_from_world
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Parameter:
+    """How an input parametrizes a tensor: ``apply(tensor, start(tensor))`` is the tensor."""
+
+    start: Callable[[Tensor], Tensor]
+    apply: Callable[[Tensor, Tensor], Tensor]
+
+
+_VALUES = _Parameter(start=lambda tensor: tensor, apply=lambda _, values: values)
+# Zero information stays zero.
+_FACTOR = _Parameter(start=torch.ones_like, apply=lambda tensor, factor: tensor * factor)
+_PARAMETERS = {
+    "cameras": _Parameter(start=lambda poses: poses.new_zeros(len(poses), 6), apply=moved_poses),
+    "information": _FACTOR,
+    "normal information": _FACTOR,
+}
+
+
+def probes(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str, Probe]:
+    """Run the chain once; give a probe of every stage that took part, and of the whole.
+
+    Args:
+        chain: Its stages may be swapped; structure from motion and the coarse mesh are replaced
+            by ``scene`` and ``coarse``, and silhouettes are everything.
+        scene: Float64.
+        coarse: In the same frame.
+    """
+    calls = _calls(chain, scene, coarse)
+
+    def whole(scene: SparseScene, coarse: CoarseMesh) -> Reconstruction:
+        _substitute(chain, scene, coarse)
+        return chain(scene)
+
+    if "remesh" not in calls:
+        del calls["decompose"]  # templates carry no surface, and facets are constants
+    found = {
+        name: _probe(paths, getattr(chain, name), calls[name])
+        for name, paths in _STAGES.items()
+        if name in calls
+    }
+    return {**found, "chain": _probe(_CHAIN, whole, (scene, coarse))}
 
 
 def _calls(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str, tuple[Any, ...]]:
-    """Run the chain and keep what each stage was handed last."""
+    """Run the chain, and keep the arguments of each stage's last call."""
     calls: dict[str, tuple[Any, ...]] = {}
 
     def keep(name: str) -> Callable[[nn.Module, tuple[Any, ...]], None]:
-        return lambda _, handed: calls.update({name: handed})
+        return lambda _, arguments: calls.update({name: arguments})
 
-    _place(chain, scene, coarse)
+    _substitute(chain, scene, coarse)
     chain.factorize = Whole(chain.factorize)
     hooks = [stage.register_forward_pre_hook(keep(name)) for name, stage in chain.named_children()]
     chain(scene)
@@ -176,8 +317,8 @@ def _calls(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str,
     return calls
 
 
-def _place(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> None:
-    # Silhouettes jump as photographs change: everything is the object.
+def _substitute(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> None:
+    # Silhouettes are not continuous in the photographs: everything is the object.
     chain.silhouettes = Given(Silhouettes.everything(scene.views))
     if isinstance(chain, Published):
         chain.triangulate = Given(coarse)
@@ -185,319 +326,86 @@ def _place(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> None:
         chain.coarse_surface = Given(coarse)
 
 
-def _gathered(buckets: Sequence[Record], name: str) -> Float[Tensor, " value"]:
-    return torch.cat([getattr(bucket, name).flatten() for bucket in buckets])
-
-
-def _replaced(buckets: Sequence[Any], **fields: Float[Tensor, " _"]) -> tuple[Any, ...]:
-    """Put gathered values back into their buckets."""
-    for name, values in fields.items():
-        sizes = [getattr(bucket, name).numel() for bucket in buckets]
-        buckets = [
-            bucket.replace(**{name: part.reshape(getattr(bucket, name).shape)})
-            for bucket, part in zip(buckets, torch.split(values, sizes), strict=True)
-        ]
-    return tuple(buckets)
-
-
-def _spacing(patches: Any) -> float:  # noqa: ANN401 - any record with patches
-    return float(patches.buckets[0].spacing[0])
-
-
-def _still(cameras: Cameras) -> Float[Tensor, "view 6"]:
-    return torch.zeros(cameras.num_views, 6, dtype=torch.float64)
-
-
-def _per_pixel(cameras: Cameras) -> float:
-    """Give the angle of a pixel: cameras move by some pixels at most."""
-    return 1 / float(cameras.intrinsics[:, 0, 0].median())
-
-
-def _warp(
-    stage: nn.Module,
-    views: Views,
-    cameras: Cameras,
-    patches: Any,  # noqa: ANN401
-    _sources: object = None,  # which the stage makes itself, of photographs that vary
-) -> Probe:
-    def function(x: Tensors) -> Tensors:
-        carrying = patches.replace(buckets=_replaced(patches.buckets, depth=x["depth"]))
-        moved = moved_cameras(cameras, x["cameras"])
-        seen = stage(views.replace(images=x["photographs"]), moved, carrying)
-        return {"radiance": _gathered(seen.buckets, "radiance")}
-
-    inputs = {
-        "photographs": views.images,
-        "cameras": _still(cameras),
-        "depth": _gathered(patches.buckets, "depth"),
-    }
-    scales = {"depth": _spacing(patches), "cameras": _per_pixel(cameras)}
-    return Probe(function=function, inputs=inputs, scales=scales)
-
-
-def _factorize(stage: nn.Module, seen: Any) -> Probe:  # noqa: ANN401
-    patches = seen.patches
-    carrying = patches.buckets[0].normals_patch is not None
-
-    def function(x: Tensors) -> Tensors:
-        templates = patches.buckets
-        if carrying:
-            templates = _replaced(templates, normals_patch=x["carried normals"])
-        found = stage(
-            seen.replace(
-                patches=patches.replace(buckets=templates),
-                buckets=_replaced(seen.buckets, radiance=x["radiance"]),
-            )
-        )
-        residual = [bucket.convergence.residual for bucket in found.buckets]
-        return {
-            "normals": _gathered(found.buckets, "normals_patch"),
-            "albedo": _gathered(found.buckets, "albedo"),
-            "lights": _gathered(found.buckets, "lights_patch"),
-            "confidence": _gathered(found.buckets, "confidence"),
-            "residual": torch.cat(residual),
-        }
-
-    inputs = {"radiance": _gathered(seen.buckets, "radiance")}
-    if carrying:
-        inputs["carried normals"] = _gathered(patches.buckets, "normals_patch")
-    return Probe(function=function, inputs=inputs, scales={})
-
-
-def _integrate(stage: nn.Module, photometric: Any) -> Probe:  # noqa: ANN401
-    information = _gathered(photometric.buckets, "information")
-
-    def function(x: Tensors) -> Tensors:
-        buckets = _replaced(
-            photometric.buckets,
-            normals_patch=x["normals"],
-            information=information * x["information"],
-        )
-        return {"depth": _gathered(stage(photometric.replace(buckets=buckets)).buckets, "depth")}
-
-    inputs = {
-        "normals": _gathered(photometric.buckets, "normals_patch"),
-        "information": torch.ones_like(information),  # as a factor: none stays none
-    }
-    return Probe(function=function, inputs=inputs, scales={})
-
-
-def _align(stage: nn.Module, depths: Any) -> Probe:  # noqa: ANN401
-    def function(x: Tensors) -> Tensors:
-        found = stage(depths.replace(buckets=_replaced(depths.buckets, depth=x["depth"])))
-        return {"depth": _gathered(found.buckets, "depth")}
-
-    spacing = _spacing(depths.patches)
-    inputs = {"depth": _gathered(depths.buckets, "depth")}
-    return Probe(function=function, inputs=inputs, scales={"depth": spacing})
-
-
-def _refine(stage: nn.Module, depths: Any) -> Probe:  # noqa: ANN401
-    photometric = depths.photometric
-
-    def function(x: Tensors) -> Tensors:
-        buckets = _replaced(photometric.buckets, normals_patch=x["normals"], albedo=x["albedo"])
-        surface = stage(
-            depths.replace(
-                photometric=photometric.replace(buckets=buckets),
-                buckets=_replaced(depths.buckets, depth=x["depth"]),
-            )
-        )
-        return _of_surface(surface)
-
-    inputs = {
-        "depth": _gathered(depths.buckets, "depth"),
-        "normals": _gathered(photometric.buckets, "normals_patch"),
-        "albedo": _gathered(photometric.buckets, "albedo"),
-    }
-    return Probe(function=function, inputs=inputs, scales={"depth": _spacing(depths.patches)})
-
-
-def _sweep(
-    stage: nn.Module,
-    views: Views,
-    cameras: Cameras,
-    seen: Any,  # noqa: ANN401
-    photometric: Any,  # noqa: ANN401
-    _sources: object = None,
-) -> Probe:
-    spacing = _spacing(seen.patches)
-
-    def function(x: Tensors) -> Tensors:
-        patches = seen.patches.replace(buckets=_replaced(seen.patches.buckets, depth=x["depth"]))
-        buckets = _replaced(
-            photometric.buckets, normals_patch=x["normals"], lights_patch=x["lights"]
-        )
-        found = stage(
-            views.replace(images=x["photographs"]),
-            moved_cameras(cameras, x["cameras"]),
-            seen.replace(patches=patches),
-            photometric.replace(buckets=buckets, patches=patches),
-        )
-        return {
-            "offset": _gathered(found.buckets, "offset") / spacing,
-            "information": _gathered(found.buckets, "information") * spacing**2,
-        }
-
-    inputs = {
-        "photographs": views.images,
-        "cameras": _still(cameras),
-        "normals": _gathered(photometric.buckets, "normals_patch"),
-        "lights": _gathered(photometric.buckets, "lights_patch"),
-        "depth": _gathered(seen.patches.buckets, "depth"),
-    }
-    scales = {"depth": spacing, "cameras": _per_pixel(cameras)}
-    return Probe(function=function, inputs=inputs, scales=scales)
-
-
-def _fuse(stage: nn.Module, swept: Any, contours: Any, expected: bool) -> Probe:  # noqa: ANN401
-    photometric = swept.photometric
-    patches = photometric.patches
-    spacing, cloud = _spacing(patches), patches.coarse.points
-    information = _gathered(swept.buckets, "information")
-    certain = _gathered(photometric.buckets, "information")
-
-    def function(x: Tensors) -> Tensors:
-        carrying = patches.replace(buckets=_replaced(patches.buckets, depth=x["depth"]))
-        if cloud is not None:
-            points = cloud.replace(points_world=x["cloud"])
-            carrying = carrying.replace(coarse=patches.coarse.replace(points=points))
-        buckets = _replaced(
-            photometric.buckets,
-            normals_patch=x["normals"],
-            albedo=x["albedo"],
-            information=certain * x["normal information"],
-        )
-        heights = _replaced(
-            swept.buckets, offset=x["offset"], information=information * x["information"]
-        )
-        surface = stage(
-            swept.replace(
-                photometric=photometric.replace(buckets=buckets, patches=carrying),
-                buckets=heights,
-            ),
-            contours,
-            expected,
-        )
-        return _of_surface(surface)
-
-    inputs = {
-        "normals": _gathered(photometric.buckets, "normals_patch"),
-        "albedo": _gathered(photometric.buckets, "albedo"),
-        "normal information": torch.ones_like(certain),
-        "offset": _gathered(swept.buckets, "offset"),
-        "information": torch.ones_like(information),  # as a factor: none stays none
-        "depth": _gathered(patches.buckets, "depth"),
-    }
-    if cloud is not None:
-        inputs["cloud"] = cloud.points_world
-    scales = {"depth": spacing, "cloud": spacing, "offset": spacing}
-    return Probe(function=function, inputs=inputs, scales=scales)
-
-
-def _mend(stage: nn.Module, surface: Any) -> Probe:  # noqa: ANN401
-    def function(x: Tensors) -> Tensors:
-        found = stage(surface.replace(vertices_world=x["vertices"]))
-        return {"vertices": found.vertices_world}
-
-    scale = _step_of(surface.vertices_world, surface.faces)
-    inputs = {"vertices": surface.vertices_world}
-    return Probe(function=function, inputs=inputs, scales={"vertices": scale})
-
-
-def _adapt(stage: nn.Module, swept: Any, surface: Any, contours: Any) -> Probe:  # noqa: ANN401
-    def function(x: Tensors) -> Tensors:
-        found = stage(
-            swept,
-            surface.replace(
-                vertices_world=x["vertices"],
-                normals_world=x["normals"],
-                information=surface.information * x["information"],
-            ),
-            contours,
-        )
-        return {"vertices": found.mesh.vertices_world, "normals": found.mesh.normals_world}
-
-    inputs = {
-        "vertices": surface.vertices_world,
-        "normals": surface.normals_world,
-        "information": torch.ones_like(surface.information),
-    }
-    scale = _step_of(surface.vertices_world, surface.faces)
-    return Probe(function=function, inputs=inputs, scales={"vertices": scale})
-
-
-def _decompose(
-    stage: Callable[..., Any],
-    coarse: CoarseMesh,
-    cameras: Cameras,
-    surface: Any,  # noqa: ANN401
-    scale: float,
-) -> Probe:
-    def function(x: Tensors) -> Tensors:
-        mesh = coarse.mesh.replace(vertices_world=x["facets"])
-        found = stage(
-            coarse.replace(mesh=mesh),
-            cameras,
-            surface.replace(vertices_world=x["vertices"], normals_world=x["normals"]),
-            scale,
-        )
-        return {
-            "depth": _gathered(found.buckets, "depth"),
-            "normals": _gathered(found.buckets, "normals_patch"),
-            "frames": _gathered(found.buckets, "patch_from_world"),
-        }
-
-    step = _step_of(surface.vertices_world, surface.faces)
-    inputs = {
-        "vertices": surface.vertices_world,
-        "normals": surface.normals_world,
-        "facets": coarse.mesh.vertices_world,
-    }
-    return Probe(function=function, inputs=inputs, scales={"vertices": step, "facets": step})
-
-
-def _chain(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> Probe:
-    step = _step_of(coarse.mesh.vertices_world, coarse.mesh.faces)
-
-    def function(x: Tensors) -> Tensors:
-        views = scene.views.replace(images=x["photographs"])
-        mesh = coarse.mesh.replace(vertices_world=x["mesh"])
-        moved = scene.replace(views=views, cameras=moved_cameras(scene.cameras, x["cameras"]))
-        _place(chain, moved, coarse.replace(mesh=mesh))
-        result = chain(moved)
-        found = result.mesh
-        return {
-            "vertices": found.vertices_world,
-            "normals": _known(found.normals_world),
-            "albedo": _known(found.albedo),
-            "lights": _gathered(result.patches.photometric.buckets, "lights_patch"),
-        }
-
-    inputs = {
-        "photographs": scene.views.images,
-        "cameras": _still(scene.cameras),
-        "mesh": coarse.mesh.vertices_world,
-    }
-    scales = {"mesh": step, "cameras": _per_pixel(scene.cameras)}
-    return Probe(function=function, inputs=inputs, scales=scales)
-
-
-def _known(values: Tensor | None) -> Tensor:
-    assert values is not None  # what a chain extracts has all
-    return values
-
-
-def _of_surface(surface: Any) -> Tensors:  # noqa: ANN401
-    return {
-        "vertices": surface.vertices_world,
-        "normals": surface.normals_world,
-        "albedo": surface.albedo,
-        "confidence": surface.confidence,
+def _probe(paths: _Paths, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Probe:
+    # Stages prepare the sources themselves, of photographs that vary.
+    arguments = tuple(None if isinstance(one, Sources) else one for one in arguments)
+    given = {name: _tensors(arguments, inputs[0]) for name, inputs in paths.inputs.items()}
+    given = {name: tensors for name, tensors in given.items() if tensors}
+    starts = {
+        name: [_PARAMETERS.get(name, _VALUES).start(tensor) for tensor in tensors]
+        for name, tensors in given.items()
     }
 
+    def moved(x: Tensors) -> Tensors:
+        replaced: Any = arguments
+        for name, tensors in given.items():
+            parts = torch.split(x[name], [start.numel() for start in starts[name]])
+            values = [
+                _PARAMETERS.get(name, _VALUES).apply(tensor, part.reshape(start.shape))
+                for tensor, start, part in zip(tensors, starts[name], parts, strict=True)
+            ]
+            for path in paths.inputs[name]:
+                replaced = _replaced(replaced, path.split("."), iter(values))
+        result = function(*replaced)
+        return {name: _flat(_tensors(result, path)) for name, path in paths.outputs.items()}
 
-def _step_of(vertices: Float[Tensor, "vertex 3"], faces: Tensor) -> float:
+    scales = {name: _length(arguments) for name in given if name in _LENGTHS}
+    if "cameras" in given:
+        scales["cameras"] = _pixel_angle(arguments)
+    inputs = {name: _flat(tensors) for name, tensors in starts.items()}
+    return Probe(function=moved, inputs=inputs, scales=scales)
+
+
+def _tensors(value: Any, path: str) -> list[Tensor]:  # noqa: ANN401 - records and tuples of them
+    """Give the tensors at a path; none where it ends in ``None``."""
+    found = [value]
+    for name in path.split("."):
+        inner: list[Any] = []
+        for one in found:
+            if isinstance(one, tuple):
+                inner += [one[int(name)]] if name.isdigit() else [getattr(i, name) for i in one]
+            elif one is not None:
+                inner.append(getattr(one, name))
+        found = inner
+    return [one for one in found if one is not None]
+
+
+def _replaced(value: Any, path: list[str], tensors: Iterator[Tensor]) -> Any:  # noqa: ANN401
+    """Replace the tensors that :func:`_tensors` gives, in their order."""
+    if not path:
+        return next(tensors)
+    name, *rest = path
+    if isinstance(value, tuple) and name.isdigit():
+        index = int(name)
+        return (*value[:index], _replaced(value[index], rest, tensors), *value[index + 1 :])
+    if isinstance(value, tuple):
+        return tuple(_replaced(item, path, tensors) for item in value)
+    return value.replace(**{name: _replaced(getattr(value, name), rest, tensors)})
+
+
+def _flat(tensors: list[Tensor]) -> Float[Tensor, " value"]:
+    return torch.cat([tensor.flatten() for tensor in tensors])
+
+
+def _length(arguments: tuple[Any, ...]) -> float:
+    """Give the median edge of a surface, or of the coarse mesh of a scene; else the spacing."""
+    for one in arguments:
+        if isinstance(one, Surface):
+            return _edge(one.vertices_world, one.faces)
+    if isinstance(arguments[0], SparseScene):
+        return _edge(arguments[1].mesh.vertices_world, arguments[1].mesh.faces)
+    patches = (getattr(one, "patches", one) for one in arguments)
+    return next(float(one.buckets[0].spacing[0]) for one in patches if hasattr(one, "buckets"))
+
+
+def _edge(vertices: Float[Tensor, "vertex 3"], faces: Tensor) -> float:
     """Give the median length of the faces' edges."""
     ends = vertices.detach()[faces]
     return float((ends[:, 1] - ends[:, 0]).norm(dim=1).median())
+
+
+def _pixel_angle(arguments: tuple[Any, ...]) -> float:
+    """Give the angle of a pixel, the unit of the cameras' motion."""
+    first = arguments[0]
+    cameras = first.cameras if isinstance(first, SparseScene) else arguments[1]
+    return 1 / float(cameras.intrinsics[:, 0, 0].median())
