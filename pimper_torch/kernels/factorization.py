@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.cholesky import solve_damped
 from pimper_torch.kernels.cone import TILE, update_shading, whitening
-from pimper_torch.kernels.spread import robust_variance
+from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.switch import compiled
 
 Floats = NDArray[np.float32]
@@ -22,7 +22,7 @@ Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # As in ``variable_projection`` and ``bilinear``: damping, steps of the samples, the residual that
-# counts as zero in roundings, minimum spread; and the codes of StopCause.
+# counts as zero in roundings, minimum deviation; and the codes of StopCause.
 _INITIAL_DAMPING, _DAMPING_DECREASE, _DAMPING_INCREASE = 1e-2, 0.2, 5.0
 _SHADING_STEPS = 2
 _ZERO_ROUNDINGS = 30.0
@@ -49,9 +49,9 @@ class Patch(NamedTuple):
         regularization: Of each view.
         slack: Sum of the regularization of the omitted views, times 4.
         num_views: Omitted views included.
-        num_spread: The spread is estimated from so many samples, the first.
-        level: Minimum spread of residuals.
-        scale: Of Cauchy's loss, in spreads; 0 for squares.
+        num_scale: The residual deviation is estimated from so many samples, the first.
+        level: Minimum deviation of residuals.
+        scale: Of Cauchy's loss, in deviations; 0 for squares.
     """
 
     radiance: Floats
@@ -64,7 +64,7 @@ class Patch(NamedTuple):
     regularization: Floats
     slack: float
     num_views: int
-    num_spread: int
+    num_scale: int
     level: float
     scale: float
 
@@ -88,7 +88,7 @@ def _views_that_count(
 
 @compiled()
 def _samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
-    """List the samples with data, those that estimate the spread first, and count the latter."""
+    """List the samples with data, those that estimate the deviation first, and count the latter."""
     seen = np.zeros(given.shape[1], np.bool_)
     for f in range(len(given)):
         row = given[f]
@@ -100,12 +100,12 @@ def _samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
         if seen[k]:
             found[count] = k
             count += 1
-    num_spread = count
+    num_scale = count
     for k in range(len(seen)):
         if seen[k] and k % stride > 0:
             found[count] = k
             count += 1
-    return found[:count], num_spread
+    return found[:count], num_scale
 
 
 @compiled()
@@ -117,7 +117,7 @@ def _packed(
     prior: Floats,
     views: Integers,
     samples: Integers,
-    num_spread: int,
+    num_scale: int,
     scale: float,
 ) -> Patch:
     num_views, num_samples = len(views), len(samples)
@@ -157,7 +157,7 @@ def _packed(
         regularization=own_regularization,
         slack=max(slack, 0.0),
         num_views=len(regularization),
-        num_spread=num_spread,
+        num_scale=num_scale,
         level=_MIN_DEVIATION * size / max(count, 1.0),
         scale=scale,
     )
@@ -177,7 +177,7 @@ def _solve(
     slope, step = np.zeros((len(lights), 4)), np.zeros(size)
     new_slope, new_lights, new_shading = np.zeros_like(slope), lights.copy(), shading.copy()
     curvature, factor = np.zeros((size, size)), np.empty((size, size))
-    spread = _robust_weights(patch, lights, shading, 0.0)
+    scale_start = _robust_weights(patch, lights, shading, 0.0)
     energy = _energy(patch)
     _equations(patch, lights)
     update_shading(patch.equations, shading, _SHADING_STEPS)
@@ -210,7 +210,7 @@ def _solve(
             lights[:], shading[:], slope[:] = new_lights, new_shading, new_slope
             cost = after
             if patch.scale > 0:
-                spread = _robust_weights(patch, lights, shading, spread)
+                scale_start = _robust_weights(patch, lights, shading, scale_start)
                 cost = _evaluate(patch, lights, shading, slope)
         if exact or small >= small_steps:
             return taken, _CONVERGED
@@ -227,12 +227,12 @@ def _robust_weights(patch: Patch, lights: Floats, shading: Floats, start_scale: 
     """Update the robust weights; return the scale that the next call starts from."""
     if patch.scale == 0:
         return 0.0
-    squares = np.empty(patch.radiance.shape[0] * patch.num_spread, np.float32)
+    squares = np.empty(patch.radiance.shape[0] * patch.num_scale, np.float32)
     count = 0
     for f in range(len(lights)):
         _residual(patch, lights[f], shading, f)
         residual_row, given = patch.residual[f], patch.given[f]
-        for k in range(patch.num_spread):
+        for k in range(patch.num_scale):
             squares[count] = residual_row[k] * residual_row[k]
             count += given[k] > 0
     variance, scale = robust_variance(squares[:count], start_scale)
@@ -465,7 +465,7 @@ def solve_on_cone(
         regularization: Weight of the anchor.
         prior: Patch, packed, sample.
         scale: Of Cauchy's loss, in standard deviations; 0 for squares.
-        stride: The spread is estimated from every so many samples.
+        stride: The deviation is estimated from every ``stride``-th sample.
         max_iterations: Maximum number of steps.
         tolerance: See the twin.
         small_steps: See the twin.
@@ -480,7 +480,7 @@ def solve_on_cone(
     limits = (max_iterations, tolerance, small_steps, curvature_samples)
     for p in range(len(radiance)):
         views = _views_that_count(given[p], anchor[p], regularization[p], lights[p])
-        samples, num_spread = _samples_that_count(given[p], stride)
+        samples, num_scale = _samples_that_count(given[p], stride)
         patch = _packed(
             radiance[p],
             given[p],
@@ -489,7 +489,7 @@ def solve_on_cone(
             prior[p],
             views,
             samples,
-            num_spread,
+            num_scale,
             scale,
         )
         light = np.empty((len(views), 4), np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pimper_torch.kernels.cholesky import solve_damped
-from pimper_torch.kernels.spread import robust_variance
+from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.switch import compiled
 
 Doubles = NDArray[np.float64]

@@ -10,9 +10,9 @@ from pimper_torch.kernels.switch import compiled
 Floats = NDArray[np.float32]
 
 # As in ``photometry.robust``: the scale of Gaussian noise of unit deviation, the limits on number
-# and length of Newton's steps, and the gain at which they end.
-_OF_GAUSSIAN = 0.6472404
-_SCALE_STEPS, _LONGEST_GAIN = 40, 1.5
+# and length of Newton's steps, and the step at which they end.
+_GAUSSIAN_SCALE = 0.6472404
+_NEWTON_STEPS, _MAX_STEP = 40, 1.5
 _CLOSE = float(np.finfo(np.float32).eps) ** 0.75
 
 
@@ -28,22 +28,22 @@ def robust_variance(squares: Floats, guess: float) -> tuple[float, float]:
         The variance, 0 where half of the squares are, and the squared scale.
     """
     half = 0.5 * len(squares)
-    total, some = 0.0, 0
+    total, num_positive = 0.0, 0
     for i in range(len(squares)):
         total += squares[i]
-        some += squares[i] > 0
-    if not some > half:
+        num_positive += squares[i] > 0
+    if not num_positive > half:
         return 0.0, 0.0
     scale = guess if guess > 0 else total / len(squares)
-    for _ in range(_SCALE_STEPS):
+    for _ in range(_NEWTON_STEPS):
         fraction, slope = _fractions(squares, np.float32(1 / scale))
-        gain = (fraction - half) / max(slope, 1e-7)
-        scale *= math.exp(min(max(gain, -_LONGEST_GAIN), _LONGEST_GAIN))
-        if abs(gain) < _CLOSE:
+        step = (fraction - half) / max(slope, 1e-7)
+        scale *= math.exp(min(max(step, -_MAX_STEP), _MAX_STEP))
+        if abs(step) < _CLOSE:
             break
     fraction, slope = _fractions(squares, np.float32(1 / scale))
-    off = (fraction - half) / slope if slope > 0 else 0.0
-    return max(scale * (1 + off), 0.0) / _OF_GAUSSIAN**2, scale
+    correction = (fraction - half) / slope if slope > 0 else 0.0
+    return max(scale * (1 + correction), 0.0) / _GAUSSIAN_SCALE**2, scale
 
 
 @compiled(fast=True)

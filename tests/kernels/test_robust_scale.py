@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.kernels.spread import robust_variance as compiled_variance
+from pimper_torch.kernels.robust_scale import robust_variance as compiled_variance
 from pimper_torch.photometry.robust import robust_variance
 
 
