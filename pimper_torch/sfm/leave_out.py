@@ -13,7 +13,12 @@ from torch import Tensor
 
 from pimper_torch.progress import track
 from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.camera_in_place import mapped, reference_from_photographs, shift_px
+from pimper_torch.sfm.camera_in_place import (
+    mapped,
+    reference_from_photographs,
+    shift_px,
+    still_length_px,
+)
 from pimper_torch.sfm.matching import MatchSettings
 from pimper_torch.sfm.static_background import (
     Keypoints,
@@ -100,15 +105,16 @@ def _shifted(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) 
     if maps is None:
         return None
     pixels = [mapped(*one).float() for one in zip(maps, matched.keypoints, strict=True)]
+    still_px = still_length_px(pixels, matched.pairs, _SHIFTED_PX)
 
     def both(pair: Pair) -> int:
-        still = int(is_still(pixels, pair, _SHIFTED_PX).sum())
+        still = int(is_still(pixels, pair, still_px).sum())
         return min(still, len(pair.matches) - still)
 
     some = sorted(matched.pairs, key=both, reverse=True)[:_TRIED]
-    if not _find(pixels, some, verifier, settings, _SHIFTED_PX).rest.room:
+    if not _find(pixels, some, verifier, settings, still_px).rest.room:
         return None
-    found = _find(pixels, track(matched.pairs), verifier, settings, _SHIFTED_PX)
+    found = _find(pixels, track(matched.pairs), verifier, settings, still_px)
     shift = shift_px(maps, matched.keypoints)
     return replace(found, rest=found.rest.replace(shift_px=shift))
 

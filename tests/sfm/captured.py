@@ -88,6 +88,7 @@ def turntable(
     span_deg: float = 330.0,
     shift_px: float = 0.0,
     table: int = 0,
+    moved: float = 0.0,
 ) -> Captured:
     """Turn a ball before a room at rest; things from ``turning`` on are the room's.
 
@@ -100,6 +101,8 @@ def turntable(
         span_deg: Turn of the ball, in all.
         shift_px: The camera pans, so that the middle of its picture shifts by up to so much.
         table: Of the ``turning`` points, those of a plane that turns along.
+        moved: How far the camera moves sideways and up at most, as a part of its distance; the
+            room is up to twice as far behind the ball as the ball is from the camera.
     """
     cameras = orbit(count, span_deg, elevation_deg)
     ball = seen_of_ball(generator, turning - table, cameras)
@@ -110,7 +113,12 @@ def turntable(
         ball = torch.cat([ball, flat], dim=1)
     room = torch.rand(resting, 2, generator=generator, dtype=torch.float64)
     room = room * room.new_tensor([WIDTH, HEIGHT])
-    pixels = torch.cat([ball, room.expand(count, -1, -1)], dim=1)
+    room = room.expand(count, -1, -1)
+    if moved:
+        depth = 1 + torch.rand(resting, 1, generator=generator, dtype=torch.float64)
+        moves = 2 * torch.rand(count, 1, 2, generator=generator, dtype=torch.float64) - 1
+        room = room + FOCAL * moved * moves / depth
+    pixels = torch.cat([ball, room], dim=1)
     return Captured(generator, panned(generator, pixels, shift_px) if shift_px else pixels)
 
 
