@@ -6,12 +6,21 @@ Points that follow one homography a photograph, as before a camera that stays in
 explained by any translation of the camera, or by none: they determine neither depth nor baseline.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.sfm.camera_in_place import both_ways, picture_centre, references, tied_to
-from pimper_torch.sfm.components import ADVICE, MIN_ANGLE_DEG, MOVE, wide_points
+from pimper_torch.sfm.components import (
+    ADVICE,
+    FEWEST_VIEWS,
+    MIN_ANGLE_DEG,
+    MOVE,
+    count_spread_views,
+    wide_points,
+)
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.static_background import Pair
 
@@ -58,6 +67,26 @@ def count_deep_views(model: SparseModel) -> int:
     """Count the views that see most of their points under triangulation angles that tell depth."""
     wide = model.observed[wide_points(model)].sum(dim=0)
     return int((wide > _MOST * model.observed.sum(dim=0)).sum())
+
+
+def count_views_with_depth(models: Sequence[SparseModel], fewest: int) -> list[int]:
+    """Count, model by model, the views that see depth.
+
+    Args:
+        models: Components of one sequence.
+        fewest: Points that a view must see under a triangulation angle of 4 degrees or more.
+
+    Returns:
+        As :func:`~pimper_torch.sfm.components.count_spread_views`, but 0 for a model whose points
+        move as before a camera in its place, where there is another one to go on with.
+    """
+    spread = [count_spread_views(model, fewest) for model in models]
+    moving = [following_fraction(model) <= _MOST_FOLLOWING for model in models]
+    if not any(
+        count >= FEWEST_VIEWS and moves for count, moves in zip(spread, moving, strict=True)
+    ):
+        return spread
+    return [count if moves else 0 for count, moves in zip(spread, moving, strict=True)]
 
 
 def following_fraction(model: SparseModel) -> float:

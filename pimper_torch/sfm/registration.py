@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.sfm.agreement import misplaced_views
-from pimper_torch.sfm.components import FEWEST_VIEWS, count_spread_views, require_motion
+from pimper_torch.sfm.components import FEWEST_VIEWS, require_motion
+from pimper_torch.sfm.doubt import count_views_with_depth
 from pimper_torch.sfm.guided import match_guided
 from pimper_torch.sfm.leave_out import leave_out_room
 from pimper_torch.sfm.mapping import MapSettings, map_views
@@ -52,7 +53,7 @@ class Registration:
     Attributes:
         models: One a component, the one with most views that see depth first.
         spread: How many views of each see depth, see
-            :func:`~pimper_torch.sfm.components.count_spread_views`.
+            :func:`~pimper_torch.sfm.doubt.count_views_with_depth`.
         missing: Files that the first model lacks; all without a model.
         misplaced: Files of the first model whose strongest pairs contradict it, and the fraction of
             the matches in those that agrees.
@@ -166,7 +167,8 @@ def _mapped(
     mapping: MapSettings,
 ) -> Registration:
     found = [drop_weak_views(model, mapping.min_inliers) for model in map_views(space, mapping)]
-    counted = [(count_spread_views(model, mapping.min_inliers), model) for model in found]
+    counts = count_views_with_depth(found, mapping.min_inliers)
+    counted = list(zip(counts, found, strict=True))
     counted.sort(key=lambda one: (-one[0], -one[1].num_views, -len(one[1].points_world)))
     models = tuple(model for _, model in counted)
     registered = models[0].names if models else ()

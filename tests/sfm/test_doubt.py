@@ -4,7 +4,7 @@ import torch
 from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.doubt import doubt, following_fraction
+from pimper_torch.sfm.doubt import count_views_with_depth, doubt, following_fraction
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.scene import assemble_scene, write_model
@@ -99,3 +99,9 @@ def test_points_under_small_angles_are_doubtful_though_they_do_not_follow(genera
     model = model_of(points, cameras.cam_from_world, pixels, generator)
     assert following_fraction(model) < 0.5
     assert "0 of 8 photographs are registered and see most" in doubt(model, 8)
+
+
+def test_of_a_room_and_an_object_the_object_has_depth_and_a_room_alone_is_gone_on_with(generator):
+    room, ball = of_a_room(generator), of_a_ball(generator, 6, 90.0)
+    assert count_views_with_depth([room, ball], 30) == [0, 6]
+    assert count_views_with_depth([room], 30) == [12]

@@ -62,7 +62,11 @@ def told(model, monkeypatch):
         monkeypatch.setattr(registration, "misplaced_views", answers.judge)
         monkeypatch.setattr(registration, "verified_pairs", lambda space: pairs)
         monkeypatch.setattr(registration, "leave_out_room", lambda database, settings: rest)
-        monkeypatch.setattr(registration, "count_spread_views", lambda one, fewest: one.num_views)
+        monkeypatch.setattr(
+            registration,
+            "count_views_with_depth",
+            lambda models, fewest: [one.num_views for one in models],
+        )
         return answers
 
     return tell
