@@ -145,7 +145,10 @@ class Problem(Record):
 
         Where lit surface encloses it, its normals are continued: the shape there is what the
         facets started with, since no pass knew it. Elsewhere the shape is kept. Continued normals
-        of a facet have a common error: together they count as much as one of them.
+        of a facet have a common error: together they count as much as one of them. So do kept
+        slopes within a window of the sweep, or they would outvote its heights: of potatoes under
+        one light for all views, 24 views of 800x600, normals are 9.6 degrees off where each counts
+        by itself, and 7.6, 7.8 and 8.1 where 16, 100 and 300 count as one.
         """
         flat, along, edges = self.subdivision.points, self.directions, self.edges
         transferred, variance = self.blend.heights, self._slope_variance()
@@ -160,11 +163,14 @@ class Problem(Record):
         over = inpainted[edges].any(dim=1) & upright(edges, along, normals)
         kept = ~self.lit & ~over
         sloped = kept & upright(edges, along, self.normals)
+        shape = variance * self.correlated * torch.ones_like(transferred)
         return [
             slopes(edges[over], flat, along, normals, together).replace(
                 correlated=(together / variance)[edges[over]].mean(dim=1), evaluated=False
             ),
-            kept_slopes(edges[sloped], flat, along, self.normals, transferred, variance),
+            kept_slopes(edges[sloped], flat, along, self.normals, transferred, shape).replace(
+                correlated=torch.full_like(transferred[edges[sloped][:, 0]], self.correlated)
+            ),
             kept_steps(edges[kept & ~sloped], flat, transferred, variance),
         ]
 

@@ -125,7 +125,7 @@ def kept_slopes(
     directions: Float[Tensor, "vertex 3"],
     shape: Float[Tensor, "vertex 3"],
     transferred: Float[Tensor, " vertex"],
-    variance: float | Float[Tensor, ""],
+    variance: Float[Tensor, " vertex"],
 ) -> Terms:
     """Say that edges lie as they do on the surface that there is, where light tells nothing.
 
@@ -137,7 +137,7 @@ def kept_slopes(
         transferred: Its heights.
         variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
     """
-    found = slopes(edges, flat, directions, shape, variance * torch.ones_like(transferred))
+    found = slopes(edges, flat, directions, shape, variance)
     return found.replace(
         targets=(found.coefficients * transferred[edges]).sum(dim=1),
         evaluated=False,
