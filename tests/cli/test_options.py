@@ -38,9 +38,11 @@ RUNS = {
         "--supersample 2 --bits 16 --encoding linear --up y --specular 0.1 --roughness 0.2",
         "{ball} --out {out} {tiny} --albedo 0.6 0.5 0.4 --table patterned --rotation-deg 30",
         "{ball} --out {out} {tiny} --conductor copper --environment changing",
-        "{ball} -o {out} {tiny} --path turntable --fixed-point-light --fixed-room --fixed-table",
+        "{ball} -o {out} {tiny} --path turntable --fixed-point-light --fixed-room --fixed-table "
+        "--pan-jitter-px 2 --crop-jitter-px 1",
         "{ball} -o {out} {tiny} --path turntable --no-fixed-point-light --no-fixed-room "
-        "--no-fixed-table",
+        "--no-fixed-table --constant-light",
+        "{ball} -o {out} {tiny} --no-constant-light",
     ],
     "evaluate": [
         "{true_mesh} {scene} -o {out}.json --truth-layout rendered --samples 500 --seed 2 --views "
