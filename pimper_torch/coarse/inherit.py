@@ -1,5 +1,7 @@
 """Normals, points of the cloud and support of a coarse mesh whose facets were split."""
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -10,13 +12,23 @@ from pimper_torch.geometry.surfaces import barycentric_2d, vertex_normals
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Surface
 
-# Weight of the surface's normals, added to their confidence: a twentieth of the best where they
-# follow from their neighbours alone. A choice.
-MIN_WEIGHT = 0.05
+# Standard error of the normals that a facet blends from those of its corners, and the weight of a
+# surface's normals that follow from their neighbours alone, over that of the best: choices.
+_MODEL_ERROR_DEG, _MIN_WEIGHT = 8.0, 0.05
 
 # Weight of the facets' own normals in the fit, in fractions of a typical vertex's data: negligible
 # except where there is none. A choice.
 _DAMPING = 0.01
+
+
+def normal_weights(information: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
+    """Give inverse variances of normals about those that facets blend, relative to the best.
+
+    Args:
+        information: Inverse variance of the normals, one over squared radians.
+    """
+    known = math.radians(_MODEL_ERROR_DEG) ** 2 * information
+    return known / (1 + known) + _MIN_WEIGHT
 
 
 def fitted_normals(
@@ -24,8 +36,8 @@ def fitted_normals(
 ) -> Float[Tensor, "vertex 3"]:
     """Fit vertex normals whose blend over the facets is nearest to the surface's normals.
 
-    Least squares over the subdivided mesh, weighted by confidence; where that has no vertex, the
-    facets' own normals.
+    Least squares over the subdivided mesh, weighted by inverse variances; where that has no
+    vertex, the facets' own normals.
 
     Args:
         mesh: After splitting and dropping.
@@ -38,7 +50,7 @@ def fitted_normals(
     face = index[child]
     (kept,) = torch.nonzero(face >= 0, as_tuple=True)
     face, barycentric = face[kept], barycentric[kept].double()
-    weight = (surface.confidence[kept].double() + MIN_WEIGHT)[:, None] * barycentric
+    weight = normal_weights(surface.information[kept].double())[:, None] * barycentric
     normals = surface.normals_world[kept].double()
     # Facet by facet first: a million subdivided mesh vertices are a few thousand blocks.
     zeros = barycentric.new_zeros(len(faces), 3, 3)

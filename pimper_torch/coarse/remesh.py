@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.contradicted import contradicted, misfit_of
-from pimper_torch.coarse.inherit import MIN_WEIGHT, fitted_normals, with_points
+from pimper_torch.coarse.inherit import fitted_normals, normal_weights, with_points
 from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import require
@@ -92,7 +92,7 @@ class Remesh(Stage):
         photographs contradict (:mod:`~pimper_torch.coarse.contradicted`).
         """
         patches, mesh = swept.patches, swept.patches.coarse.mesh
-        residual = surface.confidence.new_full((patches.num_patches,), torch.nan)
+        residual = surface.information.new_full((patches.num_patches,), torch.nan)
         misfit, seen = residual.clone(), torch.zeros_like(residual, dtype=torch.bool)
         for templates, found, heights in zip(
             patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
@@ -308,7 +308,7 @@ def departures(
 
 def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
     """Give the root mean square angle between the surface's normals and their facet's mean."""
-    weight = surface.confidence + MIN_WEIGHT
+    weight = normal_weights(surface.information)
     total = weight.new_zeros(count, 3)
     total = total.index_add(0, surface.facet, weight[:, None] * surface.normals_world)
     mass = weight.new_zeros(count).index_add(0, surface.facet, weight)
