@@ -16,7 +16,6 @@ from pimper_torch.coarse.matching import level_of
 from pimper_torch.coarse.oriented import OrientedPoints, no_points
 from pimper_torch.coarse.trim import (
     ViewCounts,
-    connected_to,
     enclosed_holes,
     fringes,
     point_distances,
@@ -27,6 +26,7 @@ from pimper_torch.coarse.trim import (
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.topology import connected_to
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, ContourPoints, Record, SparseScene, Support
 from pimper_torch.sfm.surfaces import poisson_surface

@@ -12,7 +12,7 @@ from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.matching import Level
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import component_areas, face_normals, side_lengths
-from pimper_torch.geometry.topology import corners_of, face_components, face_pairs, graph_components
+from pimper_torch.geometry.topology import dilated, face_components, face_pairs, graph_components
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import num_workers, side_by_side
 from pimper_torch.records import Record
@@ -99,16 +99,6 @@ def point_distances(
     return torch.from_numpy(distance).to(queries)
 
 
-def connected_to(
-    faces: Int[Tensor, "face 3"], among: Bool[Tensor, " face"], marked: Bool[Tensor, " face"]
-) -> Bool[Tensor, " face"]:
-    """Mark the connected components of the faces ``among`` that have a marked face."""
-    pairs, _ = face_pairs(faces)
-    label = graph_components(pairs[among[pairs].all(dim=1)], len(faces))
-    count = torch.zeros_like(label).index_add(0, label, (marked & among).long())
-    return among & (count[label] > 0)
-
-
 def without_small_holes(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
@@ -166,22 +156,13 @@ def fringes(
         smallest: Area from which a supported component is not marked.
         rings: Half the width of the widest narrow strip, in faces.
     """
-    core = ~_dilated(faces, ~kept, rings, len(vertices))
-    narrow = kept & ~_dilated(faces, core, rings, len(vertices))
+    core = ~dilated(faces, ~kept, rings, len(vertices))
+    narrow = kept & ~dilated(faces, core, rings, len(vertices))
     pairs, _ = face_pairs(faces)
     label = graph_components(pairs[narrow[pairs].all(dim=1)], len(faces))
     area = component_areas(vertices, faces, label)
     known = component_areas(vertices, faces, label, supported)
     return narrow & ((area < smallest) | (known < area / 2))
-
-
-def _dilated(
-    faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], rings: int, num_vertices: int
-) -> Bool[Tensor, " face"]:
-    """Mark some faces and a number of rings of faces round them."""
-    for _ in range(rings):
-        some = corners_of(faces, some, num_vertices)[faces].any(dim=1)
-    return some
 
 
 def supported_components(

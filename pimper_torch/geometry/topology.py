@@ -67,6 +67,25 @@ def corners_of(
     return _marked(faces[chosen], num_vertices)
 
 
+def dilated(
+    faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], rings: int, num_vertices: int
+) -> Bool[Tensor, " face"]:
+    """Mark some faces and a number of rings of faces round them."""
+    for _ in range(rings):
+        some = corners_of(faces, some, num_vertices)[faces].any(dim=1)
+    return some
+
+
+def connected_to(
+    faces: Int[Tensor, "face 3"], among: Bool[Tensor, " face"], marked: Bool[Tensor, " face"]
+) -> Bool[Tensor, " face"]:
+    """Mark the connected components of the faces ``among`` that have a marked face."""
+    pairs, _ = face_pairs(faces)
+    label = graph_components(pairs[among[pairs].all(dim=1)], len(faces))
+    count = torch.zeros_like(label).index_add(0, label, (marked & among).long())
+    return among & (count[label] > 0)
+
+
 def _marked(vertices: Int[Tensor, "..."], num_vertices: int) -> Bool[Tensor, " {num_vertices}"]:
     marked = torch.zeros(num_vertices, dtype=torch.bool, device=vertices.device)
     marked[vertices.flatten()] = True

@@ -1,8 +1,10 @@
 """Extraction: the joined surface in, one connected mesh out."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -10,11 +12,20 @@ from torch.nn.functional import normalize
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import component_areas
-from pimper_torch.geometry.topology import face_components, vertex_fans
+from pimper_torch.geometry.topology import (
+    boundary_loops,
+    connected_to,
+    dilated,
+    face_components,
+    vertex_fans,
+)
 from pimper_torch.meshing.faults import faults, overturned, stretched
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.records import Mesh, Surface
 from pimper_torch.stage import Stage
+
+# Of a facet's side, half the width below which a surface's end is a shred: a choice.
+_FRAYED = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,9 +65,10 @@ class ExtractConfig:
 class Extract(Stage):
     """Extract the mesh that the photographs support, a manifold.
 
-    Faces without support are dropped, and so are spikes and overturned faces. Of the remaining
-    ones the large components stay, and where two fans of faces met in a vertex only, each gets
-    its own copy. Orientation is the coarse mesh's: counter-clockwise from outside.
+    Faces without support are dropped, and so are spikes and overturned faces, and along borders
+    what is narrower than a facet (:func:`frayed`). Of the remaining ones the large components
+    stay, and where two fans of faces met in a vertex only, each gets its own copy. Orientation is
+    the coarse mesh's: counter-clockwise from outside.
 
     Differentiable: faces are chosen without gradient, and vertices, normals, albedo and
     confidence of those keep theirs.
@@ -95,6 +107,7 @@ class Extract(Stage):
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the fraction "
                 "of missing data that the report gives."
             )
+        faces = faces[~frayed(faces, _FRAYED * facet_side(surface))]
         faces = faces[large_components(vertices, faces, self.config.min_piece)]
         source, faces = vertex_fans(faces)
         return Mesh(
@@ -113,6 +126,37 @@ class Extract(Stage):
             return faults(vertices, faces, facet, config.max_stretch).worst(vertices)
         spikes = stretched(vertices, faces, config.max_stretch)
         return spikes | overturned(vertices, faces, facet) if config.overturned == "all" else spikes
+
+
+def facet_side(surface: Surface) -> float:
+    """Give the side of a typical facet, in edges of the subdivided mesh."""
+    facets = len(torch.unique(surface.facet))
+    return (len(surface.faces) / max(facets, 1)) ** 0.5
+
+
+def frayed(faces: Int[Tensor, "face 3"], reach: float) -> Bool[Tensor, " face"]:
+    """Mark the shreds and flaps that a surface ends in, by a morphological opening.
+
+    Faces within the reach of a border are eroded, and those within the reach of what is left come
+    back: what does not is narrower than twice the reach. Of that, parts are frayed that go on for
+    more than twice the reach, as corners do not, and that are not a piece by themselves. Borders
+    that are shorter than a circle of that radius are small holes, which do not count.
+
+    Args:
+        faces: Of the surface.
+        reach: In edges.
+    """
+    rings, size = round(reach), int(faces.max()) + 1 if len(faces) else 0
+    border, loop = boundary_loops(faces)
+    long = torch.bincount(loop)[loop] >= math.tau * reach if len(loop) else loop > 0
+    if rings == 0 or not bool(long.any()):
+        return torch.zeros_like(faces[:, 0], dtype=torch.bool)
+    at_border = torch.zeros(size, dtype=torch.bool, device=faces.device)
+    at_border[border[long].flatten()] = True
+    eroded = dilated(faces, at_border[faces].any(dim=1), rings - 1, size)
+    opened = dilated(faces, ~eroded, rings, size)
+    ends = connected_to(faces, ~opened, dilated(faces, opened, 1, size))
+    return connected_to(faces, ends, ~dilated(faces, opened, 2 * rings, size))
 
 
 def large_components(

@@ -16,7 +16,6 @@ from pimper_torch.coarse.oriented import (
 )
 from pimper_torch.coarse.trim import (
     ViewCounts,
-    connected_to,
     fringes,
     supported_components,
     without_small_holes,
@@ -27,6 +26,7 @@ from pimper_torch.evidence.scenes.render import render_shape
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.topology import connected_to
 from pimper_torch.records import Support
 from pimper_torch.sfm.surfaces import poisson_surface, simplified
 
