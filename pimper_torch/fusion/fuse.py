@@ -262,7 +262,7 @@ class Fuse(Stage):
         return detail + part(coarse - detail), 2 * iterations
 
     def _heights(self, problem: Problem, shared: Float[Tensor, ""] | None) -> list[Terms]:
-        return [problem.heights(shared)] if self.config.heights else []
+        return problem.heights(shared) if self.config.heights else []
 
     def _fused(
         self, problem: Problem, terms: list[Terms], near: Float[Tensor, " vertex"] | None = None

@@ -124,22 +124,27 @@ class Problem(Record):
             self._common(shared, self.known),
         )
 
-    def heights(self, shared: Float[Tensor, ""] | None = None) -> Terms:
-        """Give the terms of swept heights.
+    def heights(self, shared: Float[Tensor, ""] | None = None) -> list[Terms]:
+        """List the terms of swept heights: with photometric normals, and with coarse ones.
+
+        Light that was fitted to coarse normals is less exact: these have a noise of their own.
 
         Args:
             shared: Variance of the error that the heights of a facet have in common.
         """
-        blend = self.blend
         facing = (self.normals * self.directions).sum(dim=-1)
-        return swept_heights(
-            blend.heights,
-            blend.offsets,
-            blend.offset_information,
-            facing,
-            self.correlated,
-            self._common(shared, upright_heights(blend.offset_information, facing)),
-        )
+        return [
+            swept_heights(
+                self.blend.heights,
+                self.blend.offsets,
+                information,
+                facing,
+                self.correlated,
+                self._common(shared, upright_heights(information, facing)),
+            )
+            for some in (self.blend.seen, ~self.blend.seen)
+            for information in (torch.where(some, self.blend.offset_information, 0),)
+        ]
 
     def unlit(self) -> list[Terms]:
         """List the slopes where no photometric normal is; no residual tells their variances.

@@ -7,7 +7,9 @@ import torch
 from scipy.spatial import Delaunay
 from torch.nn.functional import normalize
 
+from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.fusion.problem import pose
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
@@ -171,3 +173,28 @@ def test_heights_alone_bend_flat_facets_to_the_sphere(cap):
     assert surface.supported.double().mean() > 0.95
     off = off_sphere(surface.vertices_world).abs()
     assert off.median() < 0.06 * SPACING  # facets sag by 0.7; measured 0.042
+
+
+def test_heights_have_a_noise_of_their_own_where_normals_are_coarse(cap):
+    wild = noisy(cap, 0.0, 1.0, torch.Generator().manual_seed(8)).buckets
+    photometry, heights = [], []
+    for templates, found, exact_ones, drawn in zip(
+        cap.patches.buckets, cap.photometric.buckets, cap.buckets, wild, strict=True
+    ):
+        centre = invert_rigid(templates.patch_from_world)[:, :3, 3]
+        lit = (centre[:, 0] > 0)[:, None, None]
+        photometry.append(
+            found.replace(valid=found.valid & lit, information=lit * found.information)
+        )
+        heights.append(exact_ones.replace(offset=torch.where(lit, exact_ones.offset, drawn.offset)))
+    swept = cap.replace(
+        photometric=cap.photometric.replace(buckets=tuple(photometry)), buckets=tuple(heights)
+    )
+    problem = pose(swept, 1.0, True)
+    own, coarse = kinds = problem.heights()
+    assert not torch.isin(own.unknowns, coarse.unknowns).any()
+    terms = [*kinds, problem.slopes(problem.blend.normals_world), *problem.unlit()]
+    fused = fuse_terms(terms, problem.blend.heights, problem.damping, 4)
+    # A fifth of a spacing is claimed: by heights that are exact, and by others that are off by one.
+    assert fused.factors[0] < 0.5
+    assert fused.factors[1] > 5
