@@ -15,8 +15,8 @@ from pimper_torch.records import Mesh, Record
 # depend on the number of threads. Vertices between slices come last.
 _SLICES = 4
 
-# Bounds are doubled so often at most: from one median edge to 16. A choice.
-_DOUBLINGS = 5
+# Bounds are doubled so often at most: from a twentieth of a median edge to 25. A choice.
+_DOUBLINGS = 10
 
 # Edges of which the median is taken: it is certain to a few thousandths.
 _EDGES = 100_000
@@ -149,18 +149,18 @@ def simplify(
 
 
 def with_few_faces(mesh: Mesh, max_faces: int) -> Mesh:
-    """Simplify the shape of a mesh for pictures until it has few faces.
+    """Simplify a mesh for pictures until it has few faces, as faithfully as that allows.
 
     Args:
         mesh: Any; one that is small enough comes back as it is.
         max_faces: Of the result, about: borders stay, however many faces they have.
     """
-    bounds = Bounds(spacings=1.0, angle_deg=180.0)
+    bounds = FAITHFUL
     for _ in range(_DOUBLINGS):
         if len(mesh.faces) <= max_faces:
             break
         mesh = simplify(mesh, bounds).mesh
-        bounds = Bounds(spacings=2 * bounds.spacings, angle_deg=bounds.angle_deg)
+        bounds = Bounds(spacings=2 * bounds.spacings, angle_deg=2 * bounds.angle_deg)
     return mesh
 
 
