@@ -63,7 +63,7 @@ def test_swept_heights_support_a_surface_without_photometric_normals():
     left = columns(surface) <= 5
     heights = torch.where(left, 0, 1.0).double()
     surface = surface.replace(information=heights * 0, height_information=heights)
-    mesh = Extract(ExtractConfig(max_hole=0))(surface)
+    mesh = Extract(ExtractConfig(max_hole=0.0))(surface)
     assert columns(mesh).min() == 6
     assert (mesh.confidence == 0).all()
 

@@ -51,7 +51,7 @@ def test_an_aim_is_better_than_the_centre_of_the_box(generator):
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64)
     points[:, 2] **= 4  # most of it low
     toward = arc_directions(5, span_deg=50.0, elevation_deg=40.0, sway_deg=4.0)
-    view = {"focal_px": 100.0, "width": 80, "height": 60, "fill": 0.9}
+    view = {"focal_px": 100.0, "width": 80.0, "height": 60.0, "fill": 0.9}
 
     def size(target, distance):
         """Of a point of the centre in the pictures, on average."""
