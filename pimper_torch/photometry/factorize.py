@@ -26,7 +26,7 @@ from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, in_row, on_raster, rows_of
 from pimper_torch.photometry.sample_estimates import fit_albedo, initial_shading, refine_on_manifold
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
-from pimper_torch.photometry.status import patch_status, warn_of_undetermined
+from pimper_torch.photometry.status import light_varies, patch_status, warn_of_undetermined
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import (
     Observations,
@@ -251,7 +251,10 @@ class Factorize(Stage):
         illuminated: Bool[Tensor, "patch view height width"],
         field: LightField,
     ) -> _Prepared:
-        """Pose the problem; where light determines no normals, samples in shadow take part."""
+        """Pose the problem; under light that never moves, samples in shadow take part.
+
+        There shadows are at rest on the surface; elsewhere they move over it as false texture.
+        """
         config = self.config
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
         centre = invert_rigid(patch_from_world)[:, :3, 3]
@@ -270,7 +273,10 @@ class Factorize(Stage):
         )
         raster = bucket.normals.shape[1] * bucket.normals.shape[2]
         refused = status != int(PatchStatus.DETERMINED)
-        rows = rows.only(lit | (rows.seen & refused[:, None, None]))
+        shown = rows.seen.sum(dim=2)
+        fraction = shown / shown.amax(dim=1, keepdim=True).clamp_min(1)
+        at_rest = refused & ~light_varies(anchor, fraction, config.min_light_variation)
+        rows = rows.only(lit | at_rest[:, None, None])
         anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
         problem = self._problem(rows, anchor, refused, raster)
         return _Prepared(rows=rows, status=status, problem=problem)

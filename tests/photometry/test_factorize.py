@@ -136,8 +136,12 @@ def test_without_normals_a_patch_still_has_its_own_lights_and_albedo(scene):
         assert (bucket.observed == one.valid.any(dim=1)).all()
 
 
-def test_a_patch_in_shadow_has_lights_and_albedo_of_the_shadow(scene, monkeypatch):
-    true = scene(bumps=0.0)
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_patch_in_shadow_has_albedo_of_the_shadow_where_that_is_at_rest(
+    scene, monkeypatch, moves
+):
+    light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
+    true = scene(bumps=0.0, lights=None if moves else light.expand(12, 4))
 
     def illuminated(bucket, _):
         return bucket.registered.valid & (bucket.templates.facet != 1)[:, None, None, None]
@@ -146,10 +150,14 @@ def test_a_patch_in_shadow_has_lights_and_albedo_of_the_shadow(scene, monkeypatc
     with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
         found = Factorize()(true.seen).buckets[0]
     observations = true.seen.buckets[0]
+    seen = observations.valid[1]
+    assert not found.valid[1].any()
+    if moves:
+        assert not found.observed[1].any()
+        return
     basis = harmonics(coarse_normals(true.seen.patches.coarse, true.seen.patches.buckets[0]))
     shading = torch.einsum("fi,hwi->fhw", found.lights_patch[1], basis[1])
-    predicted, seen = shading * found.albedo[1].mean(dim=-1), observations.valid[1]
-    assert not found.valid[1].any()
+    predicted = shading * found.albedo[1].mean(dim=-1)
     assert (found.observed[1] == seen.any(dim=0)).all()
     assert_close(predicted[seen], observations.gray[1][seen], rtol=0.01, atol=0)
 
