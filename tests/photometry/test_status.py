@@ -23,14 +23,16 @@ def test_light_varies_as_the_third_singular_value_says(generator):
 
 @pytest.mark.parametrize(
     ("patch", "status"),
-    enumerate(
-        [
-            PatchStatus.DETERMINED,
-            PatchStatus.CONSTANT_LIGHT,
-            PatchStatus.FEW_VIEWS,
-            PatchStatus.NOT_FINITE,
-            PatchStatus.UNSEEN,
-        ]
+    list(
+        enumerate(
+            [
+                PatchStatus.DETERMINED,
+                PatchStatus.CONSTANT_LIGHT,
+                PatchStatus.FEW_VIEWS,
+                PatchStatus.NOT_FINITE,
+                PatchStatus.UNSEEN,
+            ]
+        )
     ),
 )
 def test_a_patch_has_the_first_status_that_applies(generator, patch, status):
