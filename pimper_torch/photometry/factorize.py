@@ -298,7 +298,8 @@ class Factorize(Stage):
         determined = status == int(PatchStatus.DETERMINED)
         valid = enough_views & determined[:, None] & finite_normals & (found.normals[..., 2] < 0)
         fitted = factors.lights.isfinite().flatten(1).all(dim=1) & rows.seen.flatten(1).any(dim=1)
-        lights = torch.where(fitted[:, None, None], factors.lights, problem.anchor)
+        lights = torch.where(fitted[:, None, None], factors.lights.detach(), problem.anchor)
+        lights = torch.where(determined[:, None, None], factors.lights, lights)
         lights = lights * rows.seen.any(dim=2)[..., None]
         chosen = torch.where(valid[..., None], found.normals, rows.normals)
         weight = torch.where(determined[:, None, None], factors.weight, problem.weight)
