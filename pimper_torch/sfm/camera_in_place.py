@@ -135,6 +135,8 @@ def tied_to(
     max_error_px: float,
     fewest: int,
     generator: torch.Generator,
+    *,
+    any_homography: bool = True,
 ) -> dict[int, tuple[Float[Tensor, "3 3"], Bool[Tensor, " match"]]]:
     """Map photographs to a reference, each by itself.
 
@@ -144,13 +146,14 @@ def tied_to(
         max_error_px: Distance up to which a match follows a map.
         fewest: Matches that tie a photograph.
         generator: Of random numbers.
+        any_homography: See :func:`fit_map`.
 
     Returns:
         The map to the reference of each photograph that can be tied, and the matches that follow.
     """
     tied = {}
     for view, (here, there) in matched.items():
-        found = fit_map(there, here, centre, max_error_px, generator)
+        found = fit_map(there, here, centre, max_error_px, generator, any_homography=any_homography)
         if found is not None and found[1].sum() >= fewest:
             tied[view] = found
     return tied
@@ -174,6 +177,8 @@ def fit_map(
     centre: Float[Tensor, " 2"],
     max_error_px: float,
     generator: torch.Generator,
+    *,
+    any_homography: bool = True,
 ) -> tuple[Float[Tensor, "3 3"], Bool[Tensor, " match"]] | None:
     """Find the map of a camera in its place that most matches follow, and which do.
 
@@ -186,6 +191,8 @@ def fit_map(
         centre: Of the picture, where the camera's axis meets it.
         max_error_px: Distance up to which a match follows.
         generator: Of the hypotheses.
+        any_homography: Whether the last fits are of all homographies, which large turns need: a
+            plane seen from round it follows them, too, and no similarity with a perspective row.
 
     Returns:
         ``None`` where no hypothesis is a small zoom and roll.
@@ -209,9 +216,8 @@ def fit_map(
     for step in range(_ITERATIONS):
         if follows.sum() < 8:
             break
-        matrix = least_squares_map(
-            first[follows], second[follows], centre if step < _ITERATIONS // 2 else None
-        )
+        free = any_homography and step >= _ITERATIONS // 2
+        matrix = least_squares_map(first[follows], second[follows], None if free else centre)
         follows = (mapped(matrix, first) - second).norm(dim=1) < max_error_px
     return matrix, follows
 

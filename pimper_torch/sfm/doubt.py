@@ -2,8 +2,9 @@
 
 A model can be consistent with every match that it was made of, and wrong: photographs that are
 cropped round an object that turns show the room as a camera would that shifts before a wall.
-Points that follow one homography a photograph, as before a camera that stays in its place, are
-explained by any translation of the camera, or by none: they determine neither depth nor baseline.
+Points that move as before a camera that stays in its place are explained by any translation of the
+camera, or by none: they determine neither depth nor baseline. Those of a plane that is seen from
+round it move by homographies that shear, and do.
 """
 
 from collections.abc import Sequence
@@ -26,12 +27,12 @@ from pimper_torch.sfm.static_background import Pair
 
 # Points that two views share, below which nothing is said of them.
 _FEWEST = 15
-# Distance from where a homography maps a point, up to which it follows, in longer sides of the
-# photograph: 2 px of 800, or 0.09 degrees of parallax with a normal lens.
+# Distance from where such a camera's map takes a point, up to which it follows, in longer sides of
+# the photograph: 2 px of 800, or 0.09 degrees of parallax with a normal lens.
 _MAX_ERROR = 0.0025
 # Median over views of the points that follow, above which a model is not believed: 0.93 to 0.98 in
-# wrong models of 4 turntables whose room shifts, 0.00 to 0.21 in right ones (the skull's 66 and 24,
-# 6 turntables, and the true points of 10 rendered arcs and turntables).
+# wrong models of 3 turntables whose room shifts, 0.00 to 0.32 in right ones (the skull's 24, 5
+# rendered arcs, one of points on a table alone, and 4 turntables).
 _MOST_FOLLOWING = 0.5
 # Fraction of the photographs that must see most of their points under real angles for a model to be
 # believed, and fraction of the points: most.
@@ -103,7 +104,7 @@ def following_fraction(model: SparseModel) -> float:
             if view != reference
         ]
         matched = both_ways(pixels, pairs)[reference]
-        tied = tied_to(matched, centre, max_error_px, _FEWEST, generator)
+        tied = tied_to(matched, centre, max_error_px, _FEWEST, generator, any_homography=False)
         fractions = torch.zeros(max(model.num_views - 1, 1))
         for slot, (_, follows) in enumerate(tied.values()):
             fractions[slot] = follows.double().mean()

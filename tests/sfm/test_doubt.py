@@ -8,7 +8,7 @@ from pimper_torch.sfm.doubt import count_views_with_depth, doubt, following_frac
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.scene import assemble_scene, write_model
-from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, orbit, seen_of_ball
+from tests.sfm.captured import FOCAL, HEIGHT, UP, WIDTH, orbit, seen_of_ball
 
 LENS = Lens(
     camera=1,
@@ -70,6 +70,16 @@ def test_an_object_seen_from_round_it_is_believed(generator, count, span_deg):
     model = of_a_ball(generator, count, span_deg)
     assert following_fraction(model) < 0.3
     assert doubt(model, model.num_views) == ""
+
+
+def test_points_on_a_table_seen_from_round_it_are_believed(generator):
+    cameras, up = orbit(12, 50.0), torch.tensor(UP, dtype=torch.float64)
+    points = 2 * torch.rand(400, 3, generator=generator, dtype=torch.float64) - 1
+    points -= (points @ up)[:, None] * up
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    model = model_of(points, cameras.cam_from_world, pixels, generator)
+    assert following_fraction(model) < 0.3
+    assert doubt(model, 12) == ""
 
 
 def test_a_model_of_less_than_half_of_the_photographs_is_doubtful(generator):
