@@ -41,10 +41,9 @@ def rows_of(
     index = torch.argsort((~inside).to(torch.uint8), dim=1, stable=True)[:, :longest]
     within = inside.gather(1, index)
     num_views, num_channels = registered.radiance.shape[1:3]
-    by_view = index[:, None].expand(-1, num_views, -1)
-    by_channel = by_view[:, :, None].expand(-1, -1, num_channels, -1)
+    by_channel = index[:, None, None].expand(-1, num_views, num_channels, -1)
     radiance = registered.radiance.flatten(3).gather(3, by_channel)
-    seen = registered.valid.flatten(2).gather(2, by_view) & within[:, None]
+    seen = in_row(registered.valid, index) & within[:, None]
     # A sum is finite where all its terms are, but for overflow.
     seen = seen & radiance.sum(dim=2).isfinite()
     return Rows(

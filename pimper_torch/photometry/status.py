@@ -35,9 +35,8 @@ def patch_status(
         min_light_variation: See :func:`light_varies`.
     """
     count = seen.sum(dim=2)
-    fraction = count / count.amax(dim=1, keepdim=True).clamp_min(1)
     status = torch.zeros_like(count[:, 0])
-    varies = light_varies(lights, fraction, min_light_variation)
+    varies = light_varies(lights, count, min_light_variation)
     status[~varies] = int(PatchStatus.CONSTANT_LIGHT)
     status[~(seen.sum(dim=1) >= min_views).any(dim=1)] = int(PatchStatus.FEW_VIEWS)
     status[~finite] = int(PatchStatus.NOT_FINITE)
@@ -47,17 +46,17 @@ def patch_status(
 
 def light_varies(
     lights: Float[Tensor, "patch view rank"],
-    fraction: Float[Tensor, "patch view"],
+    weight: Float[Tensor, "patch view"] | Int[Tensor, "patch view"],
     min_ratio: float,
 ) -> Bool[Tensor, " patch"]:
     r"""Tell in which patches the light changes enough between the views.
 
     A shading vector has three degrees of freedom: the third singular value of the matrix of
     lights, over the first, must reach ``min_ratio``. Lights are normalized, so that exposure does
-    not matter, and weighted by the fraction of the patch that their view sees.
+    not matter, and weighted, as by the samples that their view sees; a common factor cancels.
     """
     unit = (lights / lights.norm(dim=2, keepdim=True).clamp_min(1e-30)).double()
-    moment = unit.mT @ (fraction.double()[..., None] * unit)
+    moment = unit.mT @ (weight.double()[..., None] * unit)
     values = torch.linalg.eigvalsh(moment).clamp_min(0)
     return (values[:, -3] > 0) & (values[:, -3] >= min_ratio**2 * values[:, -1])
 
@@ -84,7 +83,7 @@ def warn_of_undetermined(
     parts = [text.format(statuses[code]) for code, text in causes.items() if statuses[code]]
     caution(
         f"Factorization: {undetermined} of {total} patches keep the normals of the coarse mesh: "
-        f"{'; '.join(parts)}. There heights come from texture alone. "
+        f"{'; '.join(parts)}. Their shape is the coarse mesh's, and what swept heights tell. "
         "Photograph these sides under more positions of the light, or lower "
         "`factorize.min_views` or `factorize.min_light_variation`."
         f"{_DOUBT if 2 * statuses[PatchStatus.CONSTANT_LIGHT] > total else ''}",
