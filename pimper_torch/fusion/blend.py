@@ -191,13 +191,13 @@ def _estimates(
     xy = points[..., :2]
     raster = templates.origin, templates.spacing
     valid, observed = photometry.valid, photometry.observed
-    known = sample_raster(valid[:, None].to(height_field.depth), xy, *raster)[:, 0]
     normals_world = photometry.normals_patch @ templates.patch_from_world[:, None, :3, :3]
     certain = photometry.information[..., None]
     layers = torch.cat([certain, certain * normals_world], dim=-1)
     normal = sample_raster(layers.movedim(-1, 1), xy, *raster, valid=valid)
-    layers = torch.cat([observed[..., None].to(layers), photometry.albedo], dim=-1)
-    albedo = sample_raster(layers.movedim(-1, 1), xy, *raster)
+    where = torch.stack([valid, observed], dim=-1).to(layers)
+    layers = torch.cat([where, photometry.albedo], dim=-1)
+    known, albedo = sample_raster(layers.movedim(-1, 1), xy, *raster).tensor_split([1], dim=1)
     offset = normal.new_zeros(normal.shape[0], 2, normal.shape[2])
     if swept is not None:
         layers = torch.stack([swept.information, swept.information * swept.offset], dim=1)
@@ -207,7 +207,7 @@ def _estimates(
         height=((points - origins) * along).sum(dim=-1)[found],
         weight=weight[found],
         scale=templates.spacing[:, None].expand_as(weight)[found],
-        known=known[found],
+        known=known[:, 0][found],
         normal=normal.movedim(1, -1)[found],
         albedo=albedo.movedim(1, -1)[found],
         offset=offset.movedim(1, -1)[found],

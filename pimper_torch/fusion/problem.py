@@ -132,29 +132,27 @@ class Problem(Record):
         Args:
             shared: Variance of the error that the heights of a facet have in common.
         """
-        facing = (self.normals * self.directions).sum(dim=-1)
-        return [
-            swept_heights(
-                self.blend.heights,
-                self.blend.offsets,
-                information,
-                facing,
-                self.correlated,
-                self._common(shared, upright_heights(information, facing)),
+        blend, facing = self.blend, (self.normals * self.directions).sum(dim=-1)
+
+        def of(some: Bool[Tensor, " vertex"]) -> Terms:
+            information = torch.where(some, blend.offset_information, 0)
+            together = self._common(shared, upright_heights(information, facing))
+            return swept_heights(
+                blend.heights, blend.offsets, information, facing, self.correlated, together
             )
-            for some in (self.blend.seen, ~self.blend.seen)
-            for information in (torch.where(some, self.blend.offset_information, 0),)
-        ]
+
+        return [of(blend.seen), of(~blend.seen)]
 
     def unlit(self) -> list[Terms]:
-        """List the slopes where no photometric normal is; no residual tells their variances.
+        """List the slopes where no photometric normal is.
 
         Where lit surface encloses it, its normals are continued: the shape there is what the
         facets started with, since no pass knew it. Elsewhere the shape is kept. Continued normals
         of a facet have a common error: together they count as much as one of them. So do kept
-        slopes within a window of the sweep, or they would outvote its heights, by which they are
-        evaluated: potatoes under one light for all views, 24 views of 800x600, have normals that
-        are 7.9 degrees off, and 9.6 where each kept slope counts by itself.
+        slopes within a window of the sweep, or they would outvote its heights. Where there are
+        heights, these tell the variance of kept slopes; elsewhere no residual does. Potatoes under
+        one light for all views, 24 views of 800x600, have normals that are 7.9 degrees off, and
+        9.6 where each kept slope counts by itself.
         """
         flat, along, edges = self.subdivision.points, self.directions, self.edges
         transferred, variance = self.blend.heights, self._slope_variance()
