@@ -10,7 +10,7 @@ from torch import Tensor
 from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.projection import triangulate_rays
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
-from pimper_torch.silhouettes.hull import Everywhere, HalfSpace, Hull, visual_hull
+from pimper_torch.silhouettes.hull import Everywhere, Hull, visual_hull
 from pimper_torch.silhouettes.rays import RayConfig, contour_rays
 from pimper_torch.silhouettes.tangency import contour_points
 from pimper_torch.stage import Stage
@@ -49,12 +49,7 @@ class Contours(Record):
         )
         hull, plane = Everywhere.of(cameras), silhouettes.plane_world
         if plane is not None:
-            hull = HalfSpace(
-                origin_world=hull.origin_world,
-                spacing=hull.spacing,
-                distance=hull.distance,
-                plane_world=plane.to(like),
-            )
+            hull = hull.above(plane[:3], -plane[3])
         return cls(silhouettes=silhouettes, rays=rays, cameras=cameras, hull=hull)
 
     @property

@@ -114,6 +114,16 @@ class Everywhere(Hull):
             distance=like.new_full((1, 1, 1), torch.inf),
         )
 
+    def above(self, normal_world: Float[Tensor, "3"], offset: Float[Tensor, ""]) -> "HalfSpace":
+        """Keep what is above a plane."""
+        return HalfSpace(
+            origin_world=self.origin_world,
+            spacing=self.spacing,
+            distance=self.distance,
+            normal_world=normal_world.to(self.origin_world),
+            offset=offset.to(self.origin_world),
+        )
+
     def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Say that points lie infinitely deep inside."""
         return torch.full_like(points_world[..., 0], torch.inf)
@@ -127,17 +137,18 @@ class HalfSpace(Everywhere):
     on the plane is not held.
 
     Attributes:
-        plane_world: Has a positive product with what it holds, ``(x, y, z, 1)``.
+        normal_world: Of the plane, unit, into the half space.
+        offset: The plane is where the normal's product with a point is this.
     """
 
-    plane_world: Float[Tensor, "4"]
+    normal_world: Float[Tensor, "3"]
+    offset: Float[Tensor, ""]
 
     def holds(
         self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
     ) -> Bool[Tensor, "*batch"]:
         """Mark points above the plane; the tolerance is of silhouettes."""
-        plane = self.plane_world.to(points_world)
-        return points_world @ plane[:3] + plane[3] > 0
+        return points_world @ self.normal_world.to(points_world) > self.offset.to(points_world)
 
 
 def visual_hull(
