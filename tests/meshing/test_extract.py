@@ -4,8 +4,7 @@ import trimesh
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, ReconstructionError
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.meshing.extract import Extract, ExtractConfig, frayed
+from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.records import Convergence, Surface
 
@@ -13,7 +12,7 @@ SIDE = 21
 
 
 def sheet(side=SIDE, information=None):
-    """A gently bent square sheet of unit steps, seen from -z; two facets."""
+    """A gently bent square sheet of unit steps, seen from -z; a facet a vertex."""
     row, column = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
     x, y = column.flatten().double(), row.flatten().double()
     vertices = torch.stack([x, y, 0.01 * x * x], dim=1)
@@ -26,7 +25,7 @@ def sheet(side=SIDE, information=None):
     return Surface(
         vertices_world=vertices,
         faces=faces,
-        facet=(y > x).long(),
+        facet=torch.arange(len(x)),
         barycentric=torch.full_like(vertices, 1 / 3),
         normals_world=torch.nn.functional.normalize(normals, dim=-1),
         albedo=vertices / side,
@@ -198,22 +197,3 @@ def test_faces_with_a_large_expected_error_are_cut_out():
 def test_settings_that_mean_nothing_are_refused(name, value):
     with pytest.raises(ConfigError, match=name):
         ExtractConfig(**{name: value})
-
-
-def test_strips_narrower_than_twice_the_reach_are_frayed_and_tongues_and_small_holes_are_not():
-    surface = sheet(41)
-    place = surface.vertices_world[surface.faces].mean(dim=1)
-    x, y = place[:, 0], place[:, 1]
-    body, strip, tongue = x < 25, (y > 5) & (y < 9), (y > 15) & (y < 35)
-    hole = ((x - 12).abs() < 1.2) & ((y - 20).abs() < 1.2)
-    kept = (body | strip | tongue) & ~hole
-    found = frayed(surface.faces[kept], 4.0)
-    x, y, strip, tongue, body = (each[kept] for each in (x, y, strip, tongue, body))
-    assert found[strip & (x > 27)].all()
-    assert not found[~strip].any()
-    assert not frayed(surface.faces[kept], 0.4).any()
-
-
-def test_a_closed_surface_has_no_border_to_fray():
-    _, faces = icosphere(3)
-    assert not frayed(faces, 5.0).any()

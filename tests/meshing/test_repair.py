@@ -134,7 +134,7 @@ def test_a_genuine_opening_stays_as_it_is():
     _, surface = folded_sphere()
     below = (surface.vertices_world[:, 2] > -0.3) & (surface.vertices_world[:, 0] > -0.9)
     bowl = surface.replace(faces=surface.faces[below[surface.faces].all(dim=1)])
-    mesh = Extract()(Repair()(bowl))
+    mesh = Repair()(bowl)
     contours = [
         {tuple(row) for row in points[boundary_loops(faces)[0]].flatten(1).tolist()}
         for points, faces in (

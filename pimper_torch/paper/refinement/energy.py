@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.subdivision import Subdivision
-from pimper_torch.geometry.topology import face_pairs
-from pimper_torch.paper.refinement.finite_elements import (
+from pimper_torch.geometry.finite_elements import (
     Elements,
     cotangent_laplacian,
     elements,
     lumped_mass,
 )
+from pimper_torch.geometry.subdivision import Subdivision
+from pimper_torch.geometry.topology import face_pairs
 from pimper_torch.records import Record
 
 # Fidelity, as a fraction of the usual, that ties what no patch supports to the flat facets: it

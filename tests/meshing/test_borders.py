@@ -1,0 +1,81 @@
+import math
+
+import pytest
+import torch
+import trimesh
+
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.meshing.borders import protruding
+
+LENGTH = 3.0
+
+
+def sheet(side=61):
+    """Vertices and faces of a square sheet of unit steps, bent a little, and the faces' middles."""
+    row, column = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
+    x, y = column.flatten().double(), row.flatten().double()
+    vertices = torch.stack([x, y, 0.003 * x * x], dim=1)
+    here = (row[:-1, :-1] * side + column[:-1, :-1]).flatten()
+    right, below, across = here + 1, here + side, here + side + 1
+    faces = torch.cat(
+        [torch.stack([here, below, across], dim=1), torch.stack([here, across, right], dim=1)]
+    )
+    return vertices, faces, vertices[faces].mean(dim=1)[:, :2]
+
+
+def test_straight_borders_stay_and_right_angles_are_rounded():
+    vertices, faces, middle = sheet()
+    found = protruding(vertices, faces, LENGTH)
+    corner = torch.tensor([[0.0, 0.0], [0.0, 60.0], [60.0, 0.0], [60.0, 60.0]]).double()
+    away = torch.cdist(middle, corner).amin(dim=1)
+    assert found[away < LENGTH].all()
+    assert not found[away > 3.5 * LENGTH].any()
+
+
+@pytest.mark.parametrize("radius", [6.0, 9.0])
+def test_a_round_border_of_a_few_lengths_stays(radius):
+    vertices, faces, middle = sheet()
+    disc = (middle - 30).norm(dim=1) < radius * LENGTH
+    found = protruding(vertices, faces[disc], LENGTH)
+    assert not found[(middle[disc] - 30).norm(dim=1) < radius * LENGTH - 2].any()
+
+
+def test_teeth_of_a_length_are_cut_off_and_the_notches_between_them_stay():
+    vertices, faces, middle = sheet()
+    x, y = middle.unbind(dim=1)
+    height = 5 * (1 - ((y / 3) % 2 - 1).abs())  # teeth 6 wide and 5 high
+    kept = x < 30 + height
+    found = protruding(vertices, faces[kept], LENGTH)
+    x, y = x[kept], y[kept]
+    inside = (y > 14) & (y < 46)
+    assert found[inside & (x > 34)].all()
+    assert not found[inside & (x > 12) & (x < 29)].any()
+
+
+def test_flaps_and_shreds_go_as_far_as_they_are_narrow():
+    vertices, faces, middle = sheet()
+    x, y = middle.unbind(dim=1)
+    body, flap = x < 30, (y - 30).abs() < 0.7 * LENGTH
+    kept = body | flap
+    found = protruding(vertices, faces[kept], LENGTH)
+    assert found[x[kept] > 30 + LENGTH].all()
+    inside = (x > 8) & (x < 28) & (y > 8) & (y < 52)
+    assert not found[inside[kept]].any()
+
+
+def test_small_holes_are_no_borders_and_neither_is_a_closed_surface():
+    vertices, faces, middle = sheet()
+    round_hole = (middle - 30).norm(dim=1) < 0.9 * LENGTH
+    kept = faces[~round_hole]
+    near = ((middle - 30).norm(dim=1) < 15)[~round_hole]
+    assert not protruding(vertices, kept, LENGTH)[near].any()
+    ball, closed = icosphere(3)
+    assert not protruding(ball, closed, 0.2).any()
+
+
+def test_scale_and_place_change_nothing():
+    vertices, faces, middle = sheet()
+    kept = faces[(middle[:, 0] < 30) | ((middle[:, 1] - 30).abs() < 2)]
+    turn = torch.tensor(trimesh.transformations.rotation_matrix(math.pi / 5, [1, 2, 3])[:3, :3])
+    moved = 0.01 * vertices @ turn.T + 7
+    assert torch.equal(protruding(vertices, kept, LENGTH), protruding(moved, kept, 0.01 * LENGTH))
