@@ -20,10 +20,10 @@ import torch
 from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, face_counts, face_edges, half_edges
@@ -124,9 +124,11 @@ def thin_plate(
     corners = mesh.vertices_world.double()[mesh.faces]
     edge = side_lengths(corners).median()
     rim = boundary_vertices(subdivision.faces, len(points))
-    operator, mass = _laplacian(subdivision)
+    flat = elements(points, subdivision.faces)
+    one = torch.ones_like(flat.area)
+    rows, cols, values = cotangent_laplacian(flat, one, _MIN_SHAPE)
+    mass = lumped_mass(flat, one)
     keep = torch.where(rim, 0, 1 / mass.sqrt())
-    rows, cols, values = operator
     count = len(points)
     parts = [
         _gram((rows, cols, values * keep[rows]), count, count),
@@ -148,26 +150,6 @@ def thin_plate(
         what="the smoothing of the coarse mesh",
     )
     return factor.solve(rhs + 1e-9 * regularization.mean() * points).to(subdivision.points)
-
-
-def _laplacian(subdivision: Subdivision) -> tuple[Entries, Float[Tensor, " vertex"]]:
-    """Give the cotangent Laplacian of the flat facets, integrated, and the lumped masses."""
-    corners = subdivision.points.double()[subdivision.faces]
-    doubled = face_normals(subdivision.points.double(), subdivision.faces)
-    opposite = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
-    least = _MIN_SHAPE * opposite.square().sum(dim=-1).amax(dim=1)
-    area = torch.maximum(doubled.norm(dim=-1) / 2, least)
-    gradients = torch.linalg.cross(
-        normalize(doubled, dim=-1)[:, None].expand_as(opposite), opposite
-    )
-    blocks = (gradients @ gradients.mT) / (4 * area)[:, None, None]
-    rows = subdivision.faces[:, :, None].expand_as(blocks).flatten()
-    cols = subdivision.faces[:, None, :].expand_as(blocks).flatten()
-    fraction = (area / 3).repeat_interleave(3)
-    mass = fraction.new_zeros(len(subdivision.points)).index_add(
-        0, subdivision.faces.flatten(), fraction
-    )
-    return (rows, cols, blocks.flatten()), mass
 
 
 def _gram(
