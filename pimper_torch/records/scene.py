@@ -1,7 +1,7 @@
 """What structure from motion finds, and triangle meshes."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import torch
@@ -32,6 +32,11 @@ class Lens(Record):
     height: int
 
 
+def no_maps() -> Float[Tensor, "0 3 3"]:
+    """List no maps."""
+    return torch.zeros(0, 3, 3)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SparseScene(Record):
     """Cameras, undistorted photographs and a sparse cloud with its tracks.
@@ -48,6 +53,9 @@ class SparseScene(Record):
         unregistered: Names of the photographs that found no place in the model.
         doubt: Why the cameras may be wrong, and what to do; empty where nothing speaks against
             them.
+        background_from_view: Maps from homogeneous pixels of each undistorted photograph to those
+            where the background is at rest before which the object turns; NaN where a view shows
+            too little of it. Empty without such a background.
     """
 
     views: Views
@@ -60,6 +68,7 @@ class SparseScene(Record):
     lenses: tuple[Lens, ...]
     unregistered: tuple[str, ...] = ()
     doubt: str = ""
+    background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List what does not belong together."""
@@ -75,6 +84,9 @@ class SparseScene(Record):
             yield "observation_point", found, f"indices of {count} points"
         if found := once(view, lambda: beyond(view, cameras.num_views), cameras.num_views):
             yield "observation_view", found, f"indices of {cameras.num_views} views"
+        if len(self.background_from_view) not in (0, cameras.num_views):
+            needed = f"none, or one for each of {cameras.num_views} views"
+            yield "background_from_view", f"are {len(self.background_from_view)}", needed
         if count:
             pose, points = cameras.cam_from_world.detach(), self.points_world.detach()
             depth = pose[:, 2, :3] @ points.mT + pose[:, 2, 3:]

@@ -24,6 +24,7 @@ _TENSORS = (
     "observation_point",
     "observation_view",
     "observation_pixels",
+    "background_from_view",
 )
 _DIGEST_BYTES = hashlib.sha256().digest_size
 

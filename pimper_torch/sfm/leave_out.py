@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.progress import track
@@ -69,7 +69,20 @@ def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
             geometries = _read_geometries(stored) | verifier.found
             _drop_features(stored, matched, found.rest)
             _drop_matches(stored, matched, found, geometries, settings.min_inliers)
-    return found.rest
+    return (
+        found.rest.replace(maps=_maps(found, settings.min_inliers))
+        if found.rest.room
+        else found.rest
+    )
+
+
+def _maps(found: "_Found", fewest: int) -> tuple[Float[Tensor, "3 3"], ...]:
+    """Give the maps of photographs that show enough features of the room."""
+    pairs = zip(found.maps, found.rest.features, strict=True)
+    return tuple(
+        one if int(resting.sum()) >= fewest else torch.full_like(one, torch.nan)
+        for one, resting in pairs
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,15 +95,17 @@ class _Matched:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Found:
-    """What is at rest, between pixels of which photographs, and to how many of them."""
+    """What is at rest, between mapped pixels of photographs, and to how many of them."""
 
     rest: StaticBackground
+    maps: tuple[Float[Tensor, "3 3"], ...]
     keypoints: Keypoints
     still_px: float
 
 
 def _at_rest(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found:
-    return _find(matched.keypoints, track(matched.pairs), verifier, settings, STILL_PX)
+    maps = tuple(torch.eye(3, dtype=torch.float64) for _ in matched.keypoints)
+    return _find(matched.keypoints, maps, track(matched.pairs), verifier, settings, STILL_PX)
 
 
 def _shifted(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found | None:
@@ -112,15 +127,16 @@ def _shifted(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) 
         return min(still, len(pair.matches) - still)
 
     some = sorted(matched.pairs, key=both, reverse=True)[:_TRIED]
-    if not _find(pixels, some, verifier, settings, still_px).rest.room:
+    if not _find(pixels, maps, some, verifier, settings, still_px).rest.room:
         return None
-    found = _find(pixels, track(matched.pairs), verifier, settings, still_px)
+    found = _find(pixels, maps, track(matched.pairs), verifier, settings, still_px)
     shift = shift_px(maps, matched.keypoints)
     return replace(found, rest=found.rest.replace(shift_px=shift))
 
 
 def _find(
     keypoints: Keypoints,
+    maps: tuple[Float[Tensor, "3 3"], ...],
     pairs: Iterable[Pair],
     verifier: "_Verifier",
     settings: MatchSettings,
@@ -134,7 +150,7 @@ def _find(
         max_error_px=settings.max_error_px,
         fewest=settings.min_inliers,
     )
-    return _Found(rest=rest, keypoints=keypoints, still_px=still_px)
+    return _Found(rest=rest, maps=maps, keypoints=keypoints, still_px=still_px)
 
 
 def _read(stored: Any) -> _Matched:  # noqa: ANN401 - pycolmap has no types before it is loaded

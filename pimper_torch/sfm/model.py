@@ -1,7 +1,7 @@
 """A sparse model before it has photographs: what SfM finds and COLMAP's folders hold."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Lens, Record, pairs_table
+from pimper_torch.records.scene import no_maps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -24,6 +25,9 @@ class SparseModel(Record):
         observation_point: Which point each observation sees.
         observation_view: Which view it is made in.
         observation_pixels: Where, in the photograph before undistortion.
+        background_from_view: Maps from pixels of each photograph, before undistortion, to those
+            where the background is at rest before which the object turns; NaN where a view shows
+            too little of it. Empty without such a background.
     """
 
     names: tuple[str, ...]
@@ -33,6 +37,7 @@ class SparseModel(Record):
     observation_point: Int[Tensor, " observation"]
     observation_view: Int[Tensor, " observation"]
     observation_pixels: Float[Tensor, "observation 2"]
+    background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
 
     @property
     def num_views(self) -> int:
@@ -83,6 +88,9 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
         observation_point=point[order],
         observation_view=view[order],
         observation_pixels=model.observation_pixels[kept][order],
+        background_from_view=model.background_from_view[list(chosen)]
+        if len(model.background_from_view)
+        else model.background_from_view,
     )
 
 

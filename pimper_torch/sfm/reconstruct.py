@@ -251,7 +251,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     numbers = [views.names.index(name) for name in model.names]
     model = refine_tracks(views.take(numbers), model, config.tracks)
     release_memory()
-    return model
+    return with_background(model, found, names)
 
 
 def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> SparseModel:
@@ -278,6 +278,14 @@ def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> 
     return select_views(
         model, [model.names.index(name) for name in photographs if name in model.names]
     )
+
+
+def with_background(model: SparseModel, found: Registration, names: dict[str, str]) -> SparseModel:
+    """Add the maps to a static background, if there is one."""
+    maps = {names[file]: one for file, one in found.background.items()}
+    if not maps:
+        return model
+    return model.replace(background_from_view=torch.stack([maps[name] for name in model.names]))
 
 
 def _known_focals(views: Views) -> list[float | None]:

@@ -2,7 +2,10 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+
+from jaxtyping import Float
+from torch import Tensor
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.sfm.agreement import misplaced_views
@@ -57,12 +60,15 @@ class Registration:
         missing: Files that the first model lacks; all without a model.
         misplaced: Files of the first model whose strongest pairs contradict it, and the fraction of
             the matches in those that agrees.
+        background: Map from each file's pixels to those where a static background is at rest, NaN
+            where the file shows too little of it; none without a static background.
     """
 
     models: tuple[SparseModel, ...]
     spread: tuple[int, ...]
     missing: tuple[str, ...]
     misplaced: Mapping[str, float]
+    background: Mapping[str, Float[Tensor, "3 3"]] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
@@ -100,7 +106,15 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     """
     pairs = all_pairs(len(space.files))
     match_pairs(space, pairs, settings.matching)
-    _leave_out_room(space, settings)
+    background = _leave_out_room(space, settings)
+    found = _registered(space, pairs, settings)
+    return replace(found, background=background)
+
+
+def _registered(
+    space: Workspace, pairs: Sequence[PhotographPair], settings: RegistrationSettings
+) -> Registration:
+    """Grow models of the pairs that are matched."""
     verified = verified_pairs(space)
     if settings.guided_pairs:
         counts = {pair.views: pair.num_matches for pair in verified}
@@ -120,7 +134,10 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     return best
 
 
-def _leave_out_room(space: Workspace, settings: RegistrationSettings) -> None:
+def _leave_out_room(
+    space: Workspace, settings: RegistrationSettings
+) -> Mapping[str, Float[Tensor, "3 3"]]:
+    """Leave out the features of a room at rest; give each file's map to where it is."""
     rest = leave_out_room(space.database, settings.matching)
     require_motion(rest, len(space.files))
     if rest.room:
@@ -137,8 +154,9 @@ def _leave_out_room(space: Workspace, settings: RegistrationSettings) -> None:
             f"{left} of {found} features {how}: they are taken for those of a room before which "
             "the object turns, and are left out.",
             PimperWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
+    return dict(zip(space.files, rest.maps, strict=True)) if rest.room else {}
 
 
 def _starts(settings: RegistrationSettings) -> list[MapSettings]:

@@ -3,18 +3,21 @@
 from pathlib import Path
 
 import torch
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Cameras, SparseScene, Views
+from pimper_torch.records import Cameras, Lens, SparseScene, Views
 from pimper_torch.sfm import colmap
+from pimper_torch.sfm.camera_in_place import least_squares_map, mapped
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reprojection import reprojection_errors
 from pimper_torch.sfm.undistort import undistort
+
+_RASTER = 9  # pixels each way that a map is fitted to
 
 
 def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
@@ -46,7 +49,40 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         observation_pixels=model.observation_pixels.to(like),
         lenses=model.lenses,
         unregistered=tuple(name for name in views.names if name not in model.names),
+        background_from_view=_undistorted_maps(model, intrinsics).to(like),
     )
+
+
+def _undistorted_maps(
+    model: SparseModel, intrinsics: Float[Tensor, "view 3 3"]
+) -> Float[Tensor, "mapped 3 3"]:
+    """Give the maps to a static background between undistorted pictures, as one lens has them.
+
+    A homography between distorted pictures is none between undistorted ones: fitted to a raster.
+    """
+    maps = model.background_from_view
+    return (
+        torch.stack(
+            [
+                _undistorted_map(one, lens, to_pinhole.to(one))
+                for one, lens, to_pinhole in zip(maps, model.lenses, intrinsics, strict=False)
+            ]
+        )
+        if len(maps)
+        else maps
+    )
+
+
+def _undistorted_map(
+    one: Float[Tensor, "3 3"], lens: Lens, intrinsics: Float[Tensor, "3 3"]
+) -> Float[Tensor, "3 3"]:
+    if not bool(one.isfinite().all()):
+        return one
+    across = torch.linspace(0, 1, _RASTER, dtype=one.dtype)
+    raster = torch.cartesian_prod(lens.width * across, lens.height * across)
+    ends = raster, mapped(one, raster)
+    first, second = (mapped(intrinsics, colmap.undistort_pixels(lens, pixels)) for pixels in ends)
+    return least_squares_map(first, second)
 
 
 def write_model(scene: SparseScene, folder: Path) -> None:

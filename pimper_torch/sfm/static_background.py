@@ -55,6 +55,8 @@ class StaticBackground(Record):
             together with the still ones; 0 without such pairs.
         shift_px: How far the room shifts in a photograph, at most, before a camera that was turned
             in its place or whose pictures were cropped; 0 where it is at rest.
+        maps: From the pixels of each photograph to those where the room is at rest; NaN where a
+            photograph shows too little of it; none without a room.
     """
 
     features: tuple[Bool[Tensor, " _"], ...]
@@ -62,6 +64,7 @@ class StaticBackground(Record):
     moving_pairs: int
     violating_fraction: float
     shift_px: float = 0.0
+    maps: tuple[Float[Tensor, "3 3"], ...] = ()
 
     @property
     def room(self) -> bool:

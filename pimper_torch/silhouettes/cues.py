@@ -1,6 +1,7 @@
 """What is known of the object before any view is cut."""
 
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.records import Record, SparseScene
 from pimper_torch.silhouettes.cloud import pixels_seen, split_cloud
-from pimper_torch.silhouettes.parallax import plane_agreement
+from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
 from pimper_torch.silhouettes.pictures import Pictures, working_pictures
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.silhouettes.supporting_plane import (
@@ -33,7 +34,8 @@ class Cues(Record):
         object_px: Pixels of the object's points, one tensor a view.
         background_px: Of points that are not the object's.
         plane: That the object stands on.
-        agreement: With the plane's texture.
+        background_from_view: Maps to a room at rest before which the object turns; empty without.
+        agreement: With the texture of plane and room, the better of both.
         fixation: Where the cameras look.
         box_world: The object is inside.
     """
@@ -42,6 +44,7 @@ class Cues(Record):
     object_px: tuple[Float[Tensor, "_ 2"], ...]
     background_px: tuple[Float[Tensor, "_ 2"], ...]
     plane: Plane | None
+    background_from_view: Float[Tensor, "mapped 3 3"]
     agreement: Float[Tensor, "view height width"] | None
     fixation: Fixation
     box_world: Float[Tensor, "2 3"]
@@ -58,11 +61,28 @@ class Cues(Record):
         return int(counts.median()) >= _MIN_OBSERVED
 
     def relearned(self, masks: Bool[Tensor, "view height width"]) -> "Cues":
-        """Learn the plane's texture anew where cuts do not hide it, and keep it elsewhere."""
-        if self.plane is None or self.agreement is None:
+        """Learn the backgrounds' texture anew where cuts do not hide it, and keep it elsewhere."""
+        if self.agreement is None:
             return self
-        found = plane_agreement(self.pictures, self.plane, self.fixation, masks)
+        found = self._agreement(masks)
+        if found is None:
+            return self
         return self.replace(agreement=torch.where(found.isnan(), self.agreement, found))
+
+    def observed(self) -> "Cues":
+        """Learn the backgrounds' texture, if there are any."""
+        return self.replace(agreement=self._agreement(None))
+
+    def _agreement(
+        self, hidden: Bool[Tensor, "view height width"] | None
+    ) -> Float[Tensor, "view height width"] | None:
+        """Compare views with what they see through homographies; ``None`` without any."""
+        found = []
+        if self.plane is not None:
+            found.append(plane_agreement(self.pictures, self.plane, self.fixation, hidden))
+        if len(self.background_from_view):
+            found.append(room_agreement(self.pictures, self.background_from_view, hidden))
+        return reduce(torch.fmax, found) if found else None
 
 
 def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDetails) -> Cues:
@@ -96,7 +116,8 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
         object_px=tuple(pixels_seen(scene, cameras, cloud.on_object)),
         background_px=tuple(pixels_seen(scene, cameras, cloud.background)),
         plane=plane,
-        agreement=None if plane is None else plane_agreement(pictures, plane, focus),
+        background_from_view=scene.background_from_view,
+        agreement=None,
         fixation=focus,
         box_world=torch.stack([centre - half, centre + half]) if region is None else region,
-    )
+    ).observed()

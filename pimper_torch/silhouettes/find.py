@@ -56,7 +56,7 @@ class FindSilhouettes(Stage):
             )
         cues = cues_of(scene, config, self.details)
         cuts = None
-        if cues.plane is not None or cues.has_points:
+        if cues.agreement is not None or cues.has_points:
             cuts = cut_in_iterations(cues, self.details)
         doubt = "the views' silhouettes have nothing in common"
         if cuts is not None:

@@ -1,9 +1,10 @@
-"""Plane parallax: what stands on a plane does not look as the plane does from elsewhere.
+"""Parallax: what stands before a background does not look as the background does from elsewhere.
 
-All photographs are rectified to the plane. The median of what they show there is the plane's
-texture, without what stands on it and without shadows, which move with the light. Where a view
-agrees with it, it shows the plane; where it does not, something stands before it, textured or not.
-Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
+Backgrounds are what views see through homographies: the plane that the object stands on, and a room
+at rest before which it turns. All photographs are rectified to it. The median of what they show
+there is its texture, without what stands before it and without shadows, which move with the light.
+Where a view agrees with it, it shows the background; where it does not, something stands before it,
+textured or not. Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
 """
 
 from dataclasses import dataclass
@@ -30,22 +31,24 @@ _REACH = 1.0  # of the cameras' distance: the plane that is rectified, to each s
 _STEP = 2.0  # working pixels at the fixation point between samples of the plane
 # The same for brightness, where there is no texture.
 _FAR_REACH, _FAR_STEP = 2.0, 8.0
+_ROOM = 1.0  # of the picture's size beyond it: a room that shifts by more is not looked at
 _NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
 _MIN_VIEWS = 3  # of which two agree
 _SAMPLES = 2**20  # of the plane, over all views, at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class PlaneRaster(Record):
-    """A raster on the plane.
+class Raster(Record):
+    """A raster on a background.
 
     Attributes:
-        world_from_raster: Homogeneous pixels of the raster to world points, 3 x 3.
+        pixels_from_raster: From homogeneous pixels of the raster to those of each view; NaN for a
+            view that does not see the background.
         size_px: Samples each way.
     """
 
-    world_from_raster: Float[Tensor, "3 3"]
-    size_px: int
+    pixels_from_raster: Float[Tensor, "view 3 3"]
+    size_px: tuple[int, int]
 
 
 def plane_agreement(
@@ -54,34 +57,69 @@ def plane_agreement(
     fixation: Fixation,
     hidden: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view height width"]:
-    r"""Say how well each view agrees with the plane's texture.
+    """Say how well each view agrees with a plane's texture; see :func:`texture_agreement`.
+
+    Args:
+        pictures: At the working size.
+        plane: Supporting the object.
+        fixation: Its fixation point is the centre of what is looked at.
+        hidden: Where views do not show the plane, as far as is known.
+    """
+    near = _plane_raster(pictures.cameras, plane, fixation, _REACH, _STEP)
+    far = _plane_raster(pictures.cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
+    return texture_agreement(pictures, near, far, hidden)
+
+
+def room_agreement(
+    pictures: Pictures,
+    background_from_view: Float[Tensor, "view 3 3"],
+    hidden: Bool[Tensor, "view height width"] | None = None,
+) -> Float[Tensor, "view height width"]:
+    """Say how well each view agrees with a room at rest; see :func:`texture_agreement`.
+
+    Args:
+        pictures: At the working size.
+        background_from_view: From pixels of each photograph to those where the room is at rest;
+            NaN for views that show too little of it.
+        hidden: Where views do not show the room, as far as is known.
+    """
+    raster = _room_raster(pictures, background_from_view.cpu().double())
+    return texture_agreement(pictures, raster, raster, hidden)
+
+
+def texture_agreement(
+    pictures: Pictures,
+    near: Raster,
+    far: Raster,
+    hidden: Bool[Tensor, "view height width"] | None = None,
+) -> Float[Tensor, "view height width"]:
+    r"""Say how well each view agrees with the texture of a background.
 
     Agreement in a window is :math:`2\,\mathrm{cov} / (\mathrm{var} + \mathrm{var}')` of log
     radiance without its smooth part.
 
     Args:
         pictures: At the working size.
-        plane: Supporting the object.
-        fixation: Its fixation point is the centre of what is looked at.
-        hidden: Where views do not show the plane, as far as is known. What they show there is
-            compared with the plane's texture, but is no part of it.
+        near: Samples of the texture.
+        far: Samples of the brightness, which may be fewer and reach farther.
+        hidden: Where views do not show the background, as far as is known. What they show there is
+            compared with its texture, but is no part of it.
 
     Returns:
-        Between -1 and 1; ``DISPUTED`` where views do not agree on what the plane looks like, as
-        where it is always hidden; NaN where it is flat, or few views see it; -1 where a view that
-        does not agree is brighter or darker than the others by more than light does it.
+        Between -1 and 1; ``DISPUTED`` where views do not agree on what the background looks like,
+        as where it is always hidden; NaN where it is flat, or few views see it; -1 where a view
+        that does not agree is brighter or darker than the others by more than light does it.
     """
-    cameras, longer = pictures.cameras, max(pictures.grey.shape[1:])
+    count, longer = len(pictures.grey), max(pictures.grey.shape[1:])
     hidden = torch.zeros_like(pictures.grey, dtype=torch.bool) if hidden is None else hidden
 
     def textured(view: int) -> Float[Tensor, "height width"]:
         return _textured(pictures.grey[view], hidden[view], longer)
 
-    texture = of_views(textured, cameras.num_views)
+    texture = of_views(textured, count)
     seen, radiance = (layer.masked_fill(hidden, torch.nan) for layer in (texture, pictures.grey))
-    common, spread = _common(seen, cameras, _raster(cameras, plane, fixation, _REACH, _STEP))
-    far = _raster(cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
-    level, level_spread = _common(radiance, cameras, far)
+    common, spread = _common(seen, near)
+    level, level_spread = _common(radiance, far)
 
     def agreement_of(view: int) -> Float[Tensor, "height width"]:
         agreement = _agreement(texture[view], common[view], spread[view], longer)
@@ -89,25 +127,30 @@ def plane_agreement(
         other &= level_spread[view] < _NO_SHADOW / 2
         return torch.where(~(agreement > DISPUTED) & other, -1, agreement)
 
-    return of_views(agreement_of, cameras.num_views)
+    return of_views(agreement_of, count)
 
 
 def _common(
-    values: Float[Tensor, "view height width"], cameras: Cameras, raster: PlaneRaster
+    values: Float[Tensor, "view height width"], raster: Raster
 ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
-    """Give the views' median at each point of the plane, and its spread, as each view sees it."""
-    maps = [
-        cameras.intrinsics[v] @ _cam_from_raster(cameras, raster, v) for v in range(len(values))
-    ]
-    square = (raster.size_px, raster.size_px)
-    seen = of_views(lambda view: warped(values[view], maps[view], square), len(values))
-    rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * raster.size_px)), dim=1)
+    """Give the views' median on a background, and its spread, as each view sees it."""
+    maps, size_px = raster.pixels_from_raster, (values.shape[2], values.shape[1])
+    sees = maps.isfinite().flatten(1).all(dim=1).tolist()
+
+    def rectified(view: int) -> Float[Tensor, "row column"]:
+        if not sees[view]:
+            return values.new_full(raster.size_px[::-1], torch.nan)
+        return warped(values[view], maps[view], raster.size_px)
+
+    seen = of_views(rectified, len(values))
+    rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * raster.size_px[0])), dim=1)
     common, spread = torch.cat(list(side_by_side(_centre, rows, tracked=False)), dim=1)
-    size = (values.shape[2], values.shape[1])
 
     def back(view: int) -> Float[Tensor, "layer height width"]:
+        if not sees[view]:
+            return values.new_full((2, *size_px[::-1]), torch.nan)
         to = torch.linalg.inv(maps[view])
-        return torch.stack([_in_front(warped(one, to, size), to) for one in (common, spread)])
+        return torch.stack([_in_front(warped(one, to, size_px), to) for one in (common, spread)])
 
     common, spread = of_views(back, len(values)).unbind(dim=1)
     return common, spread
@@ -131,9 +174,9 @@ def _in_front(
     return torch.where(scale > 0, layer, torch.nan)
 
 
-def _raster(
+def _plane_raster(
     cameras: Cameras, plane: Plane, fixation: Fixation, reach: float, step_px: float
-) -> PlaneRaster:
+) -> Raster:
     """Lay a raster on the plane about the foot of the fixation point."""
     normal = plane.normal_world
     axis = torch.eye(3)[normal.abs().argmin()].to(normal)
@@ -143,17 +186,30 @@ def _raster(
     step = step_px * fixation.distance / cameras.intrinsics[:, 0, 0].median()
     size = int(2 * reach * fixation.distance / step)
     corner = foot - step * size / 2 * (first + second)
-    return PlaneRaster(
-        world_from_raster=torch.stack([step * first, step * second, corner], dim=1), size_px=size
-    )
+    world_from_raster = torch.stack([step * first, step * second, corner], dim=1)
+    cam_from_raster = cameras.cam_from_world[:, :3, :3] @ world_from_raster
+    cam_from_raster[:, :, 2] += cameras.cam_from_world[:, :3, 3]
+    return Raster(pixels_from_raster=cameras.intrinsics @ cam_from_raster, size_px=(size, size))
 
 
-def _cam_from_raster(cameras: Cameras, raster: PlaneRaster, view: int) -> Float[Tensor, "3 3"]:
-    """Give the map from homogeneous pixels of the raster to a camera's frame."""
-    pose = cameras.cam_from_world[view]
-    moved = pose[:3, :3] @ raster.world_from_raster
-    moved[:, 2] += pose[:3, 3]
-    return moved
+def _room_raster(pictures: Pictures, background_from_view: Float[Tensor, "view 3 3"]) -> Raster:
+    """Lay a raster over the room, of working pixels where it is at rest, as far as views see."""
+    height, width = pictures.grey.shape[1:]
+    scale = torch.diag(torch.tensor([*pictures.factors, 1.0]).double())
+    maps = scale @ background_from_view @ torch.linalg.inv(scale)
+    corners = maps.new_tensor([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
+    ends = (maps @ corners.mT).mT.reshape(-1, 3)
+    ends = (ends[:, :2] / ends[:, 2:])[ends.isfinite().all(dim=1)]
+    size = maps.new_tensor([width, height])
+    low = torch.maximum(ends.amin(dim=0), -_ROOM * size).floor()
+    high = torch.minimum(ends.amax(dim=0), (1 + _ROOM) * size).ceil()
+    shift = torch.eye(3).to(maps)
+    shift[:2, 2] = low
+    to_pixels = torch.full_like(maps, torch.nan)
+    seen = maps.isfinite().flatten(1).all(dim=1)
+    to_pixels[seen] = torch.linalg.inv(maps[seen]) @ shift
+    columns, rows = (high - low).int().tolist()
+    return Raster(pixels_from_raster=to_pixels.to(pictures.grey), size_px=(columns, rows))
 
 
 def _textured(

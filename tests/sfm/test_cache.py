@@ -15,7 +15,8 @@ from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 
 @pytest.fixture
 def kept(model):
-    return KeptModel(model=model, seconds=12.5)
+    maps = torch.eye(3, dtype=torch.float64).repeat(5, 1, 1)
+    return KeptModel(model=model.replace(background_from_view=maps), seconds=12.5)
 
 
 def entry(folder: Path) -> Path:
@@ -30,7 +31,7 @@ def test_a_model_comes_back_bit_for_bit(kept, tmp_path):
     found = cache.find("a")
     assert found.seconds == 12.5
     assert (found.model.names, found.model.lenses) == (kept.model.names, kept.model.lenses)
-    for name in ("cam_from_world", "points_world", "observation_pixels"):
+    for name in ("cam_from_world", "points_world", "observation_pixels", "background_from_view"):
         assert torch.equal(getattr(found.model, name), getattr(kept.model, name))
         assert getattr(found.model, name).dtype == torch.float64
     for name in ("observation_point", "observation_view"):

@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from pimper_torch.sfm.binding import loaded
+from pimper_torch.sfm.camera_in_place import mapped
 from pimper_torch.sfm.leave_out import leave_out_room
 from pimper_torch.sfm.matching import MatchSettings
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
@@ -67,6 +68,7 @@ def test_pairs_that_were_verified_on_the_room_are_verified_on_what_turns(tmp_pat
     former = [scene.thing, scene.keypoints]
     rest = leave_out_room(path, SETTINGS)
     assert rest.room
+    assert all(torch.equal(one, torch.eye(3).double()) for one in rest.maps)
     scene.thing, scene.keypoints = (
         [values[~resting] for values, resting in zip(all_of, rest.features, strict=True)]
         for all_of in former
@@ -92,10 +94,20 @@ def test_a_rigid_scene_keeps_all_its_matches(tmp_path, generator):
     before = read(path, scene)
     rest = leave_out_room(path, SETTINGS)
     assert not rest.room
+    assert not rest.maps
     assert not any(resting.any() for resting in rest.features)
     for one, other in zip(before, read(path, scene), strict=True):
         assert torch.equal(one[0], other[0])
         assert torch.equal(one[1], other[1])
+
+
+def spread_in_room(keypoints, maps, things):
+    """Give how far apart the maps put a thing of the room in two views, in the median."""
+    found = torch.full((len(maps), 550, 2), torch.nan, dtype=torch.float64)
+    for view, thing in enumerate(things):
+        found[view, thing] = mapped(maps[view], keypoints[view])
+    away = (found[:, 250:] - found[0, 250:]).norm(dim=-1)
+    return float(away[1:].nanmedian())
 
 
 # A camera that moves by 2 % of its distance leaves up to 20 px between things at various depths;
@@ -117,6 +129,8 @@ def test_a_room_that_shifts_is_left_out_as_one_at_rest_is(tmp_path, generator, m
     rest = leave_out_room(path, SETTINGS)
     assert rest.room
     assert 40 < rest.shift_px < 180
+    if not moved:
+        assert spread_in_room(scene.keypoints, rest.maps, former) < 1.0
     thing, resting = torch.cat(former), torch.cat(rest.features)
     assert resting[thing >= 250].double().mean() > fraction
     assert resting[thing < 250].double().mean() < 0.02

@@ -21,6 +21,13 @@ def test_a_point_that_only_one_kept_view_sees_goes(model):
         assert torch.equal(model.observation_pixels[old][0], pixel)
 
 
+def test_maps_to_a_static_background_follow_their_views(model):
+    maps = torch.arange(45.0, dtype=torch.float64).reshape(5, 3, 3)
+    kept = select_views(model.replace(background_from_view=maps), [3, 1])
+    assert torch.equal(kept.background_from_view, maps[[3, 1]])
+    assert len(select_views(model, [3, 1]).background_from_view) == 0
+
+
 def test_a_view_that_loses_its_points_with_a_weak_one_goes_too(model):
     # View 2 sees 20 points with the others; view 3 sees 12 of which 8 only with view 4, and
     # view 4 sees those 8: once 4 has gone, 3 keeps 4.

@@ -2,9 +2,11 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import transform
+from pimper_torch.sfm import colmap
+from pimper_torch.sfm.camera_in_place import mapped
 from pimper_torch.sfm.colmap import read_model
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.scene import point_colors, reprojection_errors, write_model
+from pimper_torch.sfm.scene import assemble_scene, point_colors, reprojection_errors, write_model
 
 
 def test_writing_a_model_and_reading_it_gives_the_same_scene(scene, views, tmp_path):
@@ -65,3 +67,24 @@ def test_points_take_the_color_that_the_views_show(scene):
 def test_the_written_model_has_the_photographs_own_lenses(scene, model, tmp_path):
     write_model(scene, tmp_path)
     assert read_model(tmp_path).lenses == model.lenses
+
+
+def test_maps_to_a_static_background_are_those_of_undistorted_pictures(scene, views, model):
+    """Also where the background is at rest, pixels are those of an undistorted picture."""
+    shift = torch.eye(3, dtype=torch.float64).repeat(5, 1, 1)
+    shift[:, 0, 2], shift[:, 1, 2] = torch.arange(5) - 2.0, 3.0
+    shift[4] = torch.nan
+    assert len(scene.background_from_view) == 0
+    found = assemble_scene(views, model.replace(background_from_view=shift)).background_from_view
+    assert found[4].isnan().all()
+    seen = 20 + 30 * torch.rand(20, 2, generator=torch.Generator().manual_seed(3)).double()
+    for view in range(4):
+        lens, K = model.lenses[view], scene.cameras.intrinsics[view].double()
+        ends = (seen, mapped(shift[view], seen))
+        pinhole = [mapped(K, colmap.undistort_pixels(lens, pixels)) for pixels in ends]
+        assert (mapped(found[view], pinhole[0]) - pinhole[1]).norm(dim=1).max() < 0.2
+
+
+def test_as_many_maps_as_views_are_needed(scene):
+    (fault,) = scene.replace(background_from_view=torch.eye(3).repeat(2, 1, 1).double()).faults()
+    assert fault == ("background_from_view", "are 2", "none, or one for each of 5 views")

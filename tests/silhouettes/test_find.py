@@ -5,11 +5,11 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
-from pimper_torch.records import Silhouettes
+from pimper_torch.records import Silhouettes, Views
 from pimper_torch.silhouettes import find
 from pimper_torch.silhouettes.cuts import Cuts
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
-from pimper_torch.silhouettes.parallax import plane_agreement
+from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
 from pimper_torch.silhouettes.pictures import working_pictures
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.silhouettes.supporting_plane import Plane, fixation, supporting_plane
@@ -137,6 +137,56 @@ def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
     assert (before[seen] > 0.75).float().mean() < 0.4  # what hides it counts for it
     assert (after[seen] > 0.75).float().mean() > 0.9
     assert (after[covered] < 0.5).float().mean() > 0.8  # what hides it stands out
+
+
+def before_a_room(generator, num_views=9):
+    """A textured disc that moves before a room that shifts, each photograph under its own light."""
+    wide, high = 480, 360
+    room = smooth(torch.rand(1, 1, 480, 600, generator=generator))
+    thing = smooth(torch.rand(num_views, 1, high, wide, generator=generator))
+    maps = torch.eye(3).repeat(num_views, 1, 1)
+    maps[:, :2, 2] = torch.randint(0, 120, (num_views, 2), generator=generator).float()
+    corner = pixel_centers(wide, high, like=room)
+    covered = torch.stack(
+        [(corner - corner.new_tensor([240 + 7 * view, 180])).norm(dim=-1) < 80 for view in range(9)]
+    )
+    seen = torch.stack(
+        [
+            room[0, 0, int(v) : int(v) + high, int(u) : int(u) + wide]
+            for u, v in maps[:, :2, 2].tolist()
+        ]
+    )
+    light = torch.linspace(0.5, 1.5, num_views)[:, None, None] * torch.linspace(0.6, 1, wide)
+    images = torch.where(covered, thing[:, 0], seen) * light
+    return images[:, None].expand(-1, 3, -1, -1).contiguous(), maps, covered
+
+
+def smooth(noise):
+    return torch.nn.functional.avg_pool2d(noise, 9, 1, 4) ** 4
+
+
+def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator):
+    images, maps, covered = before_a_room(generator)
+    views = Views(
+        images=images,
+        sizes_px=torch.tensor([[480, 360]] * 9),
+        focals_px=torch.full((9,), torch.nan),
+        names=tuple("abcdefghi"),
+    )
+    cameras = staged.scene.cameras.take(list(range(9)))
+    pictures = working_pictures(views, cameras, 240)  # half as large
+    half = covered[:, ::2, ::2]
+    maps[4] = torch.nan
+    found = room_agreement(pictures, maps)
+    room = ~torch.nn.functional.max_pool2d(half[:, None].float(), 13, 1, 6)[:, 0].bool()
+    known = room & found.isfinite()
+    assert found[4].isnan().all()
+    assert known[:4].float().mean() > 0.5
+    assert (found[known] > 0.75).float().mean() > 0.95
+    inside = half & found.isfinite()
+    assert (found[inside] > 0.75).float().mean() < 0.03
+    wrong = room_agreement(pictures, torch.eye(3).repeat(9, 1, 1))
+    assert (wrong[wrong.isfinite()] > 0.75).float().mean() < 0.2
 
 
 def test_the_region_keeps_what_is_outside_from_being_the_object(staged):
