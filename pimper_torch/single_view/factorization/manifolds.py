@@ -3,14 +3,14 @@ r"""Photometric manifolds of each order of lighting, and their ambiguities.
 Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends
 on albedo and normal alone. The set of these vectors determines the ambiguity of a factorization:
 
-=====================  ====  ============================  =====================
-light                  rank  :math:`s`                     ambiguity
-=====================  ====  ============================  =====================
-any low-rank matrix    any   any vector                    an invertible matrix
-a distant point light  3     :math:`\rho n`: any vector    an invertible 3 x 3
-first order            4     :math:`\rho (1, n)`           scaled Lorentz
-second order           9     :math:`\rho (1, n, n n^\top)` rotation, scale
-=====================  ====  ============================  =====================
+=====================  ====  =============================  =====================
+light                  rank  :math:`s`                      ambiguity
+=====================  ====  =============================  =====================
+any low-rank matrix    any   any vector                     an invertible matrix
+a distant point light  3     :math:`\rho n`: any vector     an invertible 3 x 3
+first order            4     :math:`\rho (1, n)`            scaled Lorentz
+second order           9     :math:`\rho (1, n, n n^\top)`  rotation, scale
+=====================  ====  =============================  =====================
 
 First order is :class:`pimper_torch.photometry.manifolds.Cone`.
 

@@ -1,0 +1,57 @@
+"""How the documentation is built: ``sphinx-build -W docs site``; nothing is fetched."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "extensions"))
+
+from sphinx.application import Sphinx
+
+from pimper_torch.io.version import installed_version
+
+project = "pimper_torch"
+author = "the authors of pimper_torch"
+release = installed_version()
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "mathml",
+    "public_names",
+    "settings",
+    "sources",
+]
+exclude_patterns = ["extensions"]
+
+# Of autodoc: docstrings are in Google's form with reStructuredText inside.
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+python_maximum_signature_line_length = 88
+
+# Of pages: formulas between dollars, and headings as targets of links, both as GitHub has them.
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+
+html_theme = "furo"
+html_title = f"pimper_torch {release}"
+html_math_renderer = "mathml"
+html_copy_source = False
+html_show_copyright = False
+
+
+def setup(app: Sphinx) -> None:
+    """Escape what shapes have for several axes, such as ``*batch``, behind napoleon's turn."""
+    app.connect("autodoc-process-docstring", escape_types, priority=900)
+
+
+def escape_types(
+    app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]
+) -> None:
+    """Take the asterisks of attributes' types for what they are, not for emphasis."""
+    for index, line in enumerate(lines):
+        if line.startswith((":vartype ", "   :type ")):
+            lines[index] = line.replace("*", "\\*")
