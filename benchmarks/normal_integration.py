@@ -13,7 +13,9 @@ takes, tells whether creases survive.
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from statistics import fmean
 
 import matplotlib as mpl
 import torch
@@ -28,6 +30,8 @@ from pimper_torch.single_view.integration.rasters import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
 PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1": 0.635}
+# Occluding contours divide it into parts; normals say nothing of their distances.
+SPLIT = "goblet"
 METHODS = ("frankot-chellappa", "cosine", "weighted", "discontinuities")
 # At the true depth residuals are noise and rounding; what is beyond is a jump.
 TRUE_SCALE_PX = 0.1
@@ -48,32 +52,35 @@ def main() -> None:
 
 def with_depth(folder: Path) -> None:
     """Print errors and seconds where the depth is known."""
-    print("| method | " + " | ".join(PUBLISHED) + " | mean | s, all |")  # noqa: T201
-    print("|---|" + "--:|" * (len(PUBLISHED) + 2))  # noqa: T201
-    published = sum(PUBLISHED.values()) / len(PUBLISHED)
-    row("published", list(PUBLISHED.values()), published, "")
+    print("| method | " + " | ".join(PUBLISHED) + " | mean | without goblet | s, all |")  # noqa: T201
+    print("|---|" + "--:|" * (len(PUBLISHED) + 3))  # noqa: T201
+    row("published", PUBLISHED, "")
     maps = {name: read_normal_map(folder / name) for name in PUBLISHED}
     for method in METHODS:
         began = time.perf_counter()
         found = [integrate(one, method) for one in maps.values()]
         seconds = time.perf_counter() - began
-        errors = [
-            depth_error(one, result.depth) for one, result in zip(maps.values(), found, strict=True)
-        ]
-        row(method, errors, sum(errors) / len(errors), f"{seconds:.1f}")
-    errors = [depth_error(one, with_true_weights(one)) for one in maps.values()]
-    row("weights from the truth", errors, sum(errors) / len(errors), "")
+        errors = {
+            name: depth_error(one, result.depth)
+            for (name, one), result in zip(maps.items(), found, strict=True)
+        }
+        row(method, errors, f"{seconds:.1f}")
+    errors = {name: depth_error(one, with_true_weights(one)) for name, one in maps.items()}
+    row("weights from the truth", errors, "")
     print("\nMean by which true steps leave those of the normals, in thousandths of a pixel:")  # noqa: T201
     for axis, name in enumerate(("right", "down")):
-        means = [1e3 * true_bias(one)[axis] for one in maps.values()]
-        print(name + ": " + ", ".join(f"{mean:.1f}" for mean in means))  # noqa: T201
+        biases = [1e3 * true_bias(one)[axis] for one in maps.values()]
+        print(name + ": " + ", ".join(f"{bias:.1f}" for bias in biases))  # noqa: T201
     print()  # noqa: T201
 
 
-def row(name: str, errors: list[float], mean: float, seconds: str) -> None:
-    """Print one line."""
-    cells = " | ".join(f"{error:.3f}" for error in errors)
-    print(f"| {name} | {cells} | {mean:.3f} | {seconds} |", flush=True)  # noqa: T201
+def row(name: str, errors: Mapping[str, float], seconds: str) -> None:
+    """Print one line, with the mean of all objects and of those whose depth normals determine."""
+    determined = [error for one, error in errors.items() if one != SPLIT]
+    cells = " | ".join(
+        f"{error:.3f}" for error in (*errors.values(), fmean(errors.values()), fmean(determined))
+    )
+    print(f"| {name} | {cells} | {seconds} |", flush=True)  # noqa: T201
 
 
 def integrate(one: NormalMap, method: str) -> IntegratedMap:
