@@ -53,7 +53,7 @@ def draw_stages() -> None:
     """Reconstruct the bundled skull, and draw what the stages of every pass give."""
     views = pt.load_views(bundled_photographs())
     chain = pt.load_chain("default", {"coarse_surface": {"reference": REFERENCE}})
-    passes = []
+    passes: list[Image.Image] = []
     for step in chain.steps(views):
         view = step.coarse.reference
         camera = step.scene.cameras.take([view])

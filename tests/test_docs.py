@@ -1,7 +1,8 @@
-"""What the documentation shows runs: examples of docstrings, code and commands of the README."""
+"""What the documentation shows runs: examples of docstrings, code and commands of its pages."""
 
 import doctest
 import functools
+import json
 import re
 from collections.abc import Callable
 from importlib import import_module
@@ -28,9 +29,16 @@ from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.reconstruct import Reconstruct
 
 PACKAGE = Path(pimper_torch.__file__).parent
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
-COMMANDS = re.findall(r"^    (?:.*&& )?pimper (.+)$", README, flags=re.MULTILINE)
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCK = re.compile(r"^```python\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)
+BLOCKS = BLOCK.findall(README)
+COMMAND = re.compile(r"^    (?:.*&& )?pimper (.+)$", flags=re.MULTILINE)
+COMMANDS = COMMAND.findall(README)
+PAGES = {
+    str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
+    for path in (*sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md")
+}
 
 
 def modules_with_examples() -> list[str]:
@@ -154,6 +162,91 @@ def test_every_block_of_python_in_the_readme_is_run():
     assert len(BLOCKS) == len(GIVEN)
 
 
+def a_glance_at_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    a_folder_of_photographs(monkeypatch)
+    monkeypatch.setattr(presets, "load_config", lambda *_: load_config("fast"))
+    return {}
+
+
+def nothing(_: pytest.MonkeyPatch) -> dict[str, object]:
+    return {}
+
+
+def a_scene_and_a_mesh(_: pytest.MonkeyPatch) -> dict[str, object]:
+    scene, found = photographed()
+    vertices, faces = icosphere(1)
+    cameras = found.cameras
+    images = scene.views.images.float()
+    masks = scene.foreground
+    return {
+        "scene": pimper_torch.scene_of(
+            images, cameras.intrinsics, cameras.cam_from_world, masks=masks
+        ),
+        "mesh": pimper_torch.Mesh(vertices_world=vertices, faces=faces),
+    }
+
+
+def a_data_set_of_ones_own(_: pytest.MonkeyPatch) -> dict[str, object]:
+    scene, found = photographed()
+    folder = Path("mine")
+    save_photographs(scene.views, folder)
+    names = sorted(path.name for path in folder.iterdir())
+    flipped = torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
+    cameras = found.cameras
+    listed = [
+        {
+            "file": name,
+            "focal_px": 70.0,
+            "size_px": [56, 42],
+            "world_from_cam": (torch.linalg.inv(pose.double()) * flipped).tolist(),
+        }
+        for name, pose in zip(names, cameras.cam_from_world, strict=True)
+    ]
+    (folder / "cameras.json").write_text(json.dumps(listed), encoding="utf-8")
+    return {}
+
+
+# What each block of a page takes for granted, by page and number.
+GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
+    ("docs/index.md", 0): a_glance_at_photographs,
+    ("docs/conventions.md", 0): nothing,
+    ("docs/extending.md", 0): a_scene_and_a_mesh,
+    ("docs/extending.md", 1): nothing,
+    ("docs/extending.md", 2): a_data_set_of_ones_own,
+}
+
+
+def run_block(page: str, number: int, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    names = GIVEN_TO[page, number](monkeypatch)
+    exec(compile(BLOCK.findall(PAGES[page])[number], f"{page}, {number}", "exec"), names)
+    return names
+
+
+@pytest.mark.parametrize(("page", "number"), GIVEN_TO)
+@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
+def test_the_python_of_the_pages_runs(page, number, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_block(page, number, monkeypatch)
+
+
+def test_the_reader_of_the_pages_reads_the_cameras(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run_block("docs/extending.md", 2, monkeypatch)
+    _, found = photographed()
+    read = names["scene"].cameras
+    torch.testing.assert_close(
+        read.cam_from_world, found.cameras.cam_from_world.to(read.intrinsics)
+    )
+    torch.testing.assert_close(read.intrinsics, found.cameras.intrinsics.to(read.intrinsics))
+
+
+def test_every_block_of_python_in_the_pages_is_run():
+    found = {
+        (page, number) for page, text in PAGES.items() for number in range(len(BLOCK.findall(text)))
+    }
+    assert found == set(GIVEN_TO)
+
+
 def test_newcomers_are_shown_the_default():
     example = next(block for block in BLOCKS if "load_views" in block)
     for shown in (example, pimper_torch.__doc__):
@@ -167,8 +260,18 @@ class Understood(Exception):  # noqa: N818 - good news
     """The command line was parsed."""
 
 
-@pytest.mark.parametrize("line", COMMANDS)
-def test_the_commands_of_the_readme_are_understood(line, monkeypatch):
+def commands_of_pages() -> list[str]:
+    """List the pages' commands, each on one line and without what stands for more of the same."""
+    lines = [
+        line.replace(" ... ", " ")
+        for text in PAGES.values()
+        for line in COMMAND.findall(text.replace("\\\n", " "))
+    ]
+    return sorted({" ".join(line.split()) for line in lines})
+
+
+@pytest.mark.parametrize("line", COMMANDS + commands_of_pages())
+def test_the_commands_of_the_documentation_are_understood(line, monkeypatch):
     understand = tyro.cli
 
     def stop(function: Callable[..., object], **options: object) -> object:

@@ -25,5 +25,5 @@ def displayed(translator: HTML5Translator, node: nodes.math_block) -> None:
     text = node.astext()
     several = r"\\" in text and r"\begin" not in text
     formula = convert(ENVIRONMENT % text if several else text, display="block")
-    translator.body.append(f'<div class="math">{formula}</div>')
+    translator.body.append(f'<div class="formula">{formula}</div>')
     raise nodes.SkipNode

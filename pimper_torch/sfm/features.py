@@ -24,7 +24,7 @@ class FeatureSettings:
         peak_threshold: Contrast.
         edge_threshold: Ratio of curvatures.
         max_features: In a photograph.
-        affine_shape: Remesh features to slanted surfaces.
+        affine_shape: Adapt features to slanted surfaces.
         threads: -1 for all cores.
     """
 

@@ -46,7 +46,7 @@ class ReconstructConfig:
         edge_threshold: Ratio of curvatures above which a feature counts as an edge.
         max_features: In a photograph; those at coarse scales are kept, whole scales at a time, so
             that up to twice as many are left.
-        affine_shape: Remesh features to slanted surfaces.
+        affine_shape: Adapt features to slanted surfaces.
         max_ratio: Of the distances to the best and the second best match.
         guided_pairs: Of each photograph, those with most matches, in which more are looked for
             along the epipolar lines.

@@ -1,0 +1,138 @@
+"""Pages say what is so: links lead somewhere, messages are the program's, scripts have options."""
+
+import ast
+import functools
+import re
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import pimper_torch
+from pimper_torch.cli.options import CommonOptions, InputOptions
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PACKAGE = Path(pimper_torch.__file__).parent
+PAGES = (*sorted(DOCS.glob("*.md")), ROOT / "benchmarks" / "README.md", ROOT / "README.md")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#{1,4} (.+)$", flags=re.MULTILINE)
+MODULE = re.compile(r"^\.\. automodule:: (\S+)$", flags=re.MULTILINE)
+SCRIPT = re.compile(r"^    .*?python (benchmarks/\w+\.py)(.*)$", flags=re.MULTILINE)
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
+
+# The site has these pages from elsewhere.
+INCLUDED = {DOCS / "benchmarks.md": ROOT / "benchmarks" / "README.md"}
+
+
+def text_of(page: Path) -> str:
+    return INCLUDED.get(page, page).read_text(encoding="utf-8")
+
+
+def anchors(page: Path) -> set[str]:
+    """Name headings as GitHub and the site do."""
+    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in HEADING.findall(text_of(page)))
+    return {heading.strip().replace(" ", "-") for heading in plain}
+
+
+def links(page: Path) -> list[str]:
+    found = LINK.findall(page.read_text(encoding="utf-8"))
+    return [link for link in found if "://" not in link]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_to_files_and_headings(page):
+    for link in links(page):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in anchors(target), link
+
+
+def test_the_walk_finds_links():
+    assert sum(len(links(page)) for page in PAGES) > 80
+
+
+def messages() -> list[str]:
+    """List the package's texts, with an ellipsis where a message has numbers and names."""
+    found = []
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = [
+                    part.value if isinstance(part, ast.Constant) else "…" for part in node.values
+                ]
+                found.append("".join(map(str, parts)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return [bare(text) for text in found]
+
+
+def bare(text: str) -> str:
+    return " ".join(text.replace("`", "").split())
+
+
+def test_messages_of_the_page_on_failures_are_the_programs():
+    quoted = re.findall(r"^\| `(.+?)` \| ", text_of(DOCS / "failures.md"), flags=re.MULTILINE)
+    assert len(quoted) > 25
+    told = messages()
+    assert [quote for quote in quoted if not any(bare(quote) in text for text in told)] == []
+
+
+def documented() -> set[str]:
+    pages = (DOCS / "api").glob("*.rst")
+    return {name for page in pages for name in MODULE.findall(page.read_text(encoding="utf-8"))}
+
+
+def test_the_reference_has_the_modules_of_all_public_names():
+    homes = {
+        getattr(pimper_torch, name).__module__
+        for name in pimper_torch.__all__
+        if name != "__version__"
+    }
+    assert homes <= documented()
+
+
+def test_the_reference_names_modules_that_there_are():
+    for name in documented():
+        assert import_module(name).__doc__, name
+
+
+@functools.cache
+def options_of(script: str) -> set[str]:
+    found = set(re.findall(r'"(--[a-z-]+)"', (ROOT / script).read_text(encoding="utf-8")))
+    if script.endswith("speed.py"):  # hands the others to `pimper reconstruct`
+        fields = (*CommonOptions.__dataclass_fields__, *InputOptions.__dataclass_fields__)
+        found |= {f"--{name.replace('_', '-')}" for name in fields}
+    return found
+
+
+def test_scripts_of_the_benchmarks_have_the_options_that_the_page_gives_them():
+    page = text_of(ROOT / "benchmarks" / "README.md")
+    commands = SCRIPT.findall(page)
+    assert len(commands) > 20
+    for script, rest in commands:
+        assert set(OPTION.findall(rest)) <= options_of(script), (script, rest)
+
+
+def test_pictures_are_small_and_shown():
+    shown = {
+        (page.parent / link).resolve()
+        for page in PAGES
+        for link in links(page)
+        if link.endswith((".jpg", ".png"))
+    }
+    pictures = sorted((DOCS / "images").iterdir())
+    assert pictures
+    for picture in pictures:
+        assert picture in shown
+        assert picture.stat().st_size < 80_000
+
+
+def test_every_capture_has_its_picture():
+    page = text_of(DOCS / "photographs.md")
+    captures = re.findall(r"^    pimper render .+ -o ([\w-]+)$", page, flags=re.MULTILINE)
+    assert captures
+    for name in captures:
+        assert f"(images/{name}.jpg)" in page
