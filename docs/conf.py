@@ -22,7 +22,7 @@ extensions = [
     "settings",
     "sources",
 ]
-exclude_patterns = ["extensions"]
+exclude_patterns = ["extensions", "static"]
 
 # Of autodoc: docstrings are in Google's form with reStructuredText inside.
 autodoc_member_order = "bysource"
@@ -39,6 +39,8 @@ myst_heading_anchors = 3
 html_theme = "furo"
 html_title = f"pimper_torch {release}"
 html_math_renderer = "mathml"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_copy_source = False
 html_show_copyright = False
 
