@@ -18,7 +18,7 @@ from pimper_torch.cli.options import bundled_photographs
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.viz.maps import normal_colors, view_maps
-from pimper_torch.viz.render import frame, shade
+from pimper_torch.viz.render import bounding_box, frame, shade
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
@@ -27,8 +27,9 @@ CAPTURE = re.compile(r"^    pimper render (.+) -o ([\w-]+)$", flags=re.MULTILINE
 # Of a sheet: photographs side by side, and the width of each.
 COLUMNS, WIDTH_PX, GAP_PX = 4, 236, 4
 
-# Of the pictures of stages: the longer side of a panel, and the photograph that they look from.
-PANEL_PX, REFERENCE = 320, "37"
+# Of the pictures of stages: the longer side of a panel, the photograph that they look from, and
+# room round the object.
+PANEL_PX, REFERENCE, MARGIN = 320, "37", 0.02
 
 # The files stay below 80 kB.
 QUALITY = 82
@@ -58,19 +59,31 @@ def draw_stages() -> None:
         view = step.coarse.reference
         camera = step.scene.cameras.take([view])
         surface = Mesh(vertices_world=step.surface.vertices_world, faces=step.surface.faces)
-        around = frame(camera, step.coarse.mesh.vertices_world, PANEL_PX, 0.02)
+        around = frame(camera, step.coarse.mesh.vertices_world, PANEL_PX, MARGIN)
         if not passes:
+            low, high = bounding_box(camera, step.coarse.mesh.vertices_world, MARGIN)
+            corners = int(low[0]), int(low[1]), int(high[0]), int(high[1])
             shown = [
-                photograph(step.scene.views, view),
-                silhouette(step, view),
+                photograph(step.scene.views, view).crop(corners),
+                silhouette(step, view).crop(corners),
                 picture(shade(step.coarse.mesh, around, flat=True)),
                 normals(step.coarse.mesh, around),
             ]
             sheet(shown, PANEL_PX).save(IMAGES / "stages.jpg", quality=QUALITY)
-            figure = pt.plot_patch(step.heights[len(step.heights) // 2])
-            figure.savefig(IMAGES / "patch.png", dpi=70)
+        if step.last:
+            pt.plot_patch(step.heights[largest(step)]).savefig(IMAGES / "patch.png", dpi=70)
         passes += [normals(surface, around), picture(shade(surface, around))]
     sheet(passes[::2] + passes[1::2], PANEL_PX, 3).save(IMAGES / "passes.jpg", quality=QUALITY)
+
+
+def largest(step: pt.Step) -> int:
+    """Find the facet of most samples with a photometric normal."""
+    count, facet = 0, 0
+    for templates, bucket in zip(step.patches.buckets, step.photometric.buckets, strict=True):
+        valid = bucket.valid.flatten(1).sum(dim=1)
+        if int(valid.max()) > count:
+            count, facet = int(valid.max()), int(templates.facet[valid.argmax()])
+    return facet
 
 
 def photograph(views: Views, view: int) -> Image.Image:
