@@ -75,3 +75,17 @@ def pixels_seen(
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
     seen = (scene.observed & chosen[:, None]).cpu()
     return [pixels[view, seen[:, view]] for view in range(cameras.num_views)]
+
+
+def pixels_of(
+    scene: SparseScene, cameras: Cameras, chosen: Bool[Tensor, " point"]
+) -> list[Float[Tensor, "_ 2"]]:
+    """Give where the chosen points are in each view, whether or not it observes them.
+
+    A point of the object is inside its silhouette also where another part hides it.
+    """
+    points = scene.points_world.cpu().float()[chosen.cpu()]
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    sizes = cameras.sizes_px.to(pixels)[:, None]
+    within = ((pixels > 0) & (pixels < sizes)).all(dim=-1)
+    return [pixels[view, within[view]] for view in range(cameras.num_views)]

@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.records import Record, SparseScene
-from pimper_torch.silhouettes.cloud import pixels_seen, split_cloud
+from pimper_torch.silhouettes.cloud import pixels_of, pixels_seen, split_cloud
+from pimper_torch.silhouettes.opencv import convex_hull_of
 from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
-from pimper_torch.silhouettes.pictures import Pictures, working_pictures
+from pimper_torch.silhouettes.pictures import Pictures, of_views, working_pictures
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.silhouettes.supporting_plane import (
     Fixation,
@@ -60,6 +61,13 @@ class Cues(Record):
         counts = torch.tensor([len(pixels) for pixels in self.object_px])
         return int(counts.median()) >= _MIN_OBSERVED
 
+    def surrounded(self) -> Bool[Tensor, "view height width"]:
+        """Mark what the object's points surround in each view."""
+        height, width = self.pictures.grey.shape[1:]
+        return of_views(
+            lambda view: convex_hull_of(self.object_px[view], (width, height)), self.num_views
+        )
+
     def relearned(self, masks: Bool[Tensor, "view height width"]) -> "Cues":
         """Learn the backgrounds' texture anew where cuts do not hide it, and keep it elsewhere."""
         if self.agreement is None:
@@ -81,7 +89,8 @@ class Cues(Record):
         if self.plane is not None:
             found.append(plane_agreement(self.pictures, self.plane, self.fixation, hidden))
         if len(self.background_from_view):
-            found.append(room_agreement(self.pictures, self.background_from_view, hidden))
+            room = room_agreement(self.pictures, self.background_from_view, hidden)
+            found.append(torch.where(self.surrounded(), torch.nan, room))
         return reduce(torch.fmax, found) if found else None
 
 
@@ -111,9 +120,11 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
     )
     cloud = split_cloud(scene, focus, plane, tolerance, region)
     half, centre = _BOX * focus.distance, focus.fixation_world
+    turns = plane is None and len(scene.background_from_view) > 0
+    seen = pixels_of if turns else pixels_seen
     return Cues(
         pictures=pictures,
-        object_px=tuple(pixels_seen(scene, cameras, cloud.on_object)),
+        object_px=tuple(seen(scene, cameras, cloud.on_object)),
         background_px=tuple(pixels_seen(scene, cameras, cloud.background)),
         plane=plane,
         background_from_view=scene.background_from_view,
