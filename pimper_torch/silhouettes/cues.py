@@ -61,6 +61,11 @@ class Cues(Record):
         counts = torch.tensor([len(pixels) for pixels in self.object_px])
         return int(counts.median()) >= _MIN_OBSERVED
 
+    @property
+    def all_round(self) -> bool:
+        """Whether backgrounds that are known are all round: a room, and the plane before it."""
+        return self.plane is not None and len(self.background_from_view) > 0
+
     def surrounded(self) -> Bool[Tensor, "view height width"]:
         """Mark what the object's points surround in each view."""
         height, width = self.pictures.grey.shape[1:]
@@ -90,7 +95,7 @@ class Cues(Record):
             found.append(plane_agreement(self.pictures, self.plane, self.fixation, hidden))
         if len(self.background_from_view):
             room = room_agreement(self.pictures, self.background_from_view, hidden)
-            found.append(torch.where(self.surrounded(), torch.nan, room))
+            found.append(room if self.plane else room.masked_fill(self.surrounded(), torch.nan))
         return reduce(torch.fmax, found) if found else None
 
 

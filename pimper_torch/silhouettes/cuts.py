@@ -88,7 +88,9 @@ def _filled(
 
 
 def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
-    """Cut from points and parallax; where hardly any points are the object's, parallax alone.
+    """Cut from points and parallax; by parallax alone where backgrounds are all round.
+
+    So they do where hardly any points are the object's.
 
     Every other pixel is enough: all are cut again.
     """
@@ -97,7 +99,7 @@ def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
     def first(view: int) -> Bool[Tensor, "height width"]:
         object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
-        if agreement is not None and not cues.has_points:
+        if agreement is not None and (cues.all_round or not cues.has_points):
             return off_plane(agreement)
         labels = labels_from_points(object_px, cues.background_px[view], agreement, (width, height))
         margin = signed_distance(convex_hull_of(object_px, (width, height)))
