@@ -7,6 +7,7 @@ is read, impossible values when the dataclass is made (:func:`require`).
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from collections.abc import Hashable, Iterator, Mapping
@@ -65,6 +66,16 @@ def to_mapping(config: object) -> dict[str, object]:
 def to_yaml(config: object) -> str:
     """Write every setting of a config, defaults included, as YAML."""
     return yaml.safe_dump(to_mapping(config), sort_keys=False, allow_unicode=True)
+
+
+def written(value: object) -> str:
+    """Write one plain value as YAML, in a line.
+
+    >>> written([0.5, 1.0]), written("on")
+    ('[0.5, 1.0]', "'on'")
+    """
+    text = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=math.inf)
+    return text.removesuffix("...\n").strip()
 
 
 def overlay(base: Mapping[str, object], other: Mapping[str, object]) -> dict[str, object]:

@@ -59,10 +59,8 @@ class CoarseToFineConfig:
 
     Attributes:
         chain: Which chain these are the settings of.
-        kernels: Whether compiled kernels stand in for torch on the CPU, where no gradients are
-            asked for (numba), or nowhere (torch).
-        max_memory: That the process may hold, such as 4GB. A run whose last pass would take more
-            is refused in its first, with what would be needed. Nothing is no limit.
+        kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or none.
+        max_memory: Such as 4GB: a run whose last pass would take more is refused in its first.
         scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
     """

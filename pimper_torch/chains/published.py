@@ -44,8 +44,7 @@ class PublishedConfig:
 
     Attributes:
         chain: Which chain these are the settings of.
-        kernels: Whether compiled kernels stand in for torch on the CPU, where no gradients are
-            asked for (numba), or nowhere (torch).
+        kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or none.
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
     """
 

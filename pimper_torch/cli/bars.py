@@ -20,10 +20,15 @@ class Bars:
     """An observer with a bar and the time left for every stage.
 
     Where the output is no terminal, it writes a line when a stage ends instead.
+
+    Args:
+        console: Where to.
+        figures: How many of a stage's figures are shown at its end; ``None`` is all.
     """
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, figures: int | None = 3) -> None:
         self.console = console
+        self._most = figures
         self._progress = Progress(
             TextColumn("{task.description:<12}"),
             BarColumn(),
@@ -59,7 +64,7 @@ class Bars:
 
     def finished(self, report: StageReport) -> None:
         """Complete the bar, and say what was found."""
-        found = ", ".join(list(_figures(report))[:3])
+        found = ", ".join(_figures(report)[: self._most])
         if self._task is not None:
             self._progress.update(self._task, completed=1, total=1, found=found)
         if not self.console.is_terminal:

@@ -17,7 +17,12 @@ from typing import Any
 
 _PACKAGE = Path(__file__).parents[1]
 # Loaded as they are, and so are modules of the standard library.
-_SMALL = ("tyro", "pimper_torch.errors", "pimper_torch.config", "pimper_torch.cli.light")
+_SMALL = (
+    "tyro",
+    "pimper_torch.errors",
+    "pimper_torch.config",
+    *(f"pimper_torch.cli.{name}" for name in ("light", "arguments", "option", "output")),
+)
 
 
 class _Absent:

@@ -11,13 +11,10 @@ import tyro
 
 from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
+from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.io.folders import prepare_output
 from pimper_torch.io.photographs import list_images
 from pimper_torch.io.results import RESULT_NAMES
-
-Flag = tyro.conf.FlagCreatePairsOff[bool]
-# Several numbers are one word, 15000,15100,14900: a list would swallow PHOTOS behind it.
-LEVELS: Any = tyro.conf.UsePythonSyntaxForLiteralCollections  # typed as what it marks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,17 +22,15 @@ class CommonOptions:
     """Options that every command has.
 
     Attributes:
-        preset: Settings to start from: paper, default, fast, or a YAML file of your own.
-        reference: Name of the photograph that the facets and pictures are seen from; chosen
-            automatically unless given.
-        device: Where everything after structure from motion runs; cuda has never been run on a GPU.
+        preset: Settings to start from: default, fast, paper, or a YAML file of your own.
+        reference: Photograph that facets and pictures are seen from; chosen unless given.
+        device: Of all after structure from motion; cuda has never been run on a GPU.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         overwrite: Replace a former result in OUT.
-        full_mesh: Write every vertex that was found. Without it mesh.ply and mesh.glb have fewer
-            where the surface is smooth: those left out are within a twentieth of a sample's spacing
-            of it, their normals within 1.5 degrees.
-        cache: Folder where structure from motion is kept from run to run, so that a change of a
-            later stage costs only the later stages; none unless given.
+        full_mesh: Write every vertex, also where fewer tell the surface to a twentieth of a
+            sample's spacing and 1.5 degrees.
+        cache: Folder that keeps structure from motion, so that a run with a change of a later
+            stage begins there.
     """
 
     preset: str = "default"
@@ -54,14 +49,12 @@ class InputOptions:
     Attributes:
         masks: Folder with a mask for each photograph, of the same name; zero off the object.
         mask_object: How masks show the object; auto looks at all of them together.
-        sparse: Folder of a COLMAP model of these photographs, used instead of structure
-            from motion.
-        mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB), used instead of the
-            one that the photographs themselves give.
-        object: Whether silhouettes of the object are found (auto), taken from masks, or everything
-            is the object, as for walls, height fields and scenes; as `--silhouettes.object`.
-        region: Box that the object is inside, smallest and largest corner in scene units, such as
-            (-1,-1,0,1,1,2); as `--silhouettes.region`.
+        sparse: Folder of a COLMAP model to use instead of structure from motion.
+        mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB) to start from.
+        object: Find silhouettes of the object, take masks for them, or take everything for the
+            object, as of walls and scenes. (default: auto)
+        region: Box that the object is inside: smallest and largest corner in scene units, such as
+            (-1,-1,0,1,1,2).
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -91,11 +84,11 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
     """Read the arguments of a command.
 
     The preset is read first: its settings are the defaults that other options change, and
-    that ``--help`` shows.
+    that ``--help-all`` shows.
 
     Raises:
-        ConfigError: No such preset, or an impossible setting.
-        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
+        ConfigError: No such preset, unknown or wrong arguments, or an impossible setting.
+        SystemExit: ``--help`` was answered.
     """
     preset = load_config(_preset(arguments))
     settings: Any = type(preset)  # each chain has its own
@@ -132,12 +125,8 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         """
         return Job(photos=bundled_photographs(), out=out, common=common, config=config)
 
-    job = tyro.cli(
-        reconstruct if command == "reconstruct" else demo,
-        prog=f"pimper {command}",
-        args=list(arguments),
-        config=(LEVELS,),
-    )
+    verb = reconstruct if command == "reconstruct" else demo
+    job = read_arguments(verb, command, arguments, levels=True)
     silhouettes = job.config.silhouettes
     if job.inputs.object:
         silhouettes = dataclasses.replace(silhouettes, object=job.inputs.object)

@@ -1,29 +1,22 @@
 """One run, from photographs to a folder of results."""
 
-import time
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+import json
+from collections.abc import Sequence
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from pimper_torch.chains.presets import make_chain
-from pimper_torch.cli.bars import Bars
 from pimper_torch.cli.options import Job, checked
+from pimper_torch.cli.output import Output, stage
 from pimper_torch.errors import ConfigError
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
-from pimper_torch.io.results import write_result
-from pimper_torch.progress import listening
-from pimper_torch.records import Reconstruction, StageReport, Views
-from pimper_torch.reporting import peak_memory_mb
+from pimper_torch.io.results import RESULT_NAMES, write_result
+from pimper_torch.records import Reconstruction, Views
 from pimper_torch.viz.overview import headline
 
-Output = TypeVar("Output")
 
-
-def run(command: str, arguments: Sequence[str]) -> None:
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``reconstruct`` or ``demo``.
 
     Raises:
@@ -32,15 +25,17 @@ def run(command: str, arguments: Sequence[str]) -> None:
     job = checked(command, arguments)
     common = job.common
     _check_device(common.device)
-    console = Console(stderr=True)
-    with Bars(console) as bars:
-        views = _watched(bars, "read", lambda: _read(job))
+    with output.observer() as observer:
+        with stage(observer, "read") as figure:
+            views = _read(job)
+            figure("photographs", views.num_views)
         mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
-        result = make_chain(job.config, bars, common.cache)(
+        result = make_chain(job.config, observer, common.cache)(
             views.to(common.device), job.inputs.sparse, mesh
         )
-        _watched(bars, "write", lambda: _write(job, result))
-    _conclude(Console(), job, result)
+        with stage(observer, "write"):
+            _write(job, result)
+    _conclude(output, job, result)
 
 
 def _read(job: Job) -> Views:
@@ -75,23 +70,6 @@ def _write(job: Job, result: Reconstruction) -> None:
     )
 
 
-def _watched(bars: Bars, name: str, work: Callable[[], Output]) -> Output:
-    """Show a piece of work at the edge as if it were a stage."""
-    began = time.perf_counter()
-    bars.started(name)
-    with listening(bars.progressed):
-        output = work()
-    bars.finished(
-        StageReport(
-            name=name,
-            seconds=time.perf_counter() - began,
-            peak_memory_mb=peak_memory_mb(),
-            figures={"photographs": output.num_views} if isinstance(output, Views) else {},
-        )
-    )
-    return output
-
-
 def _check_device(device: str) -> None:
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
@@ -100,23 +78,26 @@ def _check_device(device: str) -> None:
         )
 
 
-def _conclude(console: Console, job: Job, result: Reconstruction) -> None:
+def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
     """Say what came out and where it is."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("stage")
-    table.add_column("seconds", justify="right")
-    table.add_column("peak MB", justify="right")
-    for report in result.report:
-        table.add_row(report.name, f"{report.seconds:.1f}", f"{report.peak_memory_mb:.0f}")
-    console.print(table)
     fewer = "" if job.common.full_mesh else " (simplified; --full-mesh writes every vertex)"
-    console.print(headline(result), highlight=False)
+    output.remark(f"{_costs(result)}\n{headline(result)}")
     if result.scene.doubt:
-        console.print(result.scene.doubt, style="bold yellow", highlight=False, soft_wrap=True)
-    console.print(
-        f"{job.out}/mesh.ply is the surface{fewer}, {job.out}/overview.png shows it.",
-        highlight=False,
-        soft_wrap=True,
+        output.warning(result.scene.doubt)
+    output.remark(f"{job.out}/mesh.ply is the surface{fewer}, {job.out}/overview.png shows it.")
+    paths = {name: job.out / name for name in RESULT_NAMES if (job.out / name).exists()}
+    figures = json.loads((job.out / "summary.json").read_text(encoding="utf-8"))
+    output.result({"folder": job.out, **paths}, figures=figures)
+
+
+def _costs(result: Reconstruction) -> str:
+    """Tell what every stage took, in columns."""
+    return "\n".join(
+        ["stage             seconds   peak MB"]
+        + [
+            f"{report.name:<16}{report.seconds:9.1f}{report.peak_memory_mb:10.0f}"
+            for report in result.report
+        ]
     )
 
 

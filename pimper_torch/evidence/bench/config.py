@@ -32,8 +32,8 @@ class BenchConfig:
     Attributes:
         scale: quick: 16 photographs of 640x480 a scene; full: 30 of 1600x1200.
         scenes: Names of rendered scenes, or folders that `pimper render` wrote.
-        methods: Presets, YAML files of settings, and baselines. None is those of the scale: quick
-            runs default, smoothed and global-stereo; full also paper, lim, pmvs, openmvs and
+        methods: Presets, YAML files of settings, and baselines. By default those of the scale:
+            quick runs default, smoothed and global-stereo; full also paper, lim, pmvs, openmvs and
             colmap-dense.
         masks: Give the methods the true masks of the object; without, they see the table too.
         cameras: found by structure from motion, once a scene and the same for all methods; by

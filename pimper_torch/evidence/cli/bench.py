@@ -8,8 +8,8 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from pimper_torch.cli.bars import Bars
-from pimper_torch.cli.options import Flag
+from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.output import Output
 from pimper_torch.evidence.bench.config import BenchConfig
 from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
 from pimper_torch.evidence.bench.table import terminal
@@ -19,24 +19,21 @@ from pimper_torch.sfm.cache import user_cache
 _OUT, _QUICK = Path("pimper_bench"), BenchConfig()
 
 
-def run(command: str, arguments: Sequence[str]) -> None:
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``bench``.
 
     Raises:
         PimperError: Before anything is written.
     """
     job = checked(command, arguments)
-    with Bars(Console(stderr=True)) as bars:
+    with output.observer() as observer:
         table = run_bench(
-            job.config, job.out, observer=bars, overwrite=job.overwrite, cache=job.cache
+            job.config, job.out, observer=observer, overwrite=job.overwrite, cache=job.cache
         )
-    console = Console()
-    console.print(terminal(table))
-    console.print(
-        f"{job.out}/table.md is the table, {job.out}/sheet.png shows it.",
-        highlight=False,
-        soft_wrap=True,
-    )
+    if not output.as_json:
+        Console().print(terminal(table))
+    output.remark(f"{job.out}/table.md is the table, {job.out}/sheet.png shows it.")
+    output.result({name: job.out / name for name in BENCH_NAMES if (job.out / name).exists()})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +49,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
     Raises:
         PimperError: An impossible setting, or the folder holds something else.
-        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
+        SystemExit: ``--help`` was answered.
     """
     kept = user_cache()
 
@@ -73,6 +70,6 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         """
         return _Job(out=out, config=config, cache=cache, overwrite=overwrite)
 
-    job = tyro.cli(bench, prog=f"pimper {command}", args=list(arguments))
+    job = read_arguments(bench, command, arguments)
     prepare_output(job.out, BENCH_NAMES, job.overwrite)
     return job

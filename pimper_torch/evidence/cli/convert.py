@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,10 @@ from typing import Annotated, Literal
 import torch
 import tyro
 from jaxtyping import Float
-from rich.console import Console
 from torch import Tensor
 
-from pimper_torch.cli.bars import Bars
-from pimper_torch.cli.options import LEVELS, Flag
+from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.output import Output, stage
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import (
     read_colmap,
@@ -36,11 +34,9 @@ from pimper_torch.evidence.datasets import (
 )
 from pimper_torch.evidence.datasets.posed import shrink
 from pimper_torch.io.folders import prepare_output, written_whole
-from pimper_torch.progress import listening
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
-from pimper_torch.records import Cameras, Capture, StageReport, Truth, Views
-from pimper_torch.reporting import peak_memory_mb
+from pimper_torch.records import Cameras, Capture, Truth, Views
 
 Source = Literal[
     "colmap",
@@ -125,22 +121,20 @@ class Job:
     options: ReadOptions
 
 
-def run(command: str, arguments: Sequence[str]) -> None:
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``convert``: read, write whole or not at all, and say what came.
 
     Raises:
         PimperError: Before anything is written.
     """
     job = checked(command, arguments)
-    with Bars(Console(stderr=True)) as bars:
-        bars.started("read")
-        began = time.perf_counter()
-        with listening(bars.progressed):
-            capture = read(job)
-        bars.finished(_report(capture, time.perf_counter() - began))
+    with output.observer() as observer, stage(observer, "read") as figure:
+        capture = read(job)
+        figure("photographs", capture.views.num_views)
     with written_whole(job.out, RESULT_NAMES, overwrite=job.overwrite) as staging:
         write(capture, job.target, staging)
-    Console().print(describe(capture, job), highlight=False, soft_wrap=True)
+    output.remark(describe(capture, job))
+    output.result({"folder": job.out}, photographs=capture.views.num_views)
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
@@ -160,7 +154,7 @@ def parse(arguments: Sequence[str]) -> Job:
     """Read the arguments of ``convert``.
 
     Raises:
-        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
+        SystemExit: ``--help`` was answered.
     """
 
     def convert(
@@ -192,7 +186,7 @@ def parse(arguments: Sequence[str]) -> Job:
             options=options,
         )
 
-    return tyro.cli(convert, prog="pimper convert", args=list(arguments), config=(LEVELS,))
+    return read_arguments(convert, "convert", arguments, levels=True)
 
 
 def readers() -> Mapping[Source, Callable[..., Capture]]:
@@ -322,12 +316,3 @@ def _count(number: int, noun: str) -> str:
 
 def _option(name: str) -> str:
     return f"--{'photographs.' * (name in _PHOTOGRAPHS)}{name.replace('_', '-')}"
-
-
-def _report(capture: Capture, seconds: float) -> StageReport:
-    return StageReport(
-        name="read",
-        seconds=seconds,
-        peak_memory_mb=peak_memory_mb(),
-        figures={"photographs": capture.views.num_views},
-    )

@@ -13,6 +13,8 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
+from pimper_torch.cli.arguments import read_arguments
+from pimper_torch.cli.output import Output
 from pimper_torch.config import to_mapping
 from pimper_torch.errors import InputError, OutputError
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
@@ -107,7 +109,7 @@ class Job:
     options: EvaluateOptions = field(default_factory=EvaluateOptions)
 
 
-def run(command: str, arguments: Sequence[str]) -> None:
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``evaluate``.
 
     Raises:
@@ -124,14 +126,17 @@ def run(command: str, arguments: Sequence[str]) -> None:
         )
     truth = read_truth(job, estimate, config)
     evaluation = evaluate(estimate, truth.capture, config, maps=truth.maps, dtu=truth.protocol)
-    console = Console()
-    show(evaluation, console)
+    if not output.as_json:
+        show(evaluation, Console())
     if job.out is not None:
         write_report(evaluation, job)
-        console.print(f"{job.out} has all figures.", highlight=False, soft_wrap=True)
+        output.remark(f"{job.out} has all figures.")
     if job.calibration is not None:
         _draw(evaluation, job.calibration)
-        console.print(f"{job.calibration} is drawn.", highlight=False, soft_wrap=True)
+        output.remark(f"{job.calibration} is drawn.")
+    files = {"figures": job.out, "calibration": job.calibration}
+    paths = {name: path for name, path in files.items() if path is not None}
+    output.result(paths, figures=report(evaluation))
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
@@ -155,7 +160,7 @@ def parse(arguments: Sequence[str]) -> Job:
     """Read the arguments of ``evaluate``.
 
     Raises:
-        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
+        SystemExit: ``--help`` was answered.
     """
 
     def evaluate(
@@ -177,7 +182,7 @@ def parse(arguments: Sequence[str]) -> Job:
         """
         return Job(result=result, truth=truth, out=out, calibration=calibration, options=options)
 
-    return tyro.cli(evaluate, prog="pimper evaluate", args=list(arguments))
+    return read_arguments(evaluate, "evaluate", arguments)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

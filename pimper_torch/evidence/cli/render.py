@@ -1,24 +1,28 @@
 """``pimper render``: photographs of a scene, with the truth beside them."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
-from pimper_torch.cli.bars import Bars
+from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.output import Output, stage
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.write import render_scene
-from pimper_torch.progress import listening
-from pimper_torch.records import StageReport
-from pimper_torch.reporting import peak_memory_mb
-
-Flag = tyro.conf.FlagCreatePairsOff[bool]
 
 _DEFAULT = SceneConfig()
+# Left to --help-all.
+_RARE = tuple(
+    f"--{name}"
+    for name in [
+        *("processes", "elevation-deg", "sway-deg", "fill", "no-fixed-point-light"),
+        *("no-fixed-room", "no-fixed-table", "no-constant-light", "pan-jitter-px"),
+        *("crop-jitter-px", "point-light-distance", "irradiance", "flash", "bounces"),
+        *("read-noise", "shot-noise", "supersample", "up", "rotation-deg"),
+    ]
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,41 +34,24 @@ class _Job:
     config: SceneConfig
 
 
-def run(command: str, arguments: Sequence[str]) -> None:
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``render``.
 
     Raises:
         PimperError: Before anything is written.
     """
     job = checked(command, arguments)
-    console = Console(stderr=True)
-    with Bars(console) as bars:
-        began = time.perf_counter()
-        bars.started("render")
-        with listening(bars.progressed):
-            render_scene(
-                job.scene,
-                job.out,
-                job.config,
-                processes=job.processes,
-                overwrite=job.overwrite,
-            )
-        bars.finished(
-            StageReport(
-                name="render",
-                seconds=time.perf_counter() - began,
-                peak_memory_mb=peak_memory_mb(),
-                figures={"photographs": job.config.num_views},
-            )
+    with output.observer() as observer, stage(observer, "render") as figure:
+        render_scene(
+            job.scene, job.out, job.config, processes=job.processes, overwrite=job.overwrite
         )
+        figure("photographs", job.config.num_views)
     option = "" if job.config.encoding == "srgb" else " --photographs.response linear"
-    Console().print(
+    output.remark(
         f"{job.out}/photos are the photographs, {job.out}/truth is what they show. Next:\n"
-        f"  pimper reconstruct {job.out}/photos -o RESULT{option}",
-        highlight=False,
-        soft_wrap=True,
-        markup=False,
+        f"  pimper reconstruct {job.out}/photos -o RESULT{option}"
     )
+    output.result({name: job.out / name for name in ("photos", "masks", "truth")})
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
@@ -72,7 +59,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
     Raises:
         ConfigError: An impossible setting.
-        SystemExit: Unknown or wrong arguments, reported by tyro, or ``--help``.
+        SystemExit: ``--help`` was answered.
     """
 
     def render(
@@ -93,4 +80,4 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         """
         return _Job(scene=scene, out=out, processes=processes, overwrite=overwrite, config=config)
 
-    return tyro.cli(render, prog=f"pimper {command}", args=list(arguments))
+    return read_arguments(render, command, arguments, rare=_RARE)

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.console import Console
 
-from pimper_torch.cli.bars import Bars
+from pimper_torch.cli.arguments import read_arguments
+from pimper_torch.cli.output import Output, stage
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import list_images, load_views, read_mask
-from pimper_torch.progress import listening
 from pimper_torch.radiometry import LINEAR
 from pimper_torch.single_view.factorization.gamma import GammaEstimate, gamma_of_photographs
 
@@ -19,20 +18,19 @@ from pimper_torch.single_view.factorization.gamma import GammaEstimate, gamma_of
 _AS_GOOD = 1.05
 
 
-def run(command: str, arguments: Sequence[str]) -> None:
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``gamma``: read, estimate, and print it with the option of `pimper reconstruct`.
 
     Raises:
         PimperError: Photographs that cannot be read, or too few under too few lights.
     """
     job = checked(command, arguments)
-    with Bars(Console(stderr=True)) as bars:
-        bars.started("read")
-        with listening(bars.progressed):
-            views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
+    with output.observer() as observer, stage(observer, "read"):
+        views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
     drawn = None if job.mask is None else read_mask(job.mask, job.max_size_px)
     found = gamma_of_photographs(views, mask=drawn, rank=job.rank)
-    Console().print(f"{found}{advice(found)}", highlight=False, soft_wrap=True, markup=False)
+    output.say(f"{found}{advice(found)}")
+    output.result(gamma=found.gamma, determined=found.determined)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +46,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
     Raises:
         InputError: The folder of photographs, or the mask.
-        SystemExit: Invalid arguments, or ``--help``.
+        SystemExit: ``--help`` was answered.
     """
 
     def gamma(
@@ -67,7 +65,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         """
         return _Job(photos=photos, mask=mask, rank=rank, max_size_px=max_size_px)
 
-    job = tyro.cli(gamma, prog=f"pimper {command}", args=list(arguments))
+    job = read_arguments(gamma, command, arguments)
     list_images(job.photos)
     if job.mask is not None and not job.mask.is_file():
         raise InputError(

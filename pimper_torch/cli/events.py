@@ -1,0 +1,50 @@
+"""How far a run has come, as events for a machine."""
+
+import time
+from typing import Protocol
+
+from pimper_torch.records import StageReport
+
+
+class Write(Protocol):
+    """Whatever writes an event."""
+
+    def __call__(self, event: str, **about: object) -> None:
+        """Write it."""
+
+
+class Events:
+    """An observer that writes when a stage begins, how far it is, and when it ends.
+
+    Args:
+        write: Called with every event.
+        seconds: Progress is written no more often; its end always is.
+    """
+
+    def __init__(self, write: Write, seconds: float) -> None:
+        self._write = write
+        self._seconds = seconds
+        self._stage = ""
+        self._last = 0.0
+
+    def started(self, stage: str) -> None:
+        """Write that a stage begins."""
+        self._stage, self._last = stage, time.perf_counter()
+        self._write("stage-begin", stage=stage)
+
+    def progressed(self, done: int, total: int) -> None:
+        """Write how far the stage is, unless that was written just now."""
+        now = time.perf_counter()
+        if now - self._last >= self._seconds or done == total:
+            self._last = now
+            self._write("progress", stage=self._stage, done=done, total=total)
+
+    def finished(self, report: StageReport) -> None:
+        """Write that the stage ended, what it cost and what it found."""
+        self._write(
+            "stage-end",
+            stage=report.name,
+            seconds=round(report.seconds, 3),
+            peak_memory_mb=round(report.peak_memory_mb, 1),
+            figures=report.figures,
+        )

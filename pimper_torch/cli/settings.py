@@ -1,0 +1,152 @@
+"""``pimper config``: the settings of a preset as YAML, or what some of them mean."""
+
+import dataclasses
+import difflib
+import textwrap
+import typing
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import tyro
+
+from pimper_torch.chains.presets import Config, load_config
+from pimper_torch.cli.arguments import read_arguments
+from pimper_torch.cli.option import meanings, summary, value_of
+from pimper_torch.cli.output import Output
+from pimper_torch.config import presets, to_mapping, written
+from pimper_torch.errors import ConfigError
+
+_WIDTH = 96
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    """What is asked for: all settings of a preset, a section of them, or one."""
+
+    preset: str
+    config: Config
+    path: tuple[str, ...] = ()
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``config``.
+
+    Raises:
+        PimperError: No such preset or setting.
+    """
+    job = checked(command, arguments)
+    value: object = job.config
+    owner = value
+    for name in job.path:
+        owner, value = value, getattr(value, name)
+    if dataclasses.is_dataclass(value):
+        lines = [f"# {job.preset}: {text}" for text in [summary(type(value))] if not job.path]
+        output.say("\n".join([*lines, *_yaml(job.config, job.path)]))
+        output.result(settings=to_mapping(value))
+    else:
+        output.say(_explained(job, owner, value))
+        output.result(settings={".".join(job.path): value})
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and find what is asked for.
+
+    Raises:
+        ConfigError: No such preset or setting; names the nearest.
+        SystemExit: ``--help`` was answered.
+    """
+
+    def config(
+        name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "",
+        preset: str = "default",
+    ) -> _Job:
+        """Print the settings of a preset as YAML with their meaning, or explain one.
+
+        What is printed is a file of settings for `--preset`, which may be cut down to the lines
+        that differ: `pimper config paper > mine.yaml`.
+
+        Args:
+            name: A preset to print (default, fast, paper, or a YAML file); or a section or a
+                setting to explain, such as sweep or fuse.contours.
+            preset: Whose settings these are.
+        """
+        is_preset = name in presets() or Path(name).suffix in (".yaml", ".yml")
+        chosen = name if is_preset else preset
+        settings = load_config(chosen)
+        path = () if is_preset or not name else tuple(name.replace("-", "_").split("."))
+        _require_setting(settings, path, name)
+        return _Job(preset=chosen, config=settings, path=path)
+
+    return read_arguments(config, command, arguments)
+
+
+def _require_setting(settings: object, path: Sequence[str], name: str) -> None:
+    known = ["", *_names(settings, "")]
+    if ".".join(path) not in known:
+        near = difflib.get_close_matches(name, [*known, *presets()], n=1, cutoff=0.5)
+        ends = [one for one in known if one.endswith(f".{path[-1]}")]
+        hint = f" Did you mean `{(ends or near)[0]}`?" if ends or near else ""
+        raise ConfigError(
+            f"there is no setting or preset `{name}`.{hint} `pimper config` prints all settings."
+        )
+
+
+def _names(settings: object, stem: str) -> Iterator[str]:
+    assert dataclasses.is_dataclass(settings)
+    for field in dataclasses.fields(settings):
+        yield f"{stem}{field.name}"
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _names(value, f"{stem}{field.name}.")
+
+
+def _yaml(settings: object, path: Sequence[str], depth: int = 0) -> Iterator[str]:
+    """Write settings as YAML, what each means above it; of ``path`` alone, if one is given."""
+    said, indent = meanings(type(settings)), "  " * depth
+    for name, hint in typing.get_type_hints(type(settings)).items():
+        value = getattr(settings, name)
+        if path and name != path[0]:
+            continue
+        if typing.get_origin(hint) is ClassVar:
+            yield from _comment(said.get(name, ""), indent)
+            yield f"{indent}{name}: {written(value)}"
+        elif dataclasses.is_dataclass(value):
+            yield ""
+            yield from _comment(summary(type(value)).split("\n\n")[0], indent)
+            yield f"{indent}{name}:"
+            yield from _yaml(value, path[1:], depth + 1)
+        else:
+            yield from _comment(said.get(name, ""), indent)
+            yield f"{indent}{name}: {written(to_mapping(settings)[name])}"
+
+
+def _comment(text: str, indent: str) -> list[str]:
+    start = f"{indent}# "
+    return textwrap.wrap(text, _WIDTH, initial_indent=start, subsequent_indent=start)
+
+
+def _explained(job: _Job, owner: object, value: object) -> str:
+    """Tell what a setting means, what it may be, and how it is set."""
+    name, kind = job.path[-1], type(owner)
+    option = f"--{'.'.join(job.path)}".replace("_", "-")
+    meaning = meanings(kind).get(name, "")
+    hint = typing.get_type_hints(kind)[name]
+    lines = [
+        f"{'.'.join(job.path)}: {written(to_mapping(owner)[name])}  # in {job.preset}",
+        *textwrap.wrap(meaning, _WIDTH),
+        f"needed: {'true or false' if hint is bool else value_of(hint, ', ')}",
+        f"option: {option}",
+        "file:",
+        *_nested(job.path, written(to_mapping(owner)[name])),
+    ]
+    return "\n".join(lines)
+
+
+def _nested(path: Sequence[str], value: str) -> list[str]:
+    ends = [""] * (len(path) - 1) + [f" {value}"]
+    return [
+        f"{'  ' * (depth + 1)}{name}:{end}"
+        for depth, (name, end) in enumerate(zip(path, ends, strict=True))
+    ]
