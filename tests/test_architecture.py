@@ -43,6 +43,7 @@ ROOMS = [
     "chains",
     "viz",
     "io",
+    "doctor",
     "cli",
     "single_view",
     "evidence",

@@ -256,8 +256,8 @@ def test_newcomers_are_shown_the_default():
     assert not any("--preset" in line for line in mine)
 
 
-class Understood(Exception):  # noqa: N818 - good news
-    """The command line was parsed."""
+class Understood(BaseException):
+    """The command line was parsed: good news, which the command line takes for no fault."""
 
 
 def commands_of_pages() -> list[str]:

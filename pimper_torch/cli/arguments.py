@@ -81,11 +81,12 @@ def page(
     """Write the help of a command: of what :func:`read_arguments` reads, or of ``everything``."""
     options = list(options_of(command, "," if levels else " "))
     shown = [one for one in options if everything or not _hidden(one, rare)]
-    needed = [one for one in options if one.default is REQUIRED]
+    needed = [one for one in options if one.default is REQUIRED or one.names[0][0] != "-"]
     usage = " ".join(f"{one.names[0]} {_value(one, 0)}".strip() for one in needed)
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     lines = [f"usage: pimper {name} {usage + ' ' * bool(usage)}[options]", ""]
-    lines += textwrap.wrap(summary(command), width)
+    for place, paragraph in enumerate(summary(command).split("\n\n")):
+        lines += [""] * bool(place) + textwrap.wrap(" ".join(paragraph.split()), width)
     for section in dict.fromkeys(one.section for one in shown):
         lines += ["", *textwrap.wrap(f"{section.rstrip('.') or 'arguments'}:", width)]
         for one in shown:

@@ -127,7 +127,7 @@ def _options(given: _Given, annotation: object, default: object) -> Iterator[Opt
             stage, dot, last = written[2:].rpartition(".")
             names = (written, f"--{stage}{dot}no-{last}")
     if _POSITIONAL in marks:
-        names, value = (value,), ""
+        names, value = ((value if default is REQUIRED else f"[{value}]"),), ""
     yield Option(
         section=given.section, names=names, value=value, meaning=given.meaning, default=default
     )

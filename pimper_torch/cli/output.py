@@ -32,7 +32,8 @@ class Output:
     - ``start``: ``command``, ``arguments``, ``versions``, ``format`` (1).
     - ``stage-begin``: ``stage``. ``progress``: ``stage``, ``done``, ``total``.
     - ``stage-end``: ``stage``, ``seconds``, ``peak_memory_mb``, ``figures``.
-    - ``warning``: ``message``.
+    - ``warning``: ``message``. ``finding``, of ``doctor``: ``check``, ``severity``, ``found``,
+      ``needed``, ``advice``.
     - ``result``: ``paths`` by name, and figures of the command.
     - ``error``: ``kind``, ``message``, ``exit_code``; it is the last one then.
 

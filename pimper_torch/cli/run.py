@@ -1,14 +1,17 @@
 """One run, from photographs to a folder of results."""
 
 import json
+import warnings
 from collections.abc import Sequence
 
 import torch
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output, stage
-from pimper_torch.errors import ConfigError
+from pimper_torch.doctor.examine import examine_views
+from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -29,6 +32,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         with stage(observer, "read") as figure:
             views = _read(job)
             figure("photographs", views.num_views)
+        _examine(job, views)
         mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         result = make_chain(job.config, observer, common.cache)(
             views.to(common.device), job.inputs.sparse, mesh
@@ -46,6 +50,18 @@ def _read(job: Job) -> Views:
         encoding=job.config.photographs,
         max_size_px=job.common.max_size_px,
     )
+
+
+def _examine(job: Job, views: Views) -> None:
+    """Warn of what `pimper doctor` finds without comparing what photographs show."""
+    config, own = job.config, set()
+    if job.inputs.sparse is not None or not config.reconstruct.shared_camera:
+        own.add("lenses")
+    if not isinstance(config, CoarseToFineConfig):
+        own.add("cost")  # which is that of `default`
+    for finding in examine_views(views):
+        if finding.severity == "warning" and finding.check not in own:
+            warnings.warn(f"{job.photos}: {finding}", PimperWarning, stacklevel=2)
 
 
 def _write(job: Job, result: Reconstruction) -> None:

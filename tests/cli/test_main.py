@@ -1,7 +1,10 @@
 import json
+import math
 import os
 import signal
+import tempfile
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,6 +14,7 @@ from PIL import Image
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
+from pimper_torch.cli.output import Output
 from pimper_torch.errors import PimperWarning, ReconstructionError
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -179,9 +183,6 @@ def test_a_run_that_ends_early_leaves_nothing(
 
 
 def test_warnings_are_sentences(photos, chain, tmp_path, capsys, monkeypatch):
-    def warn(_):
-        warnings.warn("light hardly varies.", PimperWarning, stacklevel=1)
-
     monkeypatch.setattr(chain, "work", warn)
     usual = warnings.showwarning
     assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
@@ -194,8 +195,12 @@ def test_help_names_the_commands_and_version_the_version(capsys):
     told = capsys.readouterr().out
     assert "pimper reconstruct PHOTOS" in told
     assert "pimper demo" in told
+    assert "2 bad input, 130 interrupted, 1 unexpected" in told
     assert run("--version") == 0
-    assert capsys.readouterr().out == f"pimper_torch {installed_version()}\n"
+    lines = dict(line.split(" ", 1) for line in capsys.readouterr().out.splitlines())
+    assert lines["pimper_torch"] == installed_version()
+    assert lines["torch"] == torch.__version__
+    assert {"kornia", "pycolmap", "Python", "system"} <= lines.keys()
     assert run() == 2
 
 
@@ -206,18 +211,119 @@ def test_a_misspelt_command_names_the_nearest(capsys):
 
 def test_every_setting_is_an_option_with_its_help(capsys):
     with pytest.raises(SystemExit) as ended:
-        run("demo", "--help")
+        run("demo", "--help-all")
     assert ended.value.code == 0
     told = capsys.readouterr().out
     for name in ("--reconstruct.starts", "--coarse-surface.reference", "--overwrite", "--preset"):
         assert name in told
 
 
-def test_an_unknown_option_is_refused(photos, chain, tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        run("reconstruct", photos, "-o", tmp_path / "out", "--sede", "3")
-    assert ended.value.code == 2
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["--sede", "3"], "Unrecognized options: --sede, 3"),
+        (["--reconstruct.starts", "many"], "--reconstruct.starts: invalid literal"),
+        (["--log-level", "loud"], "--log-level is 'loud'; needed: one of error"),
+        (["--log-level"], "--log-level is nothing"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_paragraph(photos, chain, tmp_path, capsys, given, told):
+    assert run("reconstruct", photos, "-o", tmp_path / "out", *given) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert told in message
+    assert message.count("\n") == 1
     assert chain.given is None
+
+
+def test_what_is_unexpected_is_told_in_one_paragraph_and_kept(
+    photos, chain, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(chain, "work", lambda self: 1 / 0)
+    assert run("reconstruct", photos, "-o", tmp_path / "out", "-q") == 1
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith("error: unexpected ZeroDivisionError: division by zero.")
+    (kept,) = tmp_path.glob("pimper-*.txt")
+    assert str(kept) in message
+    assert "Traceback" in kept.read_text()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_log_of_debug_tells_tracebacks(photos, chain, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(chain, "work", lambda self: fail())
+    assert run("reconstruct", photos, "-o", tmp_path / "out", "--log-level", "debug") == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+def warn(_):
+    warnings.warn("light hardly varies.", PimperWarning, stacklevel=1)
+
+
+@pytest.mark.parametrize(
+    ("given", "warned"),
+    [(["--quiet"], True), (["-q"], True), (["--log-level=warning"], True)]
+    + [(["--log-level", "error"], False)],
+)
+def test_a_quiet_run_tells_warnings_alone(
+    photos, chain, tmp_path, capsys, monkeypatch, given, warned
+):
+    monkeypatch.setattr(chain, "work", warn)
+    assert run("reconstruct", photos, "-o", tmp_path / "out", *given) == 0
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert all(line.startswith("warning: ") for line in told.err.splitlines())
+    assert ("warning: light hardly varies." in told.err) is warned
+
+
+def events(capsys):
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_a_machine_reads_events_one_a_line(photos, chain, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(chain, "work", warn)
+    assert run("reconstruct", photos, "--json", "-o", tmp_path / "out") == 0
+    told = events(capsys)
+    assert told[0]["event"] == "start"
+    assert told[0]["command"] == "reconstruct"
+    assert told[0]["versions"]["pimper_torch"] == installed_version()
+    for name in ("read", "warp", "write"):
+        begun, ended = (
+            next(n for n, one in enumerate(told) if one == one | {"event": event, "stage": name})
+            for event in ("stage-begin", "stage-end")
+        )
+        assert begun < ended
+        assert told[ended]["seconds"] >= 0
+    (ended,) = [one for one in told if one == one | {"event": "stage-end", "stage": "warp"}]
+    assert ended["figures"] == {"samples": 1200}
+    assert {"event": "progress", "stage": "read", "done": 3, "total": 3}.items() <= next(
+        one for one in told if one["event"] == "progress"
+    ).items()
+    assert "light hardly varies." in [one.get("message") for one in told]
+    assert told[-1]["event"] == "result"
+    assert told[-1]["paths"]["mesh.ply"] == str(tmp_path / "out" / "mesh.ply")
+    assert told[-1]["figures"] == json.loads((tmp_path / "out" / "summary.json").read_text())
+    moments = [one["elapsed"] for one in told]
+    assert moments == sorted(moments)
+
+
+@pytest.mark.parametrize(
+    ("work", "kind", "code"),
+    [("fail", "ReconstructionError", 2), ("interrupt", "Interrupted", 130)],
+)
+def test_a_machine_reads_why_a_run_failed(
+    photos, chain, tmp_path, capsys, monkeypatch, work, kind, code
+):
+    monkeypatch.setattr(chain, "work", lambda self: globals()[work]())
+    assert run("reconstruct", photos, "--json", "-o", tmp_path / "out") == code
+    last = events(capsys)[-1]
+    assert (last["event"], last["kind"], last["exit_code"]) == ("error", kind, code)
+
+
+def test_what_json_cannot_hold_is_told_as_null_or_text(capsys):
+    Output(as_json=True).event("result", figures={"a": math.inf, "b": [math.nan, Path("c")]})
+    (told,) = events(capsys)
+    assert told["figures"] == {"a": None, "b": [None, "c"]}
 
 
 def test_a_mesh_of_ones_own_reaches_the_chain(photos, chain, tmp_path):

@@ -62,6 +62,11 @@ RUNS = {
         "--photographs.saturation 250 --photographs.black 2",
         "{dtu} -o {out} --source dtu-mvs --target transforms --scan 9 --light-seed 1",
     ],
+    "config": ["sweep.steps --preset default"],
+    "doctor": [
+        "{photos} --max-size-px 48 --photographs.response linear --photographs.saturation 250 "
+        "--photographs.black 2"
+    ],
     "gamma": ["{photos} --mask {masks}/view_000.png --rank 3 --max-size-px 40"],
 }
 TINY = "--num-views 2 --width 32 --height 24 --processes 1"
@@ -129,18 +134,44 @@ def test_the_reference_reaches_every_stage_that_has_one():
     assert published.coarse_surface.reference == published.triangulate.reference == "38"
 
 
-def told(command, capsys):
+def told(command, capsys, page="--help-all"):
     """List the options that a command's help tells, with each of their names."""
     with pytest.raises(SystemExit):
-        main([command, "--help"])
+        main([command, page])
     lines = re.findall(r"^  (-.*?)(?:  .*)?$", capsys.readouterr().out, flags=re.MULTILINE)
-    return {name for line in lines for name in re.findall(r"(?:^| )(--?[a-z][\w.-]*)", line)}
+    written = [name for line in lines for name in re.findall(r"(?:^|, )(--?[\w.[\]-]+)", line)]
+    return {one for name in written for one in both(name)} - COMMON
+
+
+COMMON = {"-h", "--help", "--help-all", "-q", "--quiet", "--json", "--log-level"}
+
+
+def both(name):
+    """Give the two names of a switch that is written ``--[no-]x`` or ``--[no-]stage.x``."""
+    if not name.startswith("--[no-]"):
+        return [name]
+    stage, dot, last = name.removeprefix("--[no-]").rpartition(".")
+    return [f"--{stage}{dot}{no}{last}" for no in ("", "no-")]
+
+
+@pytest.mark.parametrize("command", RUNS)
+@pytest.mark.parametrize("columns", ["80", "100"])
+def test_help_fits_a_page(command, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--help"])
+    assert ended.value.code == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"usage: pimper {command}")
+    assert len(lines) <= 60
+    assert all(len(line) <= int(columns) for line in lines)
+    assert not any("None" in line or "<" in line for line in lines)
 
 
 @pytest.mark.parametrize("command", RUNS)
 def test_no_option_is_without_a_run(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
-    names = told(command, capsys) - {"-h", "--help"}
+    names = told(command, capsys)
     if command in ("reconstruct", "demo"):
         settings = {name for field in leaves(CoarseToFineConfig()) for name in spelt(field)}
         assert settings <= names  # those of the other chain come with its presets
@@ -180,14 +211,13 @@ def spelt(leaf):
 def effects(preset, capsys):
     """Give what the help says of each option of a preset, without its default."""
     with pytest.raises(SystemExit):
-        main(["reconstruct", "--preset", preset, "--help"])
-    lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
-    entries = re.split(r"^(--[a-z].*)$", "\n".join(lines), flags=re.MULTILINE)
-    names = (re.findall(r"--[a-z][\w.-]*", entry) for entry in entries[1::2])
-    texts = (
-        re.sub(r"\(default:.*|\(required.*|╰.*", "", each, flags=re.S) for each in entries[2::2]
-    )
-    return {name: text for each, text in zip(names, texts, strict=True) for name in each}
+        main(["reconstruct", "--preset", preset, "--help-all"])
+    page = re.split(r"^  (--\S+)(.*)$", capsys.readouterr().out, flags=re.MULTILINE)
+    return {
+        name: re.sub(r"\(default:.*", "", beside.partition("  ")[2] + below, flags=re.S)
+        for written, beside, below in zip(page[1::3], page[2::3], page[3::3], strict=True)
+        for name in both(written)
+    }
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])

@@ -1,0 +1,88 @@
+"""``pimper doctor``: what is installed, and what photographs are worth, before a run."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pimper_torch.cli.arguments import read_arguments
+from pimper_torch.cli.output import Output, stage
+from pimper_torch.doctor.examine import examine_folder
+from pimper_torch.doctor.findings import Finding
+from pimper_torch.doctor.machine import machine
+from pimper_torch.errors import InputError
+from pimper_torch.io.photographs import list_images
+from pimper_torch.radiometry import SRGB, Encoding
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    photos: Path | None
+    max_size_px: int
+    photographs: Encoding
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``doctor``: tell each finding in a line, with what to do.
+
+    Raises:
+        InputError: A run would be refused.
+    """
+    job = checked(command, arguments)
+    findings = list(machine())
+    _tell(output, findings)
+    if job.photos is not None:
+        with output.observer() as observer, stage(observer, "examine"):
+            found = examine_folder(job.photos, job.photographs, job.max_size_px)
+        _tell(output, found)
+        findings += found
+    errors = [one.check for one in findings if one.severity == "error"]
+    if errors:
+        raise InputError(
+            f"{job.photos or 'this machine'}: a run would be refused, see "
+            f"{', '.join(dict.fromkeys(errors))} above."
+        )
+    output.result(warnings=[one.check for one in findings if one.severity == "warning"])
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and refuse a folder without photographs.
+
+    Raises:
+        InputError: The folder.
+        SystemExit: ``--help`` was answered.
+    """
+
+    def doctor(
+        photos: Annotated[
+            tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PHOTOS")
+        ] = None,
+        max_size_px: int = 0,
+        photographs: Encoding = SRGB,
+    ) -> _Job:
+        """Tell what is installed here, and whether photographs are fit for a run, in seconds.
+
+        Of photographs: number, sizes, blur, saturation, exposure, lenses, overlap, how much the
+        light varies, and an estimate of time and memory; each with what to do. Exit code 2 where
+        a run would be refused.
+
+        Args:
+            photos: Folder of JPEG, PNG or TIFF files; without it, the machine alone.
+            max_size_px: As of `pimper reconstruct`.
+            photographs: As of `pimper reconstruct`.
+        """
+        return _Job(photos=photos, max_size_px=max_size_px, photographs=photographs)
+
+    job = read_arguments(doctor, command, arguments, levels=True)
+    if job.photos is not None:
+        list_images(job.photos)
+    return job
+
+
+def _tell(output: Output, findings: Iterable[Finding]) -> None:
+    for one in findings:
+        output.event("finding", **dataclasses.asdict(one))
+        output.say(f"{one.severity:<8} {one.check:<11} {one}")

@@ -1,0 +1,59 @@
+"""Everything that can be told of photographs before a run."""
+
+from pathlib import Path
+
+from pimper_torch.doctor.cost import cost
+from pimper_torch.doctor.each import each_alone
+from pimper_torch.doctor.findings import Finding
+from pimper_torch.doctor.light import light, variations
+from pimper_torch.doctor.machine import available_gb
+from pimper_torch.doctor.overlap import match_all, overlap
+from pimper_torch.doctor.photograph import Photograph, of_views, read_all
+from pimper_torch.errors import InputError
+from pimper_torch.io.photographs import list_images
+from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.records import Views
+
+
+def examine_folder(
+    folder: Path | str, encoding: Encoding = SRGB, max_size_px: int = 0
+) -> list[Finding]:
+    """Examine the photographs of a folder, in seconds.
+
+    Args:
+        folder: With the photographs.
+        encoding: As of :func:`pimper_torch.io.photographs.load_views`.
+        max_size_px: As of a run.
+
+    Returns:
+        In the order of the checks: files, number, blur, saturation, exposure, lenses, overlap,
+        light, cost.
+
+    Raises:
+        InputError: No such folder, or no images in it.
+    """
+    read = read_all(list_images(folder), encoding, max_size_px)
+    photographs = [one for one in read if isinstance(one, Photograph)]
+    findings = [
+        Finding(
+            check="files",
+            severity="error",
+            found=str(error).rstrip("."),
+        )
+        for error in read
+        if isinstance(error, InputError)
+    ]
+    matches = match_all(photographs)
+    return [
+        *findings,
+        *each_alone(photographs),
+        *overlap([one.name for one in photographs], matches),
+        *light(variations(photographs, matches)),
+        *cost(photographs, available_gb()),
+    ]
+
+
+def examine_views(views: Views) -> list[Finding]:
+    """Examine photographs that were read, without comparing what they show."""
+    photographs = of_views(views)
+    return [*each_alone(photographs), *cost(photographs, available_gb())]

@@ -1,0 +1,69 @@
+"""What is installed, and what the machine has."""
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+
+from pimper_torch.doctor.findings import Finding
+from pimper_torch.io.version import versions
+
+_GB = 1e9
+_NEEDED = ("numba", "pycolmap", "kornia", "embreex", "fcpw", "cholespy", "cv2", "skimage")
+_LEAST_GB = 2.5  # of memory: the demo takes 2.06 (benchmarks/README.md, "Speed")
+
+
+def machine() -> Iterator[Finding]:
+    """Tell versions, device, threads and memory."""
+    told = ", ".join(f"{name} {version}" for name, version in versions().items())
+    missing = [name for name in _NEEDED if find_spec(name) is None]
+    yield Finding(
+        check="installed",
+        severity="error" if missing else "ok",
+        found=f"{told}{'; without ' + ', '.join(missing) if missing else ''}",
+        needed="all packages that pimper_torch names" if missing else "",
+        advice="Run `pip install pimper_torch` again." if missing else "",
+    )
+    cuda = torch.cuda.is_available()
+    device = f"CPU and {torch.cuda.get_device_name()}" if cuda else "CPU"
+    yield Finding(
+        check="device",
+        severity="ok",
+        found=f"{device}, {torch.get_num_threads()} threads on {os.cpu_count()} processors",
+    )
+    free, total = available_gb(), total_gb()
+    if free is None or total is None:
+        yield Finding(check="memory", severity="note", found="the system does not tell its memory")
+        return
+    short = free < _LEAST_GB
+    yield Finding(
+        check="memory",
+        severity="warning" if short else "ok",
+        found=f"{free:.1f} of {total:.1f} GB are free",
+        needed=f"{_LEAST_GB} GB" if short else "",
+        advice="Close other programs; the demo takes that much." if short else "",
+    )
+
+
+def available_gb() -> float | None:
+    """Give the memory that a process may still take; ``None`` where the system does not tell."""
+    free = None
+    with suppress(OSError, IndexError, ValueError):
+        fields = Path("/proc/meminfo").read_text(encoding="ascii")
+        free = 1024 * float(fields.split("MemAvailable:")[1].split()[0])
+    with suppress(OSError, ValueError):  # of a container
+        group = Path("/sys/fs/cgroup")
+        limit = float((group / "memory.max").read_text(encoding="ascii"))
+        used = float((group / "memory.current").read_text(encoding="ascii"))
+        free = min(free or limit, limit - used)
+    return None if free is None else free / _GB
+
+
+def total_gb() -> float | None:
+    """Give the memory of the machine; ``None`` where the system does not tell."""
+    with suppress(AttributeError, OSError, ValueError):
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / _GB
+    return None

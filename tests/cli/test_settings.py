@@ -1,0 +1,42 @@
+"""``pimper config``: what it prints is a file of settings, and says what each means."""
+
+import pytest
+import yaml
+
+from pimper_torch.chains.presets import load_config
+from pimper_torch.cli.main import main
+from pimper_torch.config import presets, to_mapping
+
+
+@pytest.mark.parametrize("preset", presets())
+def test_what_is_printed_is_the_preset_with_a_word_on_each_setting(preset, tmp_path, capsys):
+    assert main(["config", preset]) == 0
+    text = capsys.readouterr().out
+    (tmp_path / "mine.yaml").write_text(text)
+    assert load_config(tmp_path / "mine.yaml") == load_config(preset)
+    lines = text.splitlines()
+    for before, line in zip(lines, lines[1:], strict=False):
+        assert line.lstrip().startswith("#") or not line or before.lstrip().startswith("# ")
+
+
+def test_a_section_is_printed_alone(capsys):
+    assert main(["config", "sweep", "--preset", "default"]) == 0
+    told = yaml.safe_load(capsys.readouterr().out)
+    assert told == {"sweep": to_mapping(load_config("default").sweep)}
+
+
+def test_a_setting_is_explained(capsys):
+    assert main(["config", "reconstruct.shared-camera"]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("reconstruct.shared_camera: true  # in default\n")
+    assert "One camera took all photographs" in told
+    assert "option: --reconstruct.shared-camera" in told
+    assert yaml.safe_load(told.split("file:\n")[1]) == {"reconstruct": {"shared_camera": True}}
+
+
+@pytest.mark.parametrize(
+    ("name", "near"), [("steps", "sweep.steps"), ("swep", "sweep"), ("defualt", "default")]
+)
+def test_an_unknown_name_is_refused_with_the_nearest(name, near, capsys):
+    assert main(["config", name]) == 2
+    assert f"Did you mean `{near}`?" in capsys.readouterr().err
