@@ -1,6 +1,5 @@
 """What a run tells about its stages: time, memory, and the figures of each record."""
 
-import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -137,7 +136,11 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
 
 
 def peak_memory_mb() -> float:
-    """Give the highest resident memory of this process so far."""
+    """Give the highest resident memory of this process so far; 0 where the system does not tell."""
+    if sys.platform == "win32":
+        return 0.0
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes there, kilobytes here
 

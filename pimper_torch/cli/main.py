@@ -152,8 +152,8 @@ def _failed(output: Output, error: BaseException) -> int:
     ) as file:
         traceback.print_exception(error, file=file)
     text = (
-        f"unexpected {kind}: {str(error).rstrip('.')}. This is a fault of pimper_torch; nothing was "
-        f"written. {file.name} holds the traceback: please report it with `pimper --version`."
+        f"unexpected {kind}: {str(error).rstrip('.')}. This is a fault of pimper_torch; nothing "
+        f"was written. {file.name} holds the traceback: please report it with `pimper --version`."
     )
     output.error(kind, text, _UNEXPECTED)
     return _UNEXPECTED

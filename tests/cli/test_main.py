@@ -262,8 +262,12 @@ def warn(_):
 
 @pytest.mark.parametrize(
     ("given", "warned"),
-    [(["--quiet"], True), (["-q"], True), (["--log-level=warning"], True)]
-    + [(["--log-level", "error"], False)],
+    [
+        (["--quiet"], True),
+        (["-q"], True),
+        (["--log-level=warning"], True),
+        (["--log-level", "error"], False),
+    ],
 )
 def test_a_quiet_run_tells_warnings_alone(
     photos, chain, tmp_path, capsys, monkeypatch, given, warned

@@ -1,5 +1,7 @@
 """``pimper config``: what it prints is a file of settings, and says what each means."""
 
+from itertools import pairwise
+
 import pytest
 import yaml
 
@@ -15,7 +17,7 @@ def test_what_is_printed_is_the_preset_with_a_word_on_each_setting(preset, tmp_p
     (tmp_path / "mine.yaml").write_text(text)
     assert load_config(tmp_path / "mine.yaml") == load_config(preset)
     lines = text.splitlines()
-    for before, line in zip(lines, lines[1:], strict=False):
+    for before, line in pairwise(lines):
         assert line.lstrip().startswith("#") or not line or before.lstrip().startswith("# ")
 
 

@@ -1,0 +1,234 @@
+"""Each check finds what was put into the photographs, and nothing where all is well."""
+
+import math
+
+import pytest
+import torch
+from PIL import Image
+from scipy.ndimage import gaussian_filter, uniform_filter1d
+
+from pimper_torch.cli.main import main
+from pimper_torch.doctor.cost import cost, estimate
+from pimper_torch.doctor.each import blur, exposure, lenses, number, saturation
+from pimper_torch.doctor.examine import examine_folder, examine_views
+from pimper_torch.doctor.light import light, light_variation
+from pimper_torch.doctor.machine import available_gb, machine, total_gb
+from pimper_torch.doctor.overlap import Match, match_all, overlap
+from pimper_torch.doctor.photograph import Photograph, of_views, summarize
+from pimper_torch.doctor.sharpness import edge_blur_px
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.photographs import load_views
+from pimper_torch.records import Mesh
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(44)
+
+
+def photograph(**changes):
+    plain = Photograph(
+        name="a.jpg",
+        width=900,
+        height=600,
+        focal_px=1000.0,
+        saturated=0.0,
+        bright=0.6,
+        blur_px=0.8,
+        small=torch.zeros(2, 2),
+        small_saturated=torch.zeros(2, 2),
+    )
+    return plain.replace(**changes)
+
+
+def severities(findings):
+    return [one.severity for one in findings]
+
+
+def squares(side=400, cell=40):
+    """Bright and dark squares, turned so that edges have every orientation."""
+    v, u = torch.meshgrid(torch.arange(side) + 0.5, torch.arange(side) + 0.5, indexing="ij")
+    turned = torch.stack([0.9 * u + 0.4 * v, 0.9 * v - 0.4 * u])
+    upright = torch.stack([u, v])
+    where = torch.where(u > side / 2, turned, upright)
+    return 0.2 + 0.6 * ((where // cell).sum(dim=0) % 2)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 3.0])
+def test_the_blur_of_edges_is_found_in_pixels(sigma, generator):
+    image = torch.from_numpy(gaussian_filter(squares().numpy(), sigma))
+    noise = 0.003 * torch.randn(image.shape, generator=generator)
+    # A pixel's own square adds a twelfth to the variance, and staircases of turned edges some.
+    assert edge_blur_px(image + noise) == pytest.approx(sigma, rel=0.15)
+
+
+def test_motion_counts_though_it_blurs_edges_across_it_alone():
+    moved = torch.from_numpy(uniform_filter1d(squares().numpy(), 9, axis=1))
+    assert edge_blur_px(moved) > 2.0  # a box of 9 has a deviation of 2.6
+    assert edge_blur_px(moved) == pytest.approx(edge_blur_px(moved.T.contiguous()), rel=0.1)
+    assert edge_blur_px(squares()) < 0.6
+
+
+def test_where_there_are_no_edges_no_blur_is_told():
+    assert math.isnan(edge_blur_px(torch.full((50, 50), 0.5)))
+    assert list(blur([photograph(blur_px=math.nan)])) == []
+
+
+def test_blurred_photographs_are_named():
+    sharp = [photograph(name=f"{n}.jpg") for n in range(9)]
+    (found,) = blur([*sharp, photograph(name="moved.jpg", blur_px=2.4)])
+    assert found.severity == "warning"
+    assert "1 of 10" in found.found
+    assert "moved.jpg (2.4 px)" in found.found
+    assert severities(blur(sharp)) == ["ok"]
+    (found,) = blur([photograph(blur_px=2.5)] * 5)  # all alike: too large, not blurred
+    assert found.severity == "note"
+    assert "--max-size-px" in found.advice
+
+
+def test_saturated_and_dark_photographs_are_named():
+    image = 0.3 * torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(1))
+    image[0, :4] = 1.0  # a tenth, in one colour
+    burnt = summarize("burnt.png", image, math.nan)
+    assert burnt.saturated == pytest.approx(0.1)
+    (found,) = saturation([burnt, photograph()])
+    assert "1 of 2" in found.found
+    assert "burnt.png (10%)" in found.found
+    mask = torch.zeros(40, 50, dtype=torch.bool)
+    mask[4:] = True
+    assert summarize("a", image, math.nan, mask).saturated == 0
+    dark = summarize("dark.png", 0.03 * torch.rand(3, 40, 50), math.nan)
+    assert dark.bright == pytest.approx(0.03, rel=0.05)
+    assert "dark.png" in next(exposure([dark, photograph()])).found
+    assert severities([*saturation([photograph()]), *exposure([photograph()])]) == ["ok", "ok"]
+
+
+def test_lenses_are_told_apart_by_size_and_focal_length():
+    upright = photograph(width=600, height=900)
+    assert severities(lenses([photograph(), upright, photograph(focal_px=1010.0)])) == ["ok"]
+    for other in (photograph(focal_px=1500.0), photograph(width=800)):
+        (found,) = lenses([photograph(), other, photograph()])
+        assert found.severity == "warning"
+        assert found.found.startswith("2 lenses")
+        assert "--reconstruct.no-shared-camera" in found.advice
+    assert severities(lenses([photograph(focal_px=math.nan)])) == ["note"]
+
+
+@pytest.mark.parametrize(("count", "severity"), [(2, "error"), (5, "warning"), (12, "ok")])
+def test_too_few_photographs_are_told(count, severity):
+    assert severities(number([photograph()] * count)) == [severity]
+
+
+def places(count=300):
+    return 400 * torch.rand(count, 2, generator=torch.Generator().manual_seed(2))
+
+
+def test_exposure_alone_is_no_variation_of_light(generator):
+    pixels, albedo = places(), 0.1 + 0.8 * torch.rand(300, generator=generator)
+    noise = (0.05 * torch.randn(300, generator=generator)).exp()
+    assert light_variation(albedo, 0.4 * albedo, pixels) < 1e-5
+    assert light_variation(albedo, 0.4 * albedo * noise, pixels) < 0.03  # noise is not smooth
+
+
+def test_shading_that_differs_is_the_variation_of_light(generator):
+    """Logarithms of the ratio rise evenly from 0 to 1: a median deviation of a quarter."""
+    pixels, albedo = places(1000), 0.1 + 0.8 * torch.rand(1000, generator=generator)
+    shading = (pixels[:, 0] / 400).exp()
+    found = light_variation(albedo, albedo * shading, pixels)
+    assert found == pytest.approx(1.4826 / 4, rel=0.1)
+
+
+def test_light_that_does_not_vary_is_warned_of():
+    assert severities(light([0.01, 0.02, 0.3])) == ["warning"]
+    assert severities(light([0.1, 0.2, 0.3])) == ["ok"]
+    assert severities(light([])) == ["note"]
+
+
+def test_photographs_that_nothing_connects_are_named():
+    def match(*pair):
+        return Match(pair=torch.tensor(pair), first=torch.zeros(1, 2), second=torch.zeros(1, 2))
+
+    names = ("a", "b", "c", "d")
+    assert severities(overlap(names, [match(0, 1), match(1, 2), match(2, 3)])) == ["ok"]
+    (found,) = overlap(names, [match(0, 1), match(1, 2)])
+    assert found.severity == "warning"
+    assert "1 of 4 are not connected with the rest: d" in found.found
+
+
+def test_the_cost_is_that_of_measured_runs_and_advice_fits_the_memory():
+    for megapixels, seconds, gigabytes in ((13.0, 112, 2.06), (57.6, 364, 6.7)):
+        assert estimate(megapixels) == pytest.approx((seconds, gigabytes), rel=0.05)
+    large = [photograph(width=4000, height=3000)] * 30
+    assert severities(cost(large, 100.0)) == severities(cost(large, None)) == ["ok"]
+    (found,) = cost(large, 8.0)
+    size = int(found.advice.split("--max-size-px ")[1].split("`")[0])
+    pixels = 30 * size * (0.75 * size) / 1e6
+    assert estimate(pixels)[1] == pytest.approx(0.9 * 8, rel=0.1)
+
+
+def test_the_machine_is_told():
+    found = {one.check: one for one in machine()}
+    assert torch.__version__ in found["installed"].found
+    assert f"{torch.get_num_threads()} threads" in found["device"].found
+    if available_gb() is not None:
+        assert 0 < available_gb() <= total_gb()
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """The same photographs under light that moves, and under one light."""
+    folder = tmp_path_factory.mktemp("scenes")
+    vertices, faces = icosphere(3)
+    write_ply(Mesh(vertices_world=vertices, faces=faces), folder / "ball.ply")
+    small = "--num-views 5 --width 320 --height 240 --span-deg 25 --supersample 1 --processes 1 -q"
+    for name, more in (("moving", []), ("constant", ["--constant-light"])):
+        line = ["render", str(folder / "ball.ply"), "-o", str(folder / name), *small.split(), *more]
+        assert main(line) == 0
+    return {name: folder / name / "photos" for name in ("moving", "constant")}
+
+
+def test_light_that_moves_is_told_from_light_that_stays(scenes):
+    found = {
+        name: {one.check: one for one in examine_folder(folder)} for name, folder in scenes.items()
+    }
+    assert found["moving"]["light"].severity == "ok"
+    assert found["constant"]["light"].severity == "warning"
+    assert found["constant"]["overlap"].severity == "ok"
+    checks = ["number", "blur", "saturation", "exposure", "lenses", "overlap", "light", "cost"]
+    assert list(found["moving"]) == checks
+
+
+def test_a_run_hears_what_the_folder_tells(scenes):
+    cheap = examine_views(load_views(scenes["moving"]))
+    whole = {one.check: one for one in examine_folder(scenes["moving"])}
+    assert [one for one in cheap if one.check != "cost"] == [
+        whole[one.check] for one in cheap if one.check != "cost"
+    ]
+
+
+def test_matches_lie_on_the_same_points(scenes):
+    """Of a photograph and itself, shifted, every match is off by the shift."""
+    one = of_views(load_views(scenes["moving"]))[0]
+    shifted = one.replace(small=one.small.roll((3, 5), dims=(0, 1)))
+    (match,) = match_all([one, shifted])
+    assert len(match.first) > 50
+    off = (match.second - match.first).median(dim=0).values
+    torch.testing.assert_close(off, torch.tensor([5.0, 3.0]), atol=0.1, rtol=0)
+
+
+def test_a_file_that_cannot_be_read_hides_no_other(scenes, tmp_path, capsys):
+    for path in sorted(scenes["constant"].iterdir()):
+        Image.open(path).save(tmp_path / path.name)
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    assert main(["doctor", str(tmp_path)]) == 2
+    told = capsys.readouterr()
+    assert f"{tmp_path}/broken.png: holds no JPEG, PNG or TIFF image" in told.out
+    assert "5 photographs" in told.out
+    assert "a run would be refused, see files above" in told.err
+
+
+def test_the_machine_alone_is_examined_without_photographs(capsys):
+    assert main(["doctor"]) == 0
+    assert "threads" in capsys.readouterr().out
+    assert main(["doctor", "nowhere"]) == 2
