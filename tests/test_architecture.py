@@ -154,6 +154,11 @@ def test_the_newest_heading_of_the_changelog_is_the_version():
     assert headings[0] == project["version"]
 
 
+def test_the_citation_is_of_the_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
+
+
 def test_ci_runs_the_test_command_of_the_readme():
     readme = (ROOT / "README.md").read_text().splitlines()
     (command,) = [line.strip() for line in readme if line.startswith("    ") and "pytest" in line]

@@ -1,0 +1,25 @@
+"""What a program outside the repository uses of the installed package; types are checked, too."""
+
+import sys
+from pathlib import Path
+from typing import assert_type
+
+import pimper_torch as pt
+from pimper_torch.cli.options import bundled_photographs
+from pimper_torch.config import presets
+
+
+def main(site_packages: str) -> None:
+    """Refuse a package that is another one's, or lacks its data."""
+    home = Path(str(pt.__file__)).parent
+    assert home == Path(site_packages) / "pimper_torch", home
+    assert {"default", "fast", "paper"} <= set(presets())
+    assert len(list(bundled_photographs().glob("*.jpg"))) == 24
+    assert (bundled_photographs() / "ATTRIBUTION.md").is_file()
+    assert (home / "py.typed").is_file()
+    chain = pt.load_chain("default")
+    assert_type(chain, pt.CoarseToFine | pt.Published)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# Builds sdist and wheel, and uses the wheel from outside the repository: in an environment of its
+# own, beside the packages of the one that runs this.
+#   tests/scripts/wheel.sh FOLDER
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+folder="$1"
+
+python -m build --no-isolation --outdir "$folder/dist" > /dev/null
+twine check --strict "$folder"/dist/*
+python -m venv --without-pip "$folder/venv"
+outside="$folder/venv/bin/python"
+here="$(python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
+there="$("$outside" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
+echo "$here" > "$there/beside.pth"
+pip --python "$outside" install --quiet --no-deps --force-reinstall "$folder"/dist/*.whl
+
+cp tests/scripts/from_outside.py "$folder"
+cd "$folder"
+env -u PYTHONPATH "$folder/venv/bin/pimper" --version
+env -u PYTHONPATH "$outside" from_outside.py "$there"
+env -u PYTHONPATH mypy --strict --python-executable "$outside" --cache-dir "$folder/mypy" from_outside.py
