@@ -12,6 +12,7 @@ from pimper_torch.io.photographs import MIN_PHOTOGRAPHS
 # Choices, all of them; 24 photographs of the demo and rendered scenes are within.
 _FEW = 8  # with fewer, hardly a facet is lit in enough views
 _BLUR_PX, _BLUR_RATIO = 1.5, 1.6  # absolute, and beside the median of the folder
+_SHARP_PX = 0.5  # as sharp as pixels are
 _SATURATED = 0.05
 _DARK = 0.05  # of saturation: in 8 bits of sRGB 63 levels are left
 _LENS = 0.02  # relative difference of focal lengths that EXIF rounds
@@ -28,6 +29,8 @@ def number(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     sizes = Counter((one.width, one.height) for one in photographs)
     megapixels = sum(one.width * one.height for one in photographs) / 1e6
     told = ", ".join(f"{count} of {w}x{h}" for (w, h), count in sizes.most_common(3))
+    if len(sizes) == 1:
+        told = told.split(" of ")[1] + " each"
     found = f"{len(photographs)} photographs, {told}, {megapixels:.0f} megapixels"
     if len(photographs) < MIN_PHOTOGRAPHS:
         yield Finding(
@@ -76,7 +79,8 @@ def blur(photographs: Sequence[Photograph]) -> Iterator[Finding]:
             "of the time.",
         )
     else:
-        found = f"sharp, edges blurred by {usual:.1f} px in the median"
+        amount = f"{usual:.1f} px" if usual >= _SHARP_PX else f"less than {_SHARP_PX} px"
+        found = f"sharp, edges blurred by {amount} in the median"
         yield Finding(check="blur", severity="ok", found=found)
 
 
