@@ -102,7 +102,9 @@ class Extract(Stage):
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the fraction "
                 "of missing data that the report gives."
             )
-        faces = faces[~protruding(vertices, faces, _TOOTH * facet_side(surface))]
+        teeth = protruding(vertices, faces, _TOOTH * facet_side(surface))
+        if not bool(teeth.all()):  # where all is as narrow as a facet, it is the surface
+            faces = faces[~teeth]
         faces = faces[large_components(vertices, faces, self.config.min_piece)]
         source, faces = vertex_fans(faces)
         return Mesh(
