@@ -1,27 +1,20 @@
 """How far a run has come, as events for a machine."""
 
 import time
-from typing import Protocol
+from collections.abc import Callable
 
 from pimper_torch.records import StageReport
-
-
-class Write(Protocol):
-    """Whatever writes an event."""
-
-    def __call__(self, event: str, **about: object) -> None:
-        """Write it."""
 
 
 class Events:
     """An observer that writes when a stage begins, how far it is, and when it ends.
 
     Args:
-        write: Called with every event.
+        write: Called with every event's name, and what it is about by name.
         seconds: Progress is written no more often; its end always is.
     """
 
-    def __init__(self, write: Write, seconds: float) -> None:
+    def __init__(self, write: Callable[..., None], seconds: float) -> None:
         self._write = write
         self._seconds = seconds
         self._stage = ""
