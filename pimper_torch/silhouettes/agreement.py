@@ -1,4 +1,4 @@
-"""How reliable silhouettes are: every view's cut against the projection of the visual hull."""
+"""How reliable silhouettes are: every view's cut against the visual hull and what is behind."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from pimper_torch.records import Record
 from pimper_torch.silhouettes.cuts import Cuts
 from pimper_torch.silhouettes.opencv import blind_holes, components_of
 from pimper_torch.silhouettes.seeds import is_deep
+from pimper_torch.silhouettes.settings import SilhouetteDetails
 
 # On rendered scenes, 99 in 100 pixels of a median view's cut lie less than 0.4 pixels of 640
 # outside; one of 16 to 30 views holds a shadow of 2 to 9 % of its cut.
@@ -32,15 +33,19 @@ class Agreement(Record):
         overlap: Intersection over union.
         covered: Fraction of the cut that is inside the projection.
         extent: Fraction of the picture that the cut takes.
+        exposed: Fraction of the cut that shows a background for certain. Cuts that err alike agree
+            with their hull, but not with what is behind the object.
     """
 
     overlap: Float[Tensor, " view"]
     covered: Float[Tensor, " view"]
     extent: Float[Tensor, " view"]
+    exposed: Float[Tensor, " view"]
 
-    def reliable(self, min_covered: float) -> Bool[Tensor, " view"]:
-        """Mark views whose cut shows something, little of it outside the projection."""
-        return (self.covered >= min_covered) & (self.extent > 0)
+    def reliable(self, details: SilhouetteDetails) -> Bool[Tensor, " view"]:
+        """Mark views whose cut shows something, little of it outside or a background."""
+        agrees = (self.covered >= details.min_covered) & (self.exposed <= details.max_exposed)
+        return agrees & (self.extent > 0)
 
 
 def agreement_of(cuts: Cuts) -> Agreement:
@@ -53,6 +58,7 @@ def agreement_of(cuts: Cuts) -> Agreement:
         overlap=both / either.clamp_min(1),
         covered=both / own.clamp_min(1),
         extent=own.double() / cuts.masks[0].numel(),
+        exposed=cuts.exposed,
     )
 
 

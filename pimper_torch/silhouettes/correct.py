@@ -15,7 +15,7 @@ from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
 from pimper_torch.silhouettes.cues import cues_of
-from pimper_torch.silhouettes.cuts import Cuts, cut_from
+from pimper_torch.silhouettes.cuts import cut_from, cuts_of
 from pimper_torch.silhouettes.opencv import signed_distance
 from pimper_torch.silhouettes.pictures import of_views
 from pimper_torch.silhouettes.probabilities import silhouettes_of
@@ -65,12 +65,10 @@ class CorrectSilhouettes(Stage):
                 before[view] | seen[view],
             )
 
-        cuts = Cuts(
-            masks=of_views(again, cues.num_views),
-            margins_px=of_views(lambda view: signed_distance(seen[view]), cues.num_views),
-            on_plane=cues.plane is not None,
-        )
-        corrected = silhouettes_of(cuts, scene.views, self.details.min_covered)
+        masks = of_views(again, cues.num_views)
+        margins = of_views(lambda view: signed_distance(seen[view]), cues.num_views)
+        cuts = cuts_of(cues, masks, margins)
+        corrected = silhouettes_of(cuts, scene.views, self.details)
         confirmed = corrected.reliable
         return silhouettes.replace(
             inside=torch.where(confirmed[:, None, None], corrected.inside, silhouettes.inside),

@@ -95,7 +95,7 @@ class Cues(Record):
             found.append(plane_agreement(self.pictures, self.plane, self.fixation, hidden))
         if len(self.background_from_view):
             room = room_agreement(self.pictures, self.background_from_view, hidden)
-            found.append(room if self.plane else room.masked_fill(self.surrounded(), torch.nan))
+            found.append(room.masked_fill(self.surrounded(), torch.nan))
         return reduce(torch.fmax, found) if found else None
 
 

@@ -21,6 +21,7 @@ from pimper_torch.silhouettes.opencv import (
 from pimper_torch.silhouettes.parallax import DISPUTED
 from pimper_torch.silhouettes.pictures import of_views
 from pimper_torch.silhouettes.seeds import (
+    exposed_fraction,
     filled,
     is_deep,
     labels_from_hull,
@@ -45,11 +46,13 @@ class Cuts(Record):
     Attributes:
         masks: Each view's own cut.
         margins_px: Inside the projection of the hull, pixels of the working size.
+        exposed: Fraction of each cut that shows a background for certain.
         on_plane: Whether the object stands on a plane.
     """
 
     masks: Bool[Tensor, "view height width"]
     margins_px: Float[Tensor, "view height width"]
+    exposed: Float[Tensor, " view"]
     on_plane: bool = False
 
 
@@ -70,11 +73,29 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
         if seen is None:
             return None
         masks = _again(cues, masks, seen)
-    masks = _filled(cues.relearned(masks), masks)
+    cues = cues.relearned(masks)
+    masks = _filled(cues, masks)
     seen = _voted(cues, masks, details)
-    if seen is None:
-        return None
-    return Cuts(masks=masks, margins_px=seen, on_plane=cues.plane is not None)
+    return None if seen is None else cuts_of(cues, masks, seen)
+
+
+def cuts_of(
+    cues: Cues,
+    masks: Bool[Tensor, "view height width"],
+    margins_px: Float[Tensor, "view height width"],
+) -> Cuts:
+    """Compare cuts with the backgrounds that are known."""
+
+    def exposed(view: int) -> Float[Tensor, ""]:
+        agreement = None if cues.agreement is None else cues.agreement[view]
+        return exposed_fraction(masks[view], agreement)
+
+    return Cuts(
+        masks=masks,
+        margins_px=margins_px,
+        exposed=of_views(exposed, len(masks)),
+        on_plane=cues.plane is not None,
+    )
 
 
 def _filled(
@@ -100,7 +121,7 @@ def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
         object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
         if agreement is not None and (cues.all_round or not cues.has_points):
-            return off_plane(agreement)
+            return off_plane(agreement) | not_seen_through(object_px, agreement)
         labels = labels_from_points(object_px, cues.background_px[view], agreement, (width, height))
         margin = signed_distance(convex_hull_of(object_px, (width, height)))
         return _cut(grab_cut_halved, cues, view, labels, margin)

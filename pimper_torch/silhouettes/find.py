@@ -64,7 +64,7 @@ class FindSilhouettes(Stage):
         if cuts is None or doubt:
             _warn(doubt, cues.plane is not None)
             return Silhouettes.everything(scene.views, self._top(cues))
-        return silhouettes_of(cuts, scene.views, self.details.min_covered)
+        return silhouettes_of(cuts, scene.views, self.details)
 
     def _top(self, cues: Cues) -> Float[Tensor, "4"] | None:
         """Give the upper side of the supporting plane, as thick as its points are rough."""
@@ -76,12 +76,18 @@ class FindSilhouettes(Stage):
 
     def _doubt(self, agreement: Agreement) -> str:
         """Say why silhouettes are unreliable, or nothing."""
-        reliable = agreement.reliable(self.details.min_covered)
+        reliable = agreement.reliable(self.details)
         overlap = float(agreement.overlap.median())
         if overlap < self.details.min_overlap:
             return (
                 f"silhouettes overlap with the hull of all views by {overlap:.0%} in the median; "
                 f"needed: {self.details.min_overlap:.0%}"
+            )
+        exposed = float(agreement.exposed.median())
+        if exposed > self.details.max_exposed:
+            return (
+                f"silhouettes show what is behind the object on {exposed:.0%} of their pixels in "
+                f"the median; at most: {self.details.max_exposed:.0%}"
             )
         if int(reliable.sum()) < max(3, len(reliable) / 2):
             return (

@@ -10,23 +10,24 @@ from pimper_torch.records import Silhouettes, Views
 from pimper_torch.silhouettes.agreement import agreement_of, repaired
 from pimper_torch.silhouettes.cuts import Cuts
 from pimper_torch.silhouettes.opencv import signed_distance
+from pimper_torch.silhouettes.settings import SilhouetteDetails
 
 # Probabilities where a view's cut and the hull contradict each other by more than two pixels.
 _UNSURE_INSIDE, _UNSURE_OUTSIDE = 0.6, 0.3
 _SOFT = 0.5  # working pixels: the width of a border
 
 
-def silhouettes_of(cuts: Cuts, views: Views, min_covered: float) -> Silhouettes:
+def silhouettes_of(cuts: Cuts, views: Views, details: SilhouetteDetails) -> Silhouettes:
     """Repair single cuts, and give silhouettes at the photographs' size.
 
     Args:
         cuts: Of all views.
         views: The photographs.
-        min_covered: Fraction of a cut that the others must confirm, or the view is not reliable.
+        details: What makes a view reliable.
     """
     cuts = repaired(cuts)
     found = _at_full_size(cuts, views)
-    reliable = agreement_of(cuts).reliable(min_covered).to(found.device)
+    reliable = agreement_of(cuts).reliable(details).to(found.device)
     return Silhouettes(inside=found, reliable=reliable, source="found")
 
 

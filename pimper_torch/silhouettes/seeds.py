@@ -146,6 +146,15 @@ def filled(
     return cut | blind_holes(whole, agreement > _ON_PLANE, _THROUGH)
 
 
+def exposed_fraction(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"] | None
+) -> Float[Tensor, ""]:
+    """Give the fraction of a cut that shows a background for certain; 0 where none is known."""
+    if agreement is None:
+        return torch.zeros((), dtype=torch.float64)
+    return (cut & _surely_on_plane(agreement)).sum().double() / cut.sum().clamp_min(1)
+
+
 def _surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Mark the plane, but not what is next to something else: the object's foot agrees, too."""
     sure = _grainless(agreement > _ON_PLANE)

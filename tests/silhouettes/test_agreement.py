@@ -5,6 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.silhouettes.agreement import agreement_of, repaired
 from pimper_torch.silhouettes.cuts import Cuts
+from pimper_torch.silhouettes.settings import SilhouetteDetails
 
 VIEWS = 8
 
@@ -20,7 +21,9 @@ def cuts_of(changed, on_plane=True, margin=None):
     margins = (disc() if margin is None else margin).expand(VIEWS, 80, 100)
     masks = margins > 0
     masks = torch.cat([torch.stack(changed), masks[len(changed) :]])
-    return Cuts(masks=masks, margins_px=margins, on_plane=on_plane)
+    return Cuts(
+        masks=masks, margins_px=margins, exposed=torch.zeros(len(masks)).double(), on_plane=on_plane
+    )
 
 
 def shadowed():
@@ -79,4 +82,12 @@ def test_the_agreement_counts_pixels():
     assert_close(found.overlap[:3], torch.tensor([1 / 3, 0, 1], dtype=torch.float64))
     assert_close(found.covered[:3], torch.tensor([0.5, 0, 1], dtype=torch.float64))
     assert_close(found.extent[:3], torch.tensor([0.2, 0, 0.2], dtype=torch.float64))
-    assert found.reliable(0.9).tolist() == [False, False] + [True] * 6
+    assert found.reliable(SilhouetteDetails()).tolist() == [False, False] + [True] * 6
+
+
+def test_cuts_that_agree_with_one_another_and_show_the_background_are_not_reliable():
+    cuts = cuts_of([disc() > 0])
+    exposed = torch.tensor([0.0, 0.005, 0.02, 1.0, 0.0, 0.0, 0.0, 0.0]).double()
+    found = agreement_of(cuts.replace(exposed=exposed))
+    assert (found.overlap > 0.9).all()
+    assert found.reliable(SilhouetteDetails()).tolist() == [True] * 2 + [False] * 2 + [True] * 4

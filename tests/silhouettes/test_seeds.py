@@ -5,6 +5,7 @@ import torch
 
 from pimper_torch.silhouettes.opencv import BACKGROUND, OBJECT, PERHAPS_BACKGROUND, PERHAPS_OBJECT
 from pimper_torch.silhouettes.seeds import (
+    exposed_fraction,
     filled,
     labels_from_hull,
     labels_from_points,
@@ -101,3 +102,14 @@ def test_holes_are_filled_unless_the_plane_is_seen_through_them(thing, seen_thro
     cut = thing & ~hole
     agreement = agreeing(thing & ~hole) if seen_through else agreeing(thing)
     assert bool(filled(cut, agreement)[130, 150]) != seen_through
+
+
+def test_a_cut_exposes_what_it_shows_of_the_plane_but_for_a_seam():
+    agreement = torch.ones(200, 400)
+    agreement[:, :200] = torch.nan
+    cut = torch.zeros(200, 400, dtype=torch.bool)
+    cut[50:150, 100:300] = True
+    assert 0.47 < float(exposed_fraction(cut, agreement)) < 0.5
+    assert float(exposed_fraction(cut, torch.zeros(200, 400))) == 0
+    assert float(exposed_fraction(cut, None)) == 0
+    assert float(exposed_fraction(~cut & cut, agreement)) == 0
