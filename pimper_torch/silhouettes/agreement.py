@@ -33,19 +33,21 @@ class Agreement(Record):
         overlap: Intersection over union.
         covered: Fraction of the cut that is inside the projection.
         extent: Fraction of the picture that the cut takes.
-        exposed: Fraction of the cut that shows a background for certain. Cuts that err alike agree
-            with their hull, but not with what is behind the object.
+        exposed: Fraction of the cut that shows a background for certain.
+        held: Fraction of the object's points in the cut. Cuts that err alike agree with their hull,
+            but not with background and points.
     """
 
     overlap: Float[Tensor, " view"]
     covered: Float[Tensor, " view"]
     extent: Float[Tensor, " view"]
     exposed: Float[Tensor, " view"]
+    held: Float[Tensor, " view"]
 
     def reliable(self, details: SilhouetteDetails) -> Bool[Tensor, " view"]:
-        """Mark views whose cut shows something, little of it outside or a background."""
-        agrees = (self.covered >= details.min_covered) & (self.exposed <= details.max_exposed)
-        return agrees & (self.extent > 0)
+        """Mark views whose cut shows something, nearly all of the object and nothing else."""
+        hull = (self.covered >= details.min_covered) & (self.extent > 0)
+        return hull & (self.exposed <= details.max_exposed) & (self.held >= details.min_held)
 
 
 def agreement_of(cuts: Cuts) -> Agreement:
@@ -59,6 +61,7 @@ def agreement_of(cuts: Cuts) -> Agreement:
         covered=both / own.clamp_min(1),
         extent=own.double() / cuts.masks[0].numel(),
         exposed=cuts.exposed,
+        held=cuts.held,
     )
 
 

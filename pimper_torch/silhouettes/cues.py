@@ -12,6 +12,7 @@ from pimper_torch.silhouettes.cloud import pixels_of, pixels_seen, split_cloud
 from pimper_torch.silhouettes.opencv import convex_hull_of
 from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
 from pimper_torch.silhouettes.pictures import Pictures, of_views, working_pictures
+from pimper_torch.silhouettes.seeds import MIN_POINTS
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.silhouettes.supporting_plane import (
     Fixation,
@@ -22,8 +23,6 @@ from pimper_torch.silhouettes.supporting_plane import (
 )
 
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
-# Points of the object that a view must observe, in the median, to be seeded by them.
-_MIN_OBSERVED = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -59,7 +58,7 @@ class Cues(Record):
     def has_points(self) -> bool:
         """Whether views observe enough points of the object to be seeded by them."""
         counts = torch.tensor([len(pixels) for pixels in self.object_px])
-        return int(counts.median()) >= _MIN_OBSERVED
+        return int(counts.median()) >= MIN_POINTS
 
     @property
     def all_round(self) -> bool:

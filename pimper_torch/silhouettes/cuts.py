@@ -23,6 +23,7 @@ from pimper_torch.silhouettes.pictures import of_views
 from pimper_torch.silhouettes.seeds import (
     exposed_fraction,
     filled,
+    held_fraction,
     is_deep,
     labels_from_hull,
     labels_from_points,
@@ -47,12 +48,14 @@ class Cuts(Record):
         masks: Each view's own cut.
         margins_px: Inside the projection of the hull, pixels of the working size.
         exposed: Fraction of each cut that shows a background for certain.
+        held: Fraction of the object's points that each cut holds.
         on_plane: Whether the object stands on a plane.
     """
 
     masks: Bool[Tensor, "view height width"]
     margins_px: Float[Tensor, "view height width"]
     exposed: Float[Tensor, " view"]
+    held: Float[Tensor, " view"]
     on_plane: bool = False
 
 
@@ -84,7 +87,7 @@ def cuts_of(
     masks: Bool[Tensor, "view height width"],
     margins_px: Float[Tensor, "view height width"],
 ) -> Cuts:
-    """Compare cuts with the backgrounds that are known."""
+    """Compare cuts with backgrounds and points."""
 
     def exposed(view: int) -> Float[Tensor, ""]:
         agreement = None if cues.agreement is None else cues.agreement[view]
@@ -94,6 +97,7 @@ def cuts_of(
         masks=masks,
         margins_px=margins_px,
         exposed=of_views(exposed, len(masks)),
+        held=of_views(lambda view: held_fraction(masks[view], cues.object_px[view]), len(masks)),
         on_plane=cues.plane is not None,
     )
 

@@ -83,11 +83,16 @@ class FindSilhouettes(Stage):
                 f"silhouettes overlap with the hull of all views by {overlap:.0%} in the median; "
                 f"needed: {self.details.min_overlap:.0%}"
             )
-        exposed = float(agreement.exposed.median())
+        exposed, held = float(agreement.exposed.median()), float(agreement.held.median())
         if exposed > self.details.max_exposed:
             return (
                 f"silhouettes show what is behind the object on {exposed:.0%} of their pixels in "
                 f"the median; at most: {self.details.max_exposed:.0%}"
+            )
+        if held < self.details.min_held:
+            return (
+                f"silhouettes hold {held:.0%} of the object's points in the median; needed: "
+                f"{self.details.min_held:.0%}"
             )
         if int(reliable.sum()) < max(3, len(reliable) / 2):
             return (

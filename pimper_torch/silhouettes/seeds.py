@@ -33,6 +33,9 @@ _FOOT = 1 / 200  # parallax says nothing of an object's foot that is so high
 # rendered scenes of 24 views (armadillo, mug, balls, potatoes) twice as much is no better.
 _HALF_WINDOW = 1 / 160
 
+# Points of the object that a view must observe for them to tell anything.
+MIN_POINTS = 12
+
 # Agreement with neighbours moved by the plane: below is not the plane, above is.
 _OFF_PLANE = 0.4
 _NOT_PLANE = 0.6
@@ -153,6 +156,17 @@ def exposed_fraction(
     if agreement is None:
         return torch.zeros((), dtype=torch.float64)
     return (cut & _surely_on_plane(agreement)).sum().double() / cut.sum().clamp_min(1)
+
+
+def held_fraction(
+    cut: Bool[Tensor, "height width"], object_px: Float[Tensor, "point 2"]
+) -> Float[Tensor, ""]:
+    """Give the fraction of the object's points that a cut holds; 1 where too few are known."""
+    if len(object_px) < MIN_POINTS:
+        return torch.ones((), dtype=torch.float64)
+    column, row = object_px.floor().long().unbind(dim=1)
+    height, width = cut.shape
+    return cut[row.clamp(0, height - 1), column.clamp(0, width - 1)].double().mean()
 
 
 def _surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

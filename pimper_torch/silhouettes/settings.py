@@ -48,8 +48,10 @@ class SilhouetteDetails:
         min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
             view is not reliable.
         max_exposed: Fraction of a view's silhouette that may show a background for certain: the
-            supporting plane, or a room at rest. More, and the view is not reliable. True masks show
-            up to 0.001, masks 20 px too wide of 640 from 0.012 (mug, potatoes on a turntable).
+            supporting plane, or a room at rest. True masks show up to 0.001, masks 20 px of 640 too
+            wide 0.007 to 0.19 (mug, potatoes and scorpion, two of them on turntables).
+        min_held: Fraction of the object's points that a view's silhouette must hold. True masks
+            hold 0.948 and more, masks 20 px too narrow 0.50 to 0.80 (mug, potatoes).
         min_overlap: Intersection over union of silhouettes and projections, in the median, below
             which silhouettes are not reliable.
         seed: Of the plane's trials.
@@ -63,5 +65,6 @@ class SilhouetteDetails:
     max_below_plane: float = 0.05
     min_covered: float = 0.9
     max_exposed: float = 0.01
+    min_held: float = 0.9
     min_overlap: float = 0.8
     seed: int = 0

@@ -22,7 +22,11 @@ def cuts_of(changed, on_plane=True, margin=None):
     masks = margins > 0
     masks = torch.cat([torch.stack(changed), masks[len(changed) :]])
     return Cuts(
-        masks=masks, margins_px=margins, exposed=torch.zeros(len(masks)).double(), on_plane=on_plane
+        masks=masks,
+        margins_px=margins,
+        exposed=torch.zeros(len(masks)).double(),
+        held=torch.ones(len(masks)).double(),
+        on_plane=on_plane,
     )
 
 
@@ -85,9 +89,10 @@ def test_the_agreement_counts_pixels():
     assert found.reliable(SilhouetteDetails()).tolist() == [False, False] + [True] * 6
 
 
-def test_cuts_that_agree_with_one_another_and_show_the_background_are_not_reliable():
+def test_cuts_that_agree_with_one_another_and_not_with_the_rest_are_not_reliable():
     cuts = cuts_of([disc() > 0])
     exposed = torch.tensor([0.0, 0.005, 0.02, 1.0, 0.0, 0.0, 0.0, 0.0]).double()
-    found = agreement_of(cuts.replace(exposed=exposed))
+    held = torch.tensor([1.0, 0.95, 1.0, 1.0, 0.95, 0.8, 0.0, 1.0]).double()
+    found = agreement_of(cuts.replace(exposed=exposed, held=held))
     assert (found.overlap > 0.9).all()
-    assert found.reliable(SilhouetteDetails()).tolist() == [True] * 2 + [False] * 2 + [True] * 4
+    assert found.reliable(SilhouetteDetails()).nonzero()[:, 0].tolist() == [0, 1, 4, 7]

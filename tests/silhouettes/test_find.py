@@ -9,6 +9,7 @@ from pimper_torch.records import Silhouettes, Views
 from pimper_torch.silhouettes import find
 from pimper_torch.silhouettes.cuts import Cuts, cuts_of
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.silhouettes.opencv import signed_distance
 from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
 from pimper_torch.silhouettes.pictures import working_pictures
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
@@ -91,7 +92,11 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
     masks = torch.zeros_like(staged.truth)
     masks[:, 60:120, 180 - int(fraction * 120) : 240] = True
     nonsense = Cuts(
-        masks=masks, margins_px=projections, exposed=torch.zeros(12).double(), on_plane=True
+        masks=masks,
+        margins_px=projections,
+        exposed=torch.zeros(12).double(),
+        held=torch.ones(12).double(),
+        on_plane=True,
     )
     monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: nonsense)
     overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
@@ -111,23 +116,37 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
     projections[:, 60:120, 60:180] = 5.0
     masks = projections > 0
     masks[:7, 60:120, 60:205] = True  # overlap 0.83, of which 0.83 is inside
-    cuts = Cuts(masks=masks, margins_px=projections, exposed=torch.zeros(12).double())
+    cuts = Cuts(
+        masks=masks,
+        margins_px=projections,
+        exposed=torch.zeros(12).double(),
+        held=torch.ones(12).double(),
+    )
     monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: cuts)
     with pytest.warns(PimperWarning, match="only 5 of 12 silhouettes agree"):
         assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
 
 
-def test_silhouettes_that_show_the_table_are_not_trusted_though_they_agree(staged, monkeypatch):
-    """A hull that is twice as wide as the ball: all views agree, and all of them err."""
-    wide = torch.nn.functional.max_pool2d(staged.truth[:, None].float(), 41, 1, 20)[:, 0].bool()
-    margins = torch.where(wide, 5.0, -5.0)
+@pytest.mark.parametrize(
+    ("grown_px", "why"),
+    [(20, "show what is behind the object on"), (-20, "hold [0-9]+% of the object's points")],
+)
+def test_silhouettes_that_all_err_alike_are_not_trusted(staged, monkeypatch, grown_px, why):
+    """Hulls twice and half as wide as the ball: all views agree with them."""
+    reach = signed_distances(staged.truth)
+    masks = reach > -grown_px
+    margins = torch.where(masks, 5.0, -5.0)
 
     def agreed(cues, _):
-        return cuts_of(cues.relearned(wide), wide, margins)
+        return cuts_of(cues.relearned(masks), masks, margins)
 
     monkeypatch.setattr(find, "cut_in_iterations", agreed)
-    with pytest.warns(PimperWarning, match="show what is behind the object on"):
+    with pytest.warns(PimperWarning, match=why):
         assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
+
+
+def signed_distances(masks):
+    return torch.stack([signed_distance(mask) for mask in masks])
 
 
 def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):

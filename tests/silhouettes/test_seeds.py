@@ -7,6 +7,7 @@ from pimper_torch.silhouettes.opencv import BACKGROUND, OBJECT, PERHAPS_BACKGROU
 from pimper_torch.silhouettes.seeds import (
     exposed_fraction,
     filled,
+    held_fraction,
     labels_from_hull,
     labels_from_points,
     not_seen_through,
@@ -113,3 +114,11 @@ def test_a_cut_exposes_what_it_shows_of_the_plane_but_for_a_seam():
     assert float(exposed_fraction(cut, torch.zeros(200, 400))) == 0
     assert float(exposed_fraction(cut, None)) == 0
     assert float(exposed_fraction(~cut & cut, agreement)) == 0
+
+
+def test_a_cut_holds_the_points_in_it_and_a_few_points_tell_nothing():
+    cut = torch.zeros(20, 30, dtype=torch.bool)
+    cut[:, :10] = True
+    points = torch.stack([torch.arange(0.5, 30, 1.0), torch.full((30,), 7.5)], dim=1)
+    assert float(held_fraction(cut, points)) == pytest.approx(1 / 3)
+    assert float(held_fraction(cut, points[20:])) == 1  # ten
