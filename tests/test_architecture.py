@@ -4,6 +4,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from datetime import date
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -148,10 +149,25 @@ def test_importing_the_package_loads_neither_colmap_nor_matplotlib():
     assert not loaded & {"pycolmap", "matplotlib", "tyro", "rich"}
 
 
+CHANGELOG = ROOT / "CHANGELOG.md"
+
+
 def test_the_newest_heading_of_the_changelog_is_the_version():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
-    assert headings[0] == project["version"]
+    headings = re.findall(r"^## (.+)$", CHANGELOG.read_text(), flags=re.MULTILINE)
+    version, _, day = headings[0].partition(" - ")
+    assert version == f"[{project['version']}]"
+    assert date.fromisoformat(day)
+
+
+def test_the_changelog_keeps_its_form():
+    lines = CHANGELOG.read_text().splitlines()
+    kinds = {line.removeprefix("### ") for line in lines if line.startswith("### ")}
+    assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+    first = lines.index(next(line for line in lines if line.startswith("### ")))
+    entries = [line for line in lines[first:] if line and not line.startswith(("#", "Since "))]
+    assert all(line.startswith("- ") and len(line.split()) <= 60 for line in entries)
+    assert len(entries) == len(set(entries))  # merges unite lines
 
 
 def test_the_citation_is_of_the_version():
