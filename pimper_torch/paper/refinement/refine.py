@@ -30,7 +30,7 @@ class RefineConfig:
             ``R = r sqrt(G / (1 - G))`` vertices: half of it at ``w = 2 pi R``. R is ``r`` on
             the centre of an edge, 1.55 ``r`` at a vertex of the coarse mesh, nothing in the
             centre of a facet. Twice the radius is a quarter of lambda. The notebook
-            ``02_refinement`` shows it.
+            ``08_refinement`` shows it.
         keep_planes: Cancel what the energy's tension does to flat data, which it would
             shrink at the open rim and shift where G changes. False is the published energy.
         outlier_samples: How far, in samples, a patch may lie from the others before they
