@@ -28,7 +28,7 @@ from pimper_torch.evidence.scenes.one_view import (
     point_lights,
     regions,
 )
-from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_height_fields
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_reliefs
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles
@@ -126,7 +126,7 @@ def resolved(shape: str, name: str, size: int, scenes: int) -> None:
                 height_field = hidden(generator)
                 b, lights = height_field.on_shading(shading), height_field.on_lights(made.lights)
                 errors["before"].append(error_deg(b, made.normals, known))
-                nearest = align_height_fields(b, made.shading, known.double())
+                nearest = align_reliefs(b, made.shading, known.double())
                 errors["best"].append(error_deg(nearest.on_shading(b), made.normals, known))
                 for label, resolve in RESOLVERS.items():
                     began = time.process_time()

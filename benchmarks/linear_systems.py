@@ -23,11 +23,11 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, cg, spsolve
 from torch import Tensor
 
+from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.linalg.hierarchy import sparse_product, torch_product
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.paper.refinement.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.single_view.integration.rasters import RasterSystem
 from pimper_torch.single_view.integration.stencil import Stencil
 
