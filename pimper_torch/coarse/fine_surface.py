@@ -44,8 +44,10 @@ MAX_DEPTH = 10
 # How often contour points are found, each time on the surface before; the first time on the points.
 _ITERATIONS = 3
 
-# A component needs this fraction of the area that points or contours support. A choice.
-MIN_FRACTION = 0.01
+# A component needs this fraction of the area that points or contours support: a choice where
+# silhouettes constrain nothing. Inside them even what others nearly hide is the object's: of six
+# balls, the one behind the others is in two pieces of less than 0.01 each.
+_MIN_FRACTION, _MIN_FRACTION_INSIDE = 0.01, 0.002
 
 # Barycentric coordinates, times 6, of the points of a facet that vote for its support.
 _VOTES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
@@ -152,7 +154,8 @@ def fine_surface(
     inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
     if not contours.confine:
         inside &= near_points(faces, centres, cloud, support, counts, pixel)
-    kept = seen_surface(vertices, faces, support, counts, inside, pixel, config)
+    fraction = min_fraction(contours)
+    kept = seen_surface(vertices, faces, support, counts, inside, pixel, config, fraction)
     if not bool(kept.any()):
         raise ReconstructionError(
             f"coarse mesh: none of {len(faces)} faces is seen by the photographs inside the "
@@ -162,6 +165,11 @@ def fine_surface(
     return FineSurface(
         vertices_world=vertices[used], faces=faces, support=support[kept], pixel=pixel
     )
+
+
+def min_fraction(contours: Contours) -> float:
+    """Give the fraction of the supported area that a component needs."""
+    return _MIN_FRACTION_INSIDE if contours.confine else _MIN_FRACTION
 
 
 def closed_surface(
@@ -319,6 +327,7 @@ def seen_surface(
     inside: Bool[Tensor, " face"],
     pixel: float,
     config: FineSurfaceConfig,
+    fraction: float = _MIN_FRACTION,
 ) -> Bool[Tensor, " face"]:
     """Mark the faces that stay: in the visual hull, and seen or supported.
 
@@ -334,6 +343,7 @@ def seen_surface(
         inside: True for faces in the visual hull.
         pixel: Size of one, scene units.
         config: Settings.
+        fraction: Of the supported area, that a component needs.
     """
     known = support >= Support.CONTOUR
     small = (config.hole_px * pixel) ** 2
@@ -347,6 +357,6 @@ def seen_surface(
     rings = int(config.hole_px / (2 * CELL_PX))
     kept &= ~fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)
     (chosen,) = torch.nonzero(kept, as_tuple=True)
-    stays = supported_components(vertices, faces[chosen], known[chosen], MIN_FRACTION)
+    stays = supported_components(vertices, faces[chosen], known[chosen], fraction)
     kept[chosen[~stays]] = False
     return kept

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.coarse.covariances import point_covariances
 from pimper_torch.coarse.densify import DensifyConfig
-from pimper_torch.coarse.fine_surface import MIN_FRACTION, FineSurfaceConfig, fine_surface
+from pimper_torch.coarse.fine_surface import FineSurfaceConfig, fine_surface, min_fraction
 from pimper_torch.coarse.given_mesh import oriented_outward
 from pimper_torch.coarse.matched import pixel_size
 from pimper_torch.coarse.reference import reference_view
@@ -102,7 +102,7 @@ class CoarseSurface(Stage):
             vertices, faces = _simplified(fine.vertices_world, fine.faces, count)
             faces = two_faces_an_edge(vertices, faces)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
-            kept = supported_components(vertices, faces, whole, MIN_FRACTION)
+            kept = supported_components(vertices, faces, whole, min_fraction(contours))
             vertices, faces = _used(vertices, faces[kept])
             pixel, support = fine.pixel, fine.support_of(vertices[faces])
         return CoarseMesh(
