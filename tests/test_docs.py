@@ -139,27 +139,12 @@ def a_scene_in_tensors(_: pytest.MonkeyPatch) -> dict[str, object]:
     }
 
 
-# What each block of Python takes for granted, by a word of its own.
-GIVEN: dict[str, Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
-    "load_views": a_folder_of_photographs,
-    "scene_of": a_scene_in_tensors,
-    "factorize_from_many": a_matrix_and_patches,
-    "photometric_stereo(": photographs_of_one_viewpoint,
-    "integrate_normal_map": a_normal_map,
-}
-
-
-@pytest.mark.parametrize("word", GIVEN)
 @pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
-def test_the_python_of_the_readme_runs(word, tmp_path, monkeypatch):
+def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (block,) = [block for block in BLOCKS if word in block]
-    names = GIVEN[word](monkeypatch)
-    exec(compile(block, f"README.md, {word}", "exec"), names)
-
-
-def test_every_block_of_python_in_the_readme_is_run():
-    assert len(BLOCKS) == len(GIVEN)
+    (block,) = BLOCKS
+    names = a_folder_of_photographs(monkeypatch)
+    exec(compile(block, "README.md", "exec"), names)
 
 
 def a_glance_at_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
@@ -209,6 +194,11 @@ def a_data_set_of_ones_own(_: pytest.MonkeyPatch) -> dict[str, object]:
 # What each block of a page takes for granted, by page and number.
 GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
     ("docs/index.md", 0): a_glance_at_photographs,
+    ("docs/python.md", 0): a_folder_of_photographs,
+    ("docs/python.md", 1): a_scene_in_tensors,
+    ("docs/parts.md", 0): a_matrix_and_patches,
+    ("docs/parts.md", 1): photographs_of_one_viewpoint,
+    ("docs/parts.md", 2): a_normal_map,
     ("docs/conventions.md", 0): nothing,
     ("docs/extending.md", 0): a_scene_and_a_mesh,
     ("docs/extending.md", 1): nothing,
