@@ -69,11 +69,8 @@ def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
             geometries = _read_geometries(stored) | verifier.found
             _drop_features(stored, matched, found.rest)
             _drop_matches(stored, matched, found, geometries, settings.min_inliers)
-    return (
-        found.rest.replace(maps=_maps(found, settings.min_inliers))
-        if found.rest.room
-        else found.rest
-    )
+            return found.rest.replace(maps=_maps(found, settings.min_inliers))
+    return found.rest
 
 
 def _maps(found: "_Found", fewest: int) -> tuple[Float[Tensor, "3 3"], ...]:

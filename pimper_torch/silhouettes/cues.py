@@ -74,10 +74,8 @@ class Cues(Record):
 
     def relearned(self, masks: Bool[Tensor, "view height width"]) -> "Cues":
         """Learn the backgrounds' texture anew where cuts do not hide it, and keep it elsewhere."""
-        if self.agreement is None:
-            return self
         found = self._agreement(masks)
-        if found is None:
+        if found is None or self.agreement is None:
             return self
         return self.replace(agreement=torch.where(found.isnan(), self.agreement, found))
 

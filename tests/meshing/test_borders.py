@@ -6,20 +6,14 @@ import trimesh
 
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.meshing.borders import protruding
+from tests.meshing.sheets import sheet_of
 
 LENGTH = 3.0
 
 
 def sheet(side=61):
     """Vertices and faces of a square sheet of unit steps, bent a little, and the faces' middles."""
-    row, column = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
-    x, y = column.flatten().double(), row.flatten().double()
-    vertices = torch.stack([x, y, 0.003 * x * x], dim=1)
-    here = (row[:-1, :-1] * side + column[:-1, :-1]).flatten()
-    right, below, across = here + 1, here + side, here + side + 1
-    faces = torch.cat(
-        [torch.stack([here, below, across], dim=1), torch.stack([here, across, right], dim=1)]
-    )
+    vertices, faces = sheet_of(side, 0.003)
     return vertices, faces, vertices[faces].mean(dim=1)[:, :2]
 
 

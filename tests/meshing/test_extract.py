@@ -7,20 +7,15 @@ from pimper_torch.errors import ConfigError, ReconstructionError
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.records import Convergence, Surface
+from tests.meshing.sheets import sheet_of
 
 SIDE = 21
 
 
 def sheet(side=SIDE, information=None):
     """A gently bent square sheet of unit steps, seen from -z; a facet a vertex."""
-    row, column = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
-    x, y = column.flatten().double(), row.flatten().double()
-    vertices = torch.stack([x, y, 0.01 * x * x], dim=1)
-    here = (row[:-1, :-1] * side + column[:-1, :-1]).flatten()
-    right, below, across = here + 1, here + side, here + side + 1
-    faces = torch.cat(
-        [torch.stack([here, below, across], dim=1), torch.stack([here, across, right], dim=1)]
-    )
+    vertices, faces = sheet_of(side, 0.01)
+    x = vertices[:, 0]
     normals = torch.stack([0.02 * x, 0 * x, -torch.ones_like(x)], dim=1)
     return Surface(
         vertices_world=vertices,
