@@ -54,12 +54,12 @@ if TYPE_CHECKING:
         Views,
     )
     from pimper_torch.records.stored import load_record, save_record
-    from pimper_torch.sfm.cache import user_cache
     from pimper_torch.sfm.reconstruct import Reconstruct
     from pimper_torch.silhouettes.find import FindSilhouettes
     from pimper_torch.single_view.integration import integrate_normal_map
     from pimper_torch.single_view.photometric_stereo.stereo import photometric_stereo
     from pimper_torch.stage import Given, Stage
+    from pimper_torch.store.folders import user_cache
     from pimper_torch.sweep.sweep import Sweep
     from pimper_torch.viz.patches import by_facet, plot_in_view, plot_patch
 
@@ -181,7 +181,7 @@ _HOMES = {
         "load_record",
         "save_record",
     ),
-    "pimper_torch.sfm.cache": ("user_cache",),
+    "pimper_torch.store.folders": ("user_cache",),
     "pimper_torch.sfm.reconstruct": ("Reconstruct",),
     "pimper_torch.single_view.integration": ("integrate_normal_map",),
     "pimper_torch.single_view.photometric_stereo.stereo": ("photometric_stereo",),

@@ -38,6 +38,7 @@ class PimperWarning(UserWarning):
 
 
 _held: ContextVar[list[str] | None] = ContextVar("held", default=None)
+_listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
 
 
 def caution(message: str, stacklevel: int = 1) -> None:
@@ -47,11 +48,28 @@ def caution(message: str, stacklevel: int = 1) -> None:
         message: Of the :class:`PimperWarning`.
         stacklevel: As of :func:`warnings.warn`, counted from the caller.
     """
+    for listener in _listeners.get():
+        listener.append(message)
     held_back = _held.get()
     if held_back is None:
         warnings.warn(message, PimperWarning, stacklevel=stacklevel + 1)
     else:
         held_back.append(message)
+
+
+@contextmanager
+def overheard() -> Iterator[list[str]]:
+    """Note what is cautioned of inside the block, which is told all the same.
+
+    Yields:
+        The messages so far.
+    """
+    messages: list[str] = []
+    token = _listeners.set((*_listeners.get(), messages))
+    try:
+        yield messages
+    finally:
+        _listeners.reset(token)
 
 
 @contextmanager

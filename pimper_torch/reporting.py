@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -133,6 +133,32 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
     finally:
         _recording.reset(token)
     recording.finish(name, began, told)
+
+
+@contextmanager
+def noted() -> Iterator[list[StageReport]]:
+    """Note the reports of the stages that run inside the block; they are made all the same.
+
+    Yields:
+        The list that holds them when the block has ended.
+    """
+    recording, reports = _recording.get(), list[StageReport]()
+    before = 0 if recording is None else len(recording.reports)
+    yield reports
+    if recording is not None:
+        reports += recording.reports[before:]
+
+
+def repeat(reports: Sequence[StageReport]) -> None:
+    """Report stages again whose records an earlier run found."""
+    recording = _recording.get()
+    if recording is None:
+        return
+    for report in reports:
+        again = report.replace(kept=True)
+        recording.observer.started(again.name)
+        recording.reports.append(again)
+        recording.observer.finished(again)
 
 
 def peak_memory_mb() -> float:

@@ -28,6 +28,7 @@ ROOMS = [
     "radiometry",
     "records",
     "stage",
+    "store",
     "geometry",
     "memory",
     "linalg",
@@ -117,6 +118,18 @@ def test_a_boundary_is_crossed_in_one_place(package):
     }
     assert found
     assert all(any(path.startswith(owner) for owner in owners) for path in found), found
+
+
+def test_least_squares_repeat_bit_for_bit():
+    """LAPACK's gelsy, the default, gives other bits at every call."""
+    calls = [
+        (path, ast.unparse(node))
+        for path in files()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("lstsq")
+    ]
+    assert len(calls) > 3
+    assert all("driver='gelsd'" in call for _, call in calls), calls
 
 
 def test_whatever_is_imported_is_declared():

@@ -22,7 +22,7 @@ def functions() -> Iterator[typing.Any]:
     for name in EXPORTING:
         room = importlib.import_module(f"pimper_torch.evidence.{name}")
         yield from (getattr(room, exported) for exported in room.__all__)
-    for name in ("sfm.cache", "evidence.bench.run", *modules()):
+    for name in ("store.store", "evidence.bench.run", *modules()):
         module = importlib.import_module(f"pimper_torch.{name}")
         for found in vars(module).values():
             if getattr(found, "__module__", None) == module.__name__:
@@ -80,5 +80,5 @@ def test_the_walk_finds_readers_writers_and_stages():
         "draw_overview.(path)",
         "Chain.forward(sparse_model)",
         "Reconstruct.__init__(cache)",
-        "ModelCache.__init__(folder)",
+        "Store.__init__(folder)",
     } <= found

@@ -31,9 +31,7 @@ def given():
 
 
 def streamed(given, factorize: nn.Module | None = None):
-    warp = Warp()
-    stages = warp, factorize or Factorize(), Sweep()
-    return photometry_and_heights(*stages, *given, warp.prepare(given[0]))
+    return photometry_and_heights(Warp(), factorize or Factorize(), Sweep(), *given)
 
 
 def values(swept):

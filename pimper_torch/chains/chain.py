@@ -4,9 +4,11 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from torch import nn
 
+from pimper_torch.chains.kept import kept_call
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.kernels.switch import Kernels, compile_all, using
@@ -28,6 +30,9 @@ from pimper_torch.records import (
 )
 from pimper_torch.reporting import Observer, Silent, recorded, stage
 from pimper_torch.stage import Stage
+from pimper_torch.store import Store
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -84,16 +89,31 @@ class Chain(Stage):
     decompose: Callable[[CoarseMesh, Cameras, Surface | None, float], PatchSet]
     extract: Callable[[Surface], Mesh]
 
-    def __init__(self, kernels: Kernels, observer: Observer | None) -> None:
+    def __init__(
+        self, kernels: Kernels, observer: Observer | None, store: Store | None = None
+    ) -> None:
         super().__init__()
         self.kernels: Kernels = kernels
         self.observer = observer or Silent()
+        self.store = store
 
     @abstractmethod
     def passes(
         self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
         """Run the stages up to the surface; give each pass's records, without reports."""
+
+    def kept(self, call: Callable[..., R], *inputs: object, **derived: object) -> R:
+        """Call a stage, or give the record that an earlier run kept.
+
+        Args:
+            call: A stage of the chain, or a function.
+            inputs: What it is called with.
+            derived: What it is called with by name, which follows from the inputs.
+        """
+        names = [name for name, module in self.named_children() if module is call]
+        name = names[0] if names else getattr(call, "__name__", type(call).__name__)
+        return kept_call(self.store, name, call, inputs, derived, self.kernels)
 
     def placed(self, views: Views | SparseScene, sparse_model: Path | str | None) -> SparseScene:
         """Give photographs with their cameras: those that come with them, or else find them.
@@ -162,7 +182,7 @@ class Chain(Stage):
             step = next(steps)
             reports += step.reports
         with using(self.kernels), recorded(self, self.observer) as last:
-            found = self.extract(step.surface)
+            found = self.kept(self.extract, step.surface)
         return Reconstruction(
             mesh=found,
             scene=step.scene,

@@ -10,7 +10,7 @@ from torch import nn
 from pimper_torch.chains.chain import Chain, Step
 from pimper_torch.chains.streaming import (
     Factorizing,
-    Prepares,
+    Prepared,
     Sweeping,
     Warping,
     photometry_and_heights,
@@ -45,6 +45,7 @@ from pimper_torch.silhouettes.contours import Contours, TraceContours
 from pimper_torch.silhouettes.correct import CorrectSilhouettes
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.silhouettes.settings import SilhouetteConfig
+from pimper_torch.store import Store, opened
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
 # The draft's depth maps are of photographs half as large as the coarse surface's: a quarter of the
@@ -98,12 +99,13 @@ class CoarseToFine(Chain):
         self,
         config: CoarseToFineConfig | None = None,
         observer: Observer | None = None,
-        cache: Path | str | None = None,
+        cache: Store | Path | str | None = None,
         **stages: nn.Module,
     ) -> None:
         self.config = config = config or CoarseToFineConfig()
-        super().__init__(config.kernels, observer)
-        self.reconstruct = Reconstruct(config.reconstruct, cache)
+        store = opened(cache)
+        super().__init__(config.kernels, observer, store)
+        self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
         self.draft: Callable[[SparseScene, Contours, Mesh | None], CoarseMesh] = CoarseSurface(
@@ -130,30 +132,37 @@ class CoarseToFine(Chain):
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
         placed = self.placed(views, sparse_model)
-        silhouettes = self.corrected(placed, self.silhouettes(placed), mesh)
+        silhouettes = self.corrected(placed, self.kept(self.silhouettes, placed), mesh)
         scene = masked(placed, silhouettes)
         cameras = scene.cameras
         contours = self.contours(silhouettes, cameras)
-        coarse = self.coarse_surface(scene, contours, mesh)
-        sources = self.warp.prepare(scene.views) if isinstance(self.warp, Prepares) else None
+        coarse = self.kept(self.coarse_surface, scene, contours, mesh)
+        sources = Prepared(self.warp, scene.views)
         heights: SweptPatches | None = None
         surface: Surface | None = None
         first, last = self.config.scales[0], len(self.config.scales)
         for number, scale in enumerate(self.config.scales, start=1):
             with held() as cautions:
                 if heights is not None and surface is not None:
-                    coarse = self.remesh(heights, surface, contours)
+                    coarse = self.kept(self.remesh, heights, surface, contours)
                 patches = self.decompose(coarse, cameras, surface, scale)
                 if number == 1:
                     limit = bytes_of(self.config.max_memory)
                     require_memory(limit, patches, first, self.config.scales[-1])
-                heights = photometry_and_heights(
-                    self.warp, self.factorize, self.sweep, scene.views, cameras, patches, sources
+                heights = self.kept(
+                    photometry_and_heights,
+                    self.warp,
+                    self.factorize,
+                    self.sweep,
+                    scene.views,
+                    cameras,
+                    patches,
+                    sources=sources,
                 )
                 if number == last:
-                    sources = None  # as much memory as the photographs themselves
+                    sources.release()  # as much memory as the photographs themselves
                 release_memory()
-                surface = self.repair(self.fuse(heights, contours, number == last))
+                surface = self.repair(self.kept(self.fuse, heights, contours, number == last))
             if number == last:  # what earlier passes would warn of as well
                 for message in cautions:
                     caution(message, stacklevel=3)
@@ -179,5 +188,6 @@ class CoarseToFine(Chain):
         if silhouettes.source != "found":
             return silhouettes
         scene = masked(placed, silhouettes)
-        draft = self.draft(scene, self.contours(silhouettes, scene.cameras), mesh)
-        return self.correct(placed, silhouettes, draft.mesh)
+        contours = self.contours(silhouettes, scene.cameras)
+        draft = self.kept(self.draft, scene, contours, mesh)
+        return self.kept(self.correct, placed, silhouettes, draft.mesh)

@@ -10,6 +10,7 @@ from pimper_torch.chains.published import Published, PublishedConfig
 from pimper_torch.config import build, find_config, overlay, read_mapping, require
 from pimper_torch.errors import ConfigError
 from pimper_torch.reporting import Observer
+from pimper_torch.store import Store
 
 Config = CoarseToFineConfig | PublishedConfig
 
@@ -97,7 +98,7 @@ def _refuse_former(settings: Mapping[str, object], where: str, section: str = ""
 def make_chain(
     config: Config,
     observer: Observer | None = None,
-    cache: Path | str | None = None,
+    cache: Store | Path | str | None = None,
     **stages: nn.Module,
 ) -> CoarseToFine | Published:
     """Make the chain that settings are for.
@@ -105,7 +106,7 @@ def make_chain(
     Args:
         config: Of one of the chains.
         observer: Hears how a run is going.
-        cache: Folder that keeps what structure from motion found; nothing is kept without.
+        cache: Folder that keeps the record of every stage; nothing is kept without.
         stages: Modules in place of the chain's own, by the names of its attributes.
 
     Raises:
@@ -120,7 +121,7 @@ def load_chain(
     name_or_path: str | Path = "default",
     changes: Mapping[str, object] | None = None,
     observer: Observer | None = None,
-    cache: Path | str | None = None,
+    cache: Store | Path | str | None = None,
     **stages: nn.Module,
 ) -> CoarseToFine | Published:
     """Make the chain of a preset; see :func:`load_config` and :func:`make_chain`."""

@@ -8,6 +8,7 @@ from typing import ClassVar
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
+from pimper_torch.chains.streaming import Factorizing, Warping
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
@@ -36,6 +37,7 @@ from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.silhouettes.settings import SilhouetteConfig
+from pimper_torch.store import Store, opened
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,12 +77,13 @@ class Published(Chain):
         self,
         config: PublishedConfig | None = None,
         observer: Observer | None = None,
-        cache: Path | str | None = None,
+        cache: Store | Path | str | None = None,
         **stages: nn.Module,
     ) -> None:
         self.config = config = config or PublishedConfig()
-        super().__init__(config.kernels, observer)
-        self.reconstruct = Reconstruct(config.reconstruct, cache)
+        store = opened(cache)
+        super().__init__(config.kernels, observer, store)
+        self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.triangulate: Callable[[SparseScene], CoarseMesh] = Triangulate(config.triangulate)
         self.coarse_surface: Callable[[SparseScene, Contours, Mesh], CoarseMesh] = CoarseSurface(
@@ -100,16 +103,19 @@ class Published(Chain):
     ) -> Iterator[Step]:
         """Run once through the stages."""
         scene = self.placed(views, sparse_model)
-        silhouettes = self.silhouettes(scene)
+        silhouettes = self.kept(self.silhouettes, scene)
         scene = masked(scene, silhouettes)
         if mesh is None:
-            coarse = self.triangulate(scene)
+            coarse = self.kept(self.triangulate, scene)
         else:
-            coarse = self.coarse_surface(scene, Contours.none(silhouettes, scene.cameras), mesh)
+            contours = Contours.none(silhouettes, scene.cameras)
+            coarse = self.kept(self.coarse_surface, scene, contours, mesh)
         patches = self.decompose(coarse, scene.cameras, None, 1.0)
-        seen = self.warp(scene.views, scene.cameras, patches)
-        heights = self.align(self.integrate(self.factorize(seen)))
-        surface = self.refine(heights)
+        photometric = self.kept(
+            photometry, self.warp, self.factorize, scene.views, scene.cameras, patches
+        )
+        heights = self.kept(self.align, self.kept(self.integrate, photometric))
+        surface = self.kept(self.refine, heights)
         yield Step(
             scale=1.0,
             last=True,
@@ -118,3 +124,10 @@ class Published(Chain):
             heights=heights,
             surface=surface,
         )
+
+
+def photometry(
+    warp: Warping, factorize: Factorizing, views: Views, cameras: Cameras, patches: PatchSet
+) -> PhotometricPatches:
+    """Give normals, albedo and light of all patches."""
+    return factorize(warp(views, cameras, patches, None))

@@ -53,6 +53,31 @@ class Prepares(Protocol):
         """Prepare them."""
 
 
+@dataclass(slots=True)
+class Prepared:
+    """Photographs as a warp prepares them, when they are first needed; not at all by some.
+
+    Attributes:
+        warp: Whose they are.
+        views: The photographs.
+    """
+
+    warp: "Warping"
+    views: Views
+    _sources: Sources | None = None
+
+    def hidden_by(self, patches: PatchSet) -> Sources | None:
+        """Give them with the surface that occludes: the one before, or the facets."""
+        if not isinstance(self.warp, Prepares):
+            return None
+        self._sources = self._sources or self.warp.prepare(self.views)
+        return self._sources.hidden_by(patches.surface or patches.coarse.mesh)
+
+    def release(self) -> None:
+        """Give back their memory."""
+        self._sources = None
+
+
 Factorizing = Callable[[PatchViews], PhotometricPatches]
 Warping = Callable[[Views, Cameras, PatchSet, Sources | None], PatchViews]
 Sweeping = Callable[[Views, Cameras, PatchViews, PhotometricPatches, Sources | None], SweptPatches]
@@ -75,7 +100,7 @@ def photometry_and_heights(
     views: Views,
     cameras: Cameras,
     patches: PatchSet,
-    sources: Sources | None,
+    sources: Prepared | None = None,
 ) -> SweptPatches:
     """Give normals, albedo, light and swept heights of all patches.
 
@@ -89,28 +114,28 @@ def photometry_and_heights(
         views: Photographs.
         cameras: Of all views.
         patches: The decomposition.
-        sources: The photographs as the warp prepares them, if it does.
+        sources: The photographs as the warp prepares them; prepared for this call alone if not
+            given.
 
     Differentiable as the stages are.
     """
-    if sources is not None:
-        sources = sources.hidden_by(patches.surface or patches.coarse.mesh)
+    occluded = (sources or Prepared(warp, views)).hidden_by(patches)
     if not isinstance(factorize, InParts):
-        seen = warp(views, cameras, patches, sources)
+        seen = warp(views, cameras, patches, occluded)
         photometric: PhotometricPatches = factorize(seen)
-        return sweep(views, cameras, seen, photometric, sources)
+        return sweep(views, cameras, seen, photometric, occluded)
     with stage("photometry") as told:
         clock = _Clock()
-        light = factorize.light(warp(views, cameras, thinned(patches), sources))
+        light = factorize.light(warp(views, cameras, thinned(patches), occluded))
 
         def one(templates: Templates) -> _Bucket:
             part = patches.replace(buckets=(templates,))
             with clock("warp"):
-                seen = warp(views, cameras, part, sources)
+                seen = warp(views, cameras, part, occluded)
             with clock("factorize"):
                 solved = factorize.solve(seen, light)
             with clock("sweep"):
-                swept = sweep(views, cameras, seen, solved, sources)
+                swept = sweep(views, cameras, seen, solved, occluded)
             return _Bucket(
                 photometry=solved.buckets[0],
                 heights=swept.buckets[0],

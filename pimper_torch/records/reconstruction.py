@@ -18,12 +18,14 @@ class StageReport(Record):
         seconds: Wall clock.
         peak_memory_mb: Highest resident memory of the process up to the stage's end.
         figures: Counts and shares worth telling, such as ``samples`` or ``missing_fraction``.
+        kept: Whether an earlier run found the record; time and memory are that run's.
     """
 
     name: str
     seconds: float
     peak_memory_mb: float
     figures: dict[str, int | float]
+    kept: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

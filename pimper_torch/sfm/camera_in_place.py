@@ -245,7 +245,7 @@ def least_squares_map(
     rows = torch.cat(
         [torch.cat([part, -y[:, side, None] * x], dim=1) for side, part in enumerate(linear)]
     )
-    found = torch.linalg.lstsq(rows, y.mT.reshape(-1, 1)).solution[:, 0]
+    found = torch.linalg.lstsq(rows, y.mT.reshape(-1, 1), driver="gelsd").solution[:, 0]
     if similar:
         a, b, right, down, p, q = found
         elements = torch.stack([a, -b, right, b, a, down, p, q, torch.ones_like(a)])

@@ -1,7 +1,6 @@
 """Structure from motion: photographs to cameras and a sparse cloud."""
 
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,11 +8,10 @@ from pathlib import Path
 import torch
 
 from pimper_torch.config import require
-from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
+from pimper_torch.errors import InputError, OutputError, ReconstructionError, caution, overheard
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.binding import thread_count
-from pimper_torch.sfm.cache import KeptModel, ModelCache, model_key
 from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
 from pimper_torch.sfm.doubt import doubt
@@ -27,6 +25,8 @@ from pimper_torch.sfm.registration import Registration, RegistrationSettings, re
 from pimper_torch.sfm.scene import assemble_scene
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
+from pimper_torch.store import Store, digest, opened, settled
+from pimper_torch.store.code import code_of
 
 # Verified matches below which a pair of photographs does not count; points of the model that a view
 # must see to be added, and to stay in it (COLMAP's own); fraction of the photographs that the
@@ -151,15 +151,15 @@ class Reconstruct(Stage):
     Args:
         config: How.
         cache: Folder where models are kept and looked for, see
-            :class:`~pimper_torch.sfm.cache.ModelCache`; without, every call finds its own.
+            :class:`~pimper_torch.store.Store`; without, every call finds its own.
     """
 
     def __init__(
-        self, config: ReconstructConfig | None = None, cache: Path | str | None = None
+        self, config: ReconstructConfig | None = None, cache: Store | Path | str | None = None
     ) -> None:
         super().__init__()
         self.config = config or ReconstructConfig()
-        self.cache = None if cache is None else ModelCache(folder=Path(cache))
+        self.store = opened(cache)
 
     def forward(self, views: Views, sparse_model: Path | str | None = None) -> SparseScene:
         """Place the photographs.
@@ -174,11 +174,10 @@ class Reconstruct(Stage):
             ReconstructionError: Fewer than 3 views found their place, or the model split.
             InputError: Radiance that is not finite, one camera is to be shared by photographs
                 of unlike sizes, or the given model does not belong to the photographs.
-            OutputError: The cache cannot be written.
         """
         _require_finite(views)
         if sparse_model is None:
-            return placed_scene(views, find_model(views, self.config, self.cache).model)
+            return placed_scene(views, find_model(views, self.config, self.store)[0])
         return placed_scene(views, existing_model(views, Path(sparse_model)))
 
 
@@ -189,32 +188,43 @@ def placed_scene(views: Views, model: SparseModel) -> SparseScene:
     """
     missing = [name for name in views.names if name not in model.names]
     if missing:
-        warnings.warn(
+        caution(
             f"{model.num_views} of {views.num_views} photographs found their place; left "
             f"out: {', '.join(missing)}.",
-            PimperWarning,
             stacklevel=3,
         )
     reason = doubt(model, views.num_views)
     if reason:
-        warnings.warn(reason, PimperWarning, stacklevel=3)
+        caution(reason, stacklevel=3)
     return assemble_scene(views, model).replace(doubt=reason)
 
 
-def find_model(views: Views, config: ReconstructConfig, cache: ModelCache | None) -> KeptModel:
-    """Take a model from the cache, or run :func:`structure_from_motion` and keep what it finds.
+def find_model(
+    views: Views, config: ReconstructConfig, store: Store | None
+) -> tuple[SparseModel, float]:
+    """Take a model that was kept, or run :func:`structure_from_motion` and keep what it finds.
 
-    The number of threads is no part of the key.
+    The number of threads is no part of the key. What was warned of is warned of again.
+
+    Returns:
+        The model, and the seconds of wall clock in which it was found.
     """
-    key = model_key(views, replace(config, threads=0)) if cache else ""
-    kept = cache.find(key) if cache else None
-    if kept is None:
-        began = time.perf_counter()
-        model = structure_from_motion(views, config)
-        kept = KeptModel(model=model, seconds=time.perf_counter() - began)
-        if cache:
-            cache.keep(key, kept)
-    return kept
+    key = f"reconstruct-{digest(code_of(__name__), views, replace(config, threads=0))}"
+    kept = store.find(key, SparseModel) if store else None
+    if kept is not None:
+        for message in kept.about["cautions"]:
+            caution(message, stacklevel=2)
+        return kept.record, float(kept.about["seconds"])
+    began = time.perf_counter()
+    with overheard() as cautions:
+        model = settled(structure_from_motion(views, config))
+    seconds = time.perf_counter() - began
+    if store:
+        try:
+            store.keep(key, model, {"seconds": seconds, "cautions": cautions})
+        except OutputError as error:
+            caution(str(error), stacklevel=2)
+    return model, seconds
 
 
 def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseModel:
@@ -268,11 +278,10 @@ def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> 
         if names[file] in model.names
     ]
     if misplaced:
-        warnings.warn(
+        caution(
             f"{len(misplaced)} of {model.num_views} photographs contradict most matches with those "
             f"they share most with, and may be misplaced: {list_some(misplaced, most=20)}. Look "
             "for sides that look alike; add photographs between these and their neighbours.",
-            PimperWarning,
             stacklevel=4,
         )
     return select_views(

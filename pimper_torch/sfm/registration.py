@@ -1,13 +1,12 @@
 """Photographs with features registered in one model: quickly first, thoroughly where that fails."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import PimperWarning
+from pimper_torch.errors import caution
 from pimper_torch.sfm.agreement import misplaced_views
 from pimper_torch.sfm.components import FEWEST_VIEWS, require_motion
 from pimper_torch.sfm.doubt import count_views_with_depth
@@ -150,10 +149,9 @@ def _leave_out_room(
                 "where a camera is turned in its place or pictures are cropped, while others move "
                 "otherwise"
             )
-        warnings.warn(
+        caution(
             f"{left} of {found} features {how}: they are taken for those of a room before which "
             "the object turns, and are left out.",
-            PimperWarning,
             stacklevel=3,
         )
     return dict(zip(space.files, rest.maps, strict=True)) if rest.room else {}

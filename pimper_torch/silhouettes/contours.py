@@ -1,13 +1,12 @@
 """What the silhouettes say about the surface, as one record that stages hand on."""
 
-import warnings
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import PimperWarning
+from pimper_torch.errors import caution
 from pimper_torch.geometry.projection import triangulate_rays
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
 from pimper_torch.silhouettes.hull import Everywhere, Hull, visual_hull
@@ -107,12 +106,10 @@ class TraceContours(Stage):
                 silhouettes, cameras.to(torch.float32), box.float(), disagreeing=fraction
             )
         if hull is None:
-            warnings.warn(
-                PimperWarning(
-                    "contours: the silhouettes of the views have no place in common, so that they "
-                    "say nothing about the surface. Look at the masks: do they show the same "
-                    "object in all photographs?"
-                ),
+            caution(
+                "contours: the silhouettes of the views have no place in common, so that they "
+                "say nothing about the surface. Look at the masks: do they show the same "
+                "object in all photographs?",
                 stacklevel=2,
             )
             return Contours.none(silhouettes, cameras)

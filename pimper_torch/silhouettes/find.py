@@ -1,12 +1,10 @@
 """Which pixels of every view show the object."""
 
-import warnings
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError, caution
 from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
 from pimper_torch.silhouettes.cues import Cues, cues_of
@@ -115,10 +113,9 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
 
 def _warn(why: str, on_plane: bool) -> None:
     what = "above the plane that it stands on" if on_plane else "that the photographs show"
-    warnings.warn(
+    caution(
         f"Everything {what} is taken for the object: {why}. Give masks, or a "
         "box round the object (`silhouettes.region`); `silhouettes.object` everything says that "
         "this is meant.",
-        PimperWarning,
         stacklevel=3,
     )

@@ -160,7 +160,7 @@ def matrix_between_lights(
     Lights, not normals: those of a coarse surface are smoother than the true ones, and what
     turns the vectors along them may have no rank. Each light counts with its own size.
     """
-    inverse = torch.linalg.lstsq(lights.double(), known.double()).solution
+    inverse = torch.linalg.lstsq(lights.double(), known.double(), driver="gelsd").solution
     return torch.linalg.pinv(inverse).to(lights)
 
 

@@ -13,13 +13,13 @@ from pimper_torch.evidence.scenes.write import render_scene
 from pimper_torch.io.photographs import load_views
 from pimper_torch.paper.triangulate import Triangulate
 from pimper_torch.records import Capture, CoarseMesh, Record, SparseScene
-from pimper_torch.sfm.cache import ModelCache
 from pimper_torch.sfm.reconstruct import (
     Reconstruct,
     ReconstructConfig,
     find_model,
     placed_scene,
 )
+from pimper_torch.store import opened
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -78,10 +78,10 @@ def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) 
     else:
         refined = ReconstructConfig()
         settings = replace(refined, track_iterations=0) if config.cameras == "features" else refined
-        found = find_model(views, settings, ModelCache(folder=cache) if cache else None)
+        model, seconds = find_model(views, settings, opened(cache))
         began = time.perf_counter()
-        scene = placed_scene(views, found.model)
-        seconds = found.seconds + time.perf_counter() - began
+        scene = placed_scene(views, model)
+        seconds += time.perf_counter() - began
     coarse = Triangulate()(scene)
     capture = read_rendered(folder, maps=False, photographs=False)
     surface = prepared_surface(capture, config.evaluation)

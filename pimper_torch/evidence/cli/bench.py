@@ -14,7 +14,7 @@ from pimper_torch.evidence.bench.config import BenchConfig
 from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
 from pimper_torch.evidence.bench.table import terminal
 from pimper_torch.io.folders import prepare_output
-from pimper_torch.sfm.cache import user_cache
+from pimper_torch.store.folders import user_cache
 
 _OUT, _QUICK = Path("pimper_bench"), BenchConfig()
 

@@ -151,14 +151,16 @@ def find_maxima(
     u, v = x.double(), y.double()
     one = torch.ones_like(u)
     basis = torch.stack([one, u, v, u * u / 2, u * v, v * v / 2], dim=1)
-    fitted = torch.linalg.lstsq(basis, window.mT).solution
+    fitted = torch.linalg.lstsq(basis, window.mT, driver="gelsd").solution
     _, gx, gy, hxx, hxy, hyy = fitted
     determinant = hxx * hyy - hxy * hxy
     safe = torch.where(determinant > 0, determinant, 1)
     du, dv = -(hyy * gx - hxy * gy) / safe, -(hxx * gy - hxy * gx) / safe
     kept = (determinant > 0) & (hxx < 0) & (torch.maximum(du.abs(), dv.abs()) < radius)
     error = (window.mT - basis @ fitted).square().sum(dim=0) / (len(basis) - basis.shape[1])
-    plane = torch.linalg.lstsq(basis[:, :3], raster[:, rows, columns].permute(2, 0, 1).flatten(1))
+    plane = torch.linalg.lstsq(
+        basis[:, :3], raster[:, rows, columns].permute(2, 0, 1).flatten(1), driver="gelsd"
+    )
     level, along, down = plane.solution.reshape(3, 3, -1)
     vector = level + along * du + down * dv
     # An error of the gradient moves the maximum by minus the inverse Hessian times it.

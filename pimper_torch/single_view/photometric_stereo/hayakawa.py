@@ -173,7 +173,9 @@ def _form(
                     f"{what}: theirs are on one cone, so that more than one quadratic form makes "
                     "them equal; needed: others besides. Take more, in other directions."
                 )
-            entries = torch.linalg.lstsq((root * monomials).mT, root[:, None]).solution[:, 0]
+            entries = torch.linalg.lstsq(
+                (root * monomials).mT, root[:, None], driver="gelsd"
+            ).solution[:, 0]
             residual = entries @ monomials - 1
             scale = CAUCHY_TUNING * median_deviation(residual, given > 0)
             heavy = given * cauchy_weights(residual, scale)

@@ -1,0 +1,87 @@
+"""Calls whose records are kept, so that a run goes on where an earlier one ended."""
+
+import dataclasses
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from torch import Tensor, nn
+from torch.utils import _pytree as pytree
+
+from pimper_torch.errors import OutputError, caution, overheard
+from pimper_torch.records import Record, StageReport
+from pimper_torch.reporting import noted, repeat
+from pimper_torch.store import Store, digest, settled
+from pimper_torch.store.code import code_of
+
+R = TypeVar("R")
+
+
+def kept_call(
+    store: Store | None,
+    name: str,
+    call: Callable[..., R],
+    inputs: tuple[object, ...],
+    derived: Mapping[str, object],
+    settings: object = None,
+) -> R:
+    """Call a stage, or give what it gave for the same inputs in an earlier run.
+
+    What the earlier run reported and warned of is reported and warned of again. A stage of
+    another package is called every time, as its code is not known, and so is one that gradients
+    are asked of. Where the record cannot be kept, a warning says so.
+
+    Args:
+        store: Where records are; without, it is called.
+        name: Of the stage.
+        call: The stage, or a function.
+        inputs: What it is called with.
+        derived: What it is called with by name, which follows from the inputs.
+        settings: What else the record depends on.
+    """
+    cls = _returns(call)
+    key = None if store is None or cls is None else _key(call, inputs, settings)
+    if store is None or key is None or cls is None:
+        return call(*inputs, **derived)
+    found = store.find(f"{name}-{key}", cls)
+    if found is not None:
+        repeat([StageReport(**report) for report in found.about["reports"]])
+        for message in found.about["cautions"]:
+            caution(message)
+        return typing.cast(R, _beside(found.record, inputs))
+    with overheard() as cautions, noted() as reports:
+        result = settled(typing.cast(Record, call(*inputs, **derived)))
+    about = {"reports": list(map(dataclasses.asdict, reports)), "cautions": cautions}
+    try:
+        store.keep(f"{name}-{key}", result, about)
+    except OutputError as error:
+        caution(str(error))
+    return typing.cast(R, result)
+
+
+def _key(call: Callable[..., object], inputs: tuple[object, ...], settings: object) -> str | None:
+    """Hash the stage, its code and inputs; ``None`` where one of them is not known."""
+    codes = [
+        code_of(_module(value)) for value in (call, *inputs) if isinstance(value, nn.Module)
+    ] + [code_of(call.__module__)]
+    return None if None in codes else digest(codes, call, settings, *inputs)
+
+
+def _module(stage: nn.Module) -> str:
+    """Name the module of the class, or of the first part that is none of this package."""
+    modules = [type(part).__module__ for part in stage.modules()]
+    return next((module for module in modules if code_of(module) is None), modules[0])
+
+
+def _returns(call: Callable[..., object]) -> type[Record] | None:
+    """Give the record that a call is annotated to return."""
+    function = call.forward if isinstance(call, nn.Module) else call
+    cls: Any = typing.get_type_hints(function).get("return")
+    return cls if isinstance(cls, type) and issubclass(cls, Record) else None
+
+
+def _beside(record: Record, inputs: tuple[object, ...]) -> Record:
+    """Put a record on the device of the inputs."""
+    records = [value for value in inputs if isinstance(value, Record)]
+    tensors = [leaf for leaf in pytree.tree_leaves(records) if isinstance(leaf, Tensor)]
+    return record.to(tensors[0].device) if tensors else record

@@ -1,0 +1,103 @@
+"""A hash of what values hold, bit for bit: records, tensors, settings, stages and functions."""
+
+import dataclasses
+import hashlib
+import json
+import types
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.utils.weak import WeakTensorKeyDictionary
+
+_BYTES = 16
+# Of tensors that were hashed, while they live: their version when they were, and the hash. Stages
+# hand on the same tensors, and writing into a tensor counts up its version.
+_known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+
+
+def digest(*values: object) -> str | None:
+    """Hash values, so that equal hashes mean equal bits.
+
+    A module is what it is made with: its class, attributes and submodules. A tensor's device
+    counts, its memory layout doesn't.
+
+    Args:
+        values: Records and other dataclasses, tensors, modules, functions, tuples, lists, mappings,
+            enums, paths, numbers, texts, bytes or ``None``.
+
+    Returns:
+        Hexadecimal; ``None`` where something cannot be hashed, or gradients are asked for.
+    """
+    try:
+        text = json.dumps([_described(value) for value in values])
+    except _UnknownError:
+        return None
+    return hashlib.blake2b(text.encode(), digest_size=_BYTES).hexdigest()
+
+
+class _UnknownError(Exception):
+    """A value that cannot be hashed."""
+
+
+def _described(value: object) -> object:
+    """Turn a value into what JSON holds, one to one."""
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, Tensor):
+        return {"tensor": _tensor(value)}
+    if isinstance(value, Enum):
+        return {"enum": _named(type(value)), "name": value.name}
+    if isinstance(value, nn.Module):
+        return {"module": _named(type(value)), "holds": _described(_held(value))}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {"class": _named(type(value)), "holds": _described(fields)}
+    if isinstance(value, Mapping):
+        return {"map": [[_described(key), _described(inner)] for key, inner in value.items()]}
+    if isinstance(value, tuple | list):
+        return {type(value).__name__: [_described(inner) for inner in value]}
+    if isinstance(value, types.FunctionType):
+        return {"function": _named(value)}
+    if isinstance(value, float | complex | bytes | Path):
+        return {type(value).__name__: str(value) if isinstance(value, Path) else repr(value)}
+    raise _UnknownError
+
+
+def _held(module: nn.Module) -> dict[str, object]:
+    """Give what a module is made with, without what every module has."""
+    own = {
+        name: value
+        for name, value in vars(module).items()
+        if not name.startswith("_") and name != "training"
+    }
+    parts = (module.named_parameters(recurse=False), module.named_buffers(recurse=False))
+    return own | dict(parts[0]) | dict(parts[1]) | dict(module.named_children())
+
+
+def _named(thing: type | types.FunctionType) -> str:
+    """Name a class or function; those made inside a function may differ under one name."""
+    if "<" in thing.__qualname__:
+        raise _UnknownError
+    return f"{thing.__module__}.{thing.__qualname__}"
+
+
+def _tensor(tensor: Tensor) -> str:
+    if tensor.requires_grad or tensor.layout != torch.strided or tensor.is_meta:
+        raise _UnknownError
+    # An inference tensor has no version; it cannot be written into outside inference mode.
+    version = -1 if tensor.is_inference() else tensor._version
+    known: tuple[int, str] | None = _known.get(tensor)  # type: ignore[no-untyped-call]
+    if known is not None and known[0] == version:
+        return known[1]
+    about = f"{tensor.dtype} {tuple(tensor.shape)} {tensor.device.type}"
+    hashed = hashlib.blake2b(about.encode(), digest_size=_BYTES)
+    flat = tensor.detach().cpu().resolve_conj().resolve_neg().reshape(-1)
+    if flat.stride() != (1,):  # one entry may have any stride
+        flat = flat.clone(memory_format=torch.contiguous_format)
+    hashed.update(flat.view(torch.uint8).numpy().data)
+    found = hashed.hexdigest()
+    _known[tensor] = (version, found)
+    return found

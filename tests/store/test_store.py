@@ -1,0 +1,162 @@
+"""Records that are kept from run to run."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.errors import OutputError
+from pimper_torch.records import Cameras, Record, StageReport
+from pimper_torch.store import Store, digest, opened, settled
+from pimper_torch.store.folders import user_cache
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pair(Record):
+    one: Float[Tensor, "*shape"]
+    other: Float[Tensor, "*shape"]
+
+
+@pytest.fixture
+def record():
+    generator = torch.Generator().manual_seed(3)
+    return Cameras(
+        intrinsics=torch.eye(3).repeat(2, 1, 1),
+        cam_from_world=torch.rand(2, 4, 4, generator=generator),
+        sizes_px=torch.tensor([[80, 60]] * 2),
+    )
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_record_comes_back_bit_for_bit(record, tmp_path):
+    store = Store(folder=tmp_path / "new" / "folder")
+    assert store.find("a", Cameras) is None
+    assert store.keep("a", record, {"seconds": 12.5})
+    found = store.find("a", Cameras)
+    assert found.about == {"seconds": 12.5}
+    assert digest(found.record) == digest(record)
+    assert store.find("b", Cameras) is None
+    assert store.find("a", StageReport) is None
+
+
+@pytest.mark.parametrize("damage", ["cut short", "a bit", "empty", "another file", "text"])
+@pytest.mark.parametrize("file", ["a.safetensors", "a.json"])
+def test_a_damaged_entry_is_never_believed(record, tmp_path, damage, file):
+    store = Store(folder=tmp_path)
+    store.keep("a", record, {"seconds": 12.5})
+    whole = (tmp_path / file).read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) - 20 if file == "a.safetensors" else 30] ^= 1
+    damaged = {
+        "cut short": whole[:-1],
+        "a bit": bytes(flipped),
+        "empty": b"",
+        "another file": b"PK" + bytes(100),
+        "text": b'{"format": 1, "digest": null, "about": []}',
+    }
+    (tmp_path / file).write_bytes(damaged[damage])
+    assert store.find("a", Cameras) is None
+    store.keep("a", record)
+    assert store.find("a", Cameras) is not None
+
+
+def test_a_record_of_other_bits_than_its_hash_is_not_believed(record, tmp_path):
+    store = Store(folder=tmp_path)
+    store.keep("a", record)
+    store.keep("b", record.replace(cam_from_world=record.cam_from_world + 1))
+    (tmp_path / "b.safetensors").replace(tmp_path / "a.safetensors")
+    assert store.find("a", Cameras) is None
+
+
+@pytest.mark.parametrize("failing", ["a.safetensors", "a.json"])
+def test_what_was_not_written_whole_is_not_there(record, tmp_path, monkeypatch, failing):
+    store, replace = Store(folder=tmp_path), Path.replace
+
+    def fail(self, target):
+        if Path(target).name == failing:
+            raise OSError("disk full")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(OutputError, match="disk full"):
+        store.keep("a", record)
+    assert store.find("a", Cameras) is None
+    assert files(tmp_path) == []
+
+
+def test_the_folder_forgets_what_was_used_longest_ago(record, tmp_path):
+    store = Store(folder=tmp_path)
+    for second, key in enumerate("abc"):
+        store.keep(key, record)
+        os.utime(tmp_path / f"{key}.safetensors", (second, second))
+    size = store.sizes()["a"]
+    assert store.find("a", Cameras)  # used just now
+    small = Store(folder=tmp_path, max_bytes=3 * size)
+    assert small.keep("d", record)
+    assert list(small.sizes()) == ["c", "a", "d"]
+    assert files(tmp_path) == [f"{key}.{kind}" for key in "acd" for kind in ("json", "safetensors")]
+    assert sum(small.sizes().values()) <= small.max_bytes
+    none = Store(folder=tmp_path, max_bytes=size - 1)
+    assert not none.keep("e", record)
+    assert files(tmp_path) == []
+
+
+def test_files_that_a_killed_run_left_are_deleted_after_a_day(record, tmp_path):
+    old, new = tmp_path / ".a.safetensors.new-0a", tmp_path / ".a.safetensors.new-0b"
+    for path in (old, new):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    Store(folder=tmp_path).keep("a", record)
+    assert (old.exists(), new.exists()) == (False, True)
+
+
+def test_afresh_finds_nothing_and_replaces(record, tmp_path):
+    Store(folder=tmp_path).keep("a", record)
+    afresh = Store(folder=tmp_path, fresh=True)
+    assert afresh.find("a", Cameras) is None
+    afresh.keep("a", record.replace(cam_from_world=record.cam_from_world + 1))
+    assert not torch.equal(
+        Store(folder=tmp_path).find("a", Cameras).record.cam_from_world, record.cam_from_world
+    )
+
+
+def test_what_asks_for_gradients_is_not_kept(record, tmp_path):
+    store = Store(folder=tmp_path)
+    assert not store.keep("a", record.replace(intrinsics=record.intrinsics.requires_grad_()))
+    assert files(tmp_path) == []
+
+
+def test_settled_tensors_have_one_layout(record):
+    shared = torch.rand(4, 4, 2).permute(2, 0, 1)
+    whole = torch.rand(33)[1:].reshape(2, 4, 4)
+    found = settled(record.replace(cam_from_world=shared))
+    assert torch.equal(found.cam_from_world, shared)
+    assert found.cam_from_world.is_contiguous()
+    assert found.intrinsics is record.intrinsics
+    assert settled(record.replace(cam_from_world=whole)).cam_from_world.data_ptr() % 64 == 0
+    pair = Pair(one=shared, other=shared)
+    both = settled(pair)
+    assert both.one is both.other
+
+
+def test_a_folder_is_a_store(tmp_path):
+    store = Store(folder=tmp_path)
+    assert opened(store) is store
+    assert opened(tmp_path) == store
+    assert opened(None) is None
+
+
+def test_the_users_cache_follows_xdg(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert user_cache() == tmp_path / "pimper_torch"
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for unset in ("", "relative/path"):
+        monkeypatch.setenv("XDG_CACHE_HOME", unset)
+        assert user_cache() == tmp_path / "home" / ".cache" / "pimper_torch"

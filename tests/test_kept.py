@@ -1,0 +1,169 @@
+"""Runs that go on where an earlier one ended."""
+
+import warnings
+
+import pytest
+import torch
+
+import pimper_torch as pt
+from pimper_torch.errors import PimperWarning, caution
+from pimper_torch.evidence.bench.gradients import small_scene
+from pimper_torch.meshing.extract import Extract
+from pimper_torch.records import Mesh, Surface
+from pimper_torch.reporting import Silent
+from pimper_torch.stage import Given
+from pimper_torch.store import digest
+
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+
+# Of two passes over given facets, in order.
+STAGES = ["silhouettes", "photometry_and_heights", "fuse", "remesh"]
+STAGES += ["photometry_and_heights", "fuse", "extract"]
+
+
+class Listener(Silent):
+    def __init__(self) -> None:
+        self.reports = []
+
+    def finished(self, report):
+        self.reports.append(report)
+
+    @property
+    def kept(self):
+        return [report.name for report in self.reports if report.kept]
+
+    @property
+    def done(self):
+        return [report.name for report in self.reports if not report.kept]
+
+
+@pytest.fixture(scope="module")
+def given():
+    return tuple(each.to(torch.float32) for each in small_scene(num_views=6, width=48))
+
+
+def chain_of(given, store, **changes):
+    listener = Listener()
+    settings = {"scales": [0.25, 0.5], "silhouettes": {"object": "everything"}, **changes}
+    scene, coarse = given
+    stages = {"reconstruct": Given(scene), "coarse_surface": Given(coarse)}
+    return pt.load_chain("default", settings, listener, store, **stages), listener
+
+
+def run(given, store, **changes):
+    chain, listener = chain_of(given, store, **changes)
+    return chain(given[0].views), listener
+
+
+@pytest.fixture(scope="module")
+def whole(given, tmp_path_factory):
+    """A run that was never interrupted, without a store, and the store of another."""
+    folder = tmp_path_factory.mktemp("kept")
+    result, listener = run(given, folder)
+    assert listener.kept == []
+    return run(given, None)[0], folder, result
+
+
+def bits(result):
+    return digest(result.replace(report=()))
+
+
+def test_a_run_that_keeps_gives_what_one_gives_that_does_not(whole):
+    without, _, keeping = whole
+    assert bits(keeping) == bits(without) is not None
+
+
+@pytest.mark.parametrize("done", [1, 3, 6])
+def test_a_run_goes_on_after_any_stage_to_the_same_bits(given, whole, tmp_path, done):
+    expected, folder, _ = whole
+    paths = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
+    assert [path.name.split("-")[0] for path in paths] == STAGES
+    for path in paths[:done]:
+        for file in (path, path.with_suffix(".safetensors")):
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+    result, listener = run(given, tmp_path)
+    assert bits(result) == bits(expected)
+    names = [name.replace("photometry_and_heights", "photometry") for name in STAGES]
+    assert listener.kept == names[:done]
+    assert [name for name in listener.done if name in names] == names[done:]
+
+
+def test_a_changed_setting_runs_what_depends_on_it(given, whole):
+    _, folder, _ = whole
+    _, listener = run(given, folder, extract={"max_hole": 0.3})
+    assert "extract" in listener.done
+    assert listener.kept.count("photometry") == 2
+    _, listener = run(given, folder, factorize={"light_prior": 2.0})
+    assert listener.kept == ["silhouettes"]
+    # What the first pass gives doesn't depend on the second one's scale.
+    _, listener = run(given, folder, scales=[0.25, 0.4])
+    assert listener.kept == ["silhouettes", "photometry", "fuse", "remesh"]
+
+
+def test_other_photographs_are_another_run(given, whole):
+    _, folder, _ = whole
+    scene, coarse = given
+    brighter = scene.views.replace(images=scene.views.images * 1.001)
+    _, listener = run((scene.replace(views=brighter), coarse), folder)
+    assert "photometry" not in listener.kept
+
+
+def test_damaged_records_are_made_again(given, whole, tmp_path):
+    expected, folder, _ = whole
+    for path in folder.iterdir():
+        data = bytearray(path.read_bytes())
+        if path.suffix == ".safetensors":
+            data[len(data) * 3 // 4] ^= 16
+        (tmp_path / path.name).write_bytes(data)
+    result, listener = run(given, tmp_path)
+    assert listener.kept == []
+    assert bits(result) == bits(expected)
+
+
+class Doubtful(Extract):
+    """The package's own, but of another module."""
+
+    def forward(self, surface: Surface) -> Mesh:
+        caution("doubtful")
+        return super().forward(surface)
+
+
+def test_a_stage_of_ones_own_is_called_every_time(given, whole):
+    _, folder, _ = whole
+    chain, listener = chain_of(given, folder)
+    chain.extract = Doubtful()
+    for _ in range(2):
+        with pytest.warns(PimperWarning, match="doubtful"):
+            chain(given[0].views)
+    assert listener.done.count("extract") == 2
+
+
+def test_what_asks_for_gradients_is_not_kept(given, tmp_path):
+    scene, _ = given
+    chain, _ = chain_of(given, tmp_path)
+    chain.kept(chain.silhouettes, scene)
+    kept = sorted(tmp_path.iterdir())
+    assert len(kept) == 2
+    images = scene.views.images.clone().requires_grad_()
+    chain.kept(chain.silhouettes, scene.replace(views=scene.views.replace(images=images)))
+    assert sorted(tmp_path.iterdir()) == kept
+
+
+def test_what_was_warned_of_is_warned_of_again(given, tmp_path):
+    for _ in range(2):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            _, listener = run(
+                given, tmp_path, factorize={"min_views": 6, "min_light_variation": 0.9}
+            )
+        messages = {str(one.message) for one in caught if one.category is PimperWarning}
+        assert any("patches keep the normals" in message for message in messages)
+    assert "photometry" in listener.kept
+    assert "photometry" not in listener.done
+
+
+def test_a_store_that_cannot_be_written_ends_no_run(given, whole, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.warns(PimperWarning, match=r"cannot be kept there.*Free space"):
+        result, _ = run(given, tmp_path / "file" / "folder")
+    assert bits(result) == bits(whole[0])
