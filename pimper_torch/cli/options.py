@@ -12,9 +12,9 @@ import tyro
 from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
-from pimper_torch.io.folders import prepare_output
+from pimper_torch.io.folders import prepare_output, require_apart
+from pimper_torch.io.marker import require_name
 from pimper_torch.io.photographs import list_images
-from pimper_torch.io.results import RESULT_NAMES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,11 +155,24 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
             photographs.
     """
     job = parse(command, arguments)
-    prepare_output(job.out, RESULT_NAMES, job.common.overwrite)
+    require_apart(job.out, _inputs(job))
+    prepare_output(job.out, "result", job.common.overwrite)
     for folder in (job.photos, job.inputs.masks):
         if folder is not None:
-            list_images(folder)
+            for path in list_images(folder):
+                require_name(path)
     return job
+
+
+def _inputs(job: Job) -> dict[str, Path | None]:
+    """Give what a run reads, by what it is called."""
+    return {
+        "PHOTOS": job.photos,
+        "--masks": job.inputs.masks,
+        "--sparse": job.inputs.sparse,
+        "--mesh": job.inputs.mesh,
+        "--cache": job.common.cache,
+    }
 
 
 def bundled_photographs() -> Path:

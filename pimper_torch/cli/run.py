@@ -12,6 +12,7 @@ from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output, stage
 from pimper_torch.doctor.examine import examine_views
 from pimper_torch.errors import ConfigError, PimperWarning
+from pimper_torch.io.folders import held_output
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -28,7 +29,8 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     job = checked(command, arguments)
     common = job.common
     _check_device(common.device)
-    with output.observer() as observer:
+    held = held_output(job.out, "result", overwrite=common.overwrite)
+    with held, output.observer() as observer:
         with stage(observer, "read") as figure:
             views = _read(job)
             figure("photographs", views.num_views)

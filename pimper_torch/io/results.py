@@ -22,7 +22,7 @@ from pimper_torch.sfm.scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.overview import draw_overview
 
-# What a result consists of; a folder with anything else in it is never replaced.
+# What a result consists of, and nothing else.
 RESULT_NAMES = (
     "mesh.ply",
     "mesh.glb",
@@ -88,7 +88,7 @@ def write_result(
         OutputError: The folder holds something else, or cannot be written.
     """
     folder = Path(folder)
-    with written_whole(folder, RESULT_NAMES, overwrite=overwrite) as staging:
+    with written_whole(folder, "result", overwrite=overwrite) as staging:
         whole = result.to("cpu")
         summary = summary_report(whole, about or {})
         if not full_mesh:

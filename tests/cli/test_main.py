@@ -16,6 +16,7 @@ from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
 from pimper_torch.cli.output import Output
 from pimper_torch.errors import PimperWarning, ReconstructionError
+from pimper_torch.io.marker import MARKER
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.io.version import installed_version
@@ -34,7 +35,7 @@ def held(folder):
 
 def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys):
     assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
-    assert held(tmp_path / "out") == sorted({*RESULT_NAMES} - {"masks"})
+    assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - {"masks"})
     config, views, sparse = chain.given
     assert config == CoarseToFineConfig() == load_config("default")
     assert views.names == ("0.png", "1.png", "2.png")
@@ -109,7 +110,7 @@ def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, 
 def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run("demo", "--max-size-px", "60") == 0
-    assert held(tmp_path / "pimper_demo") == sorted({*RESULT_NAMES} - {"masks"})
+    assert held(tmp_path / "pimper_demo") == sorted({*RESULT_NAMES, MARKER} - {"masks"})
     assert chain.given[1].num_views == 24
     assert "37.jpg" in chain.given[1].names
 
@@ -136,12 +137,11 @@ def test_what_the_user_can_mend_is_one_message_and_code_2(
 
 
 def test_an_occupied_out_is_refused_before_photographs_are_read(photos, chain, tmp_path, capsys):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mesh.ply").write_text("former")
+    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
     assert run("reconstruct", tmp_path / "nowhere", "-o", tmp_path / "out") == 2
-    assert "out: already holds mesh.ply" in capsys.readouterr().err
+    assert "out: already holds albedo.png" in capsys.readouterr().err
     assert run("reconstruct", photos, "-o", tmp_path / "out", "--overwrite") == 0
-    assert held(tmp_path / "out") == sorted({*RESULT_NAMES} - {"masks"})
+    assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - {"masks"})
 
 
 def test_a_missing_gpu_is_told_before_the_run(photos, chain, tmp_path, capsys, monkeypatch):

@@ -91,7 +91,7 @@ def run_bench(
     rows: list[Row] = []
     sheet: list[SceneRow] = []
     with (
-        written_whole(folder, BENCH_NAMES, overwrite=overwrite) as staging,
+        written_whole(folder, "table", overwrite=overwrite) as staging,
         tempfile.TemporaryDirectory(prefix="pimper_bench_") as workspace,
     ):
         for part in ("heatmaps", "meshes"):

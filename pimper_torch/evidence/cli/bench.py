@@ -13,7 +13,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.evidence.bench.config import BenchConfig
 from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
 from pimper_torch.evidence.bench.table import terminal
-from pimper_torch.io.folders import prepare_output
+from pimper_torch.io.folders import prepare_output, require_apart
 from pimper_torch.store.folders import user_cache
 
 _OUT, _QUICK = Path("pimper_bench"), BenchConfig()
@@ -71,5 +71,13 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         return _Job(out=out, config=config, cache=cache, overwrite=overwrite)
 
     job = read_arguments(bench, command, arguments)
-    prepare_output(job.out, BENCH_NAMES, job.overwrite)
+    require_apart(job.out, _inputs(job))
+    prepare_output(job.out, "table", job.overwrite)
     return job
+
+
+def _inputs(job: _Job) -> dict[str, Path | None]:
+    """Give what the bench reads, by what it is called."""
+    names = (*job.config.scenes, *(job.config.methods or ()))
+    paths = {name: Path(name) for name in names}
+    return {"--cache": job.cache, **{name: path for name, path in paths.items() if path.exists()}}

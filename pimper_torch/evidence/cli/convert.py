@@ -33,7 +33,7 @@ from pimper_torch.evidence.datasets import (
     write_transforms,
 )
 from pimper_torch.evidence.datasets.posed import shrink
-from pimper_torch.io.folders import prepare_output, written_whole
+from pimper_torch.io.folders import prepare_output, require_apart, written_whole
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
 from pimper_torch.records import Cameras, Capture, Truth, Views
@@ -54,18 +54,6 @@ Source = Literal[
 ]
 Target = Literal["colmap", "idr", "transforms"]
 
-# What the three layouts consist of together: one may replace another.
-RESULT_NAMES = (
-    "images",
-    "masks",
-    "sparse",
-    "image",
-    "mask",
-    "cameras.npz",
-    "cameras_sphere.npz",
-    "transforms.json",
-    "sparse_pc.ply",
-)
 # Enough to start from or to see the object's extent, and no more than viewers like.
 _MAX_POINTS = 100_000
 
@@ -128,10 +116,10 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         PimperError: Before anything is written.
     """
     job = checked(command, arguments)
-    with output.observer() as observer, stage(observer, "read") as figure:
-        capture = read(job)
-        figure("photographs", capture.views.num_views)
-    with written_whole(job.out, RESULT_NAMES, overwrite=job.overwrite) as staging:
+    with written_whole(job.out, "data set", overwrite=job.overwrite) as staging:
+        with output.observer() as observer, stage(observer, "read") as figure:
+            capture = read(job)
+            figure("photographs", capture.views.num_views)
         write(capture, job.target, staging)
     output.remark(describe(capture, job))
     output.result({"folder": job.out}, photographs=capture.views.num_views)
@@ -144,7 +132,14 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
         PimperError: The folder for the result is taken, or there is no data.
     """
     job = parse(arguments)
-    prepare_output(job.out, RESULT_NAMES, job.overwrite)
+    inputs = {
+        "DATA": job.data,
+        "--images": job.options.images,
+        "--masks": job.options.masks,
+        "--mesh": job.options.mesh,
+    }
+    require_apart(job.out, inputs)
+    prepare_output(job.out, "data set", job.overwrite)
     if not job.data.exists():
         raise InputError(f"{job.data}: found nothing; needed: the folder or file of a data set.")
     return job

@@ -39,14 +39,13 @@ from pimper_torch.evidence.scenes.scene import Scene, build_scene
 from pimper_torch.evidence.scenes.stage import Stage
 from pimper_torch.evidence.scenes.tracks import true_model
 from pimper_torch.io.decode import write_deep_png
-from pimper_torch.io.folders import prepare_output, written_whole
+from pimper_torch.io.folders import require_apart, written_whole
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.version import installed_version
 from pimper_torch.progress import report
 from pimper_torch.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.sfm.colmap import write_binary
 
-SCENE_NAMES = ("photos", "masks", "truth")
 FORMAT, FORMAT_VERSION = "pimper_torch rendered scene", 1
 _FAST = 1  # level of PNG's compression: noise does not shrink much further at any
 
@@ -83,10 +82,11 @@ def render_scene(
     """
     require(processes >= 1, "processes", processes, "1 or more")
     folder = Path(folder)
-    prepare_output(folder, SCENE_NAMES, overwrite)
-    config = SceneConfig() if config is None else config
-    scene = build_scene(name_or_path, config)
-    with written_whole(folder, SCENE_NAMES, overwrite=overwrite) as staging:
+    if Path(name_or_path).exists():
+        require_apart(folder, {"the scene's mesh": Path(name_or_path)})
+    with written_whole(folder, "scene", overwrite=overwrite) as staging:
+        config = SceneConfig() if config is None else config
+        scene = build_scene(name_or_path, config)
         for part in ("photos", "masks", "truth/maps"):
             (staging / part).mkdir(parents=True)
         _write_truth(scene, staging / "truth")

@@ -25,6 +25,7 @@ from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.geometry.frames import transform
+from pimper_torch.io.marker import MARKER
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
 
@@ -165,7 +166,9 @@ def test_figures_over_pixels_that_all_methods_cover_stand_beside_each_ones_own(s
 def test_the_folder_holds_table_sheet_heat_maps_and_surfaces(staged, tmp_path):
     config = BenchConfig(samples=3000, scenes=("ball",), methods=("larger", "lost"))
     table = run_bench(config, tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(BENCH_NAMES)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
+        [*BENCH_NAMES, MARKER]
+    )
     assert read_json(tmp_path / "out" / "table.json") == table
     assert "larger" in (tmp_path / "out" / "table.md").read_text()
     assert [path.name for path in (tmp_path / "out" / "heatmaps").iterdir()] == ["ball_larger.png"]

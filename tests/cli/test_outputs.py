@@ -1,0 +1,138 @@
+"""What commands do to folders that hold something: as a careless user would give them."""
+
+import threading
+
+import pytest
+
+from pimper_torch.cli.main import main
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.io.folders import held_output
+from pimper_torch.io.marker import MARKER
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.records import Mesh
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.*")}
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A person's own folder, whose names are those of a result."""
+    folder = tmp_path / "proj"
+    (folder / "sparse").mkdir(parents=True)
+    (folder / "mesh.ply").write_text("a week of work")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        (folder / "sparse" / name).write_text("a model")
+    return folder
+
+
+@pytest.mark.parametrize("option", ["--sparse", "--mesh", "--masks", "--cache"])
+def test_an_input_in_the_folder_of_the_result_is_refused(
+    photos, chain, project, capsys, tmp_path, option
+):
+    before = contents(project)
+    (tmp_path / "link").symlink_to(project)
+    for place in (project, tmp_path / "link"):
+        given = place / ("mesh.ply" if option == "--mesh" else "sparse")
+        for flags in ([], ["--overwrite"]):
+            assert run("reconstruct", photos, "-o", project, option, given, *flags) == 2
+            assert f"{option} ({given}) lies in the folder" in capsys.readouterr().err
+    assert run("reconstruct", project, "-o", project, "--overwrite") == 2
+    assert "PHOTOS" in capsys.readouterr().err
+    assert contents(project) == before
+    assert chain.given is None
+
+
+def test_a_folder_that_only_looks_like_a_result_is_refused(photos, chain, project, capsys):
+    before = contents(project)
+    assert run("reconstruct", photos, "-o", project, "--overwrite") == 2
+    assert f"no list of what a former run wrote ({MARKER})" in capsys.readouterr().err
+    assert contents(project) == before
+
+
+def test_a_persons_own_file_in_a_result_is_not_overwritten(photos, chain, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run("reconstruct", photos, "-o", out) == 0
+    (out / "sparse" / "notes.txt").write_text("mine")
+    before = contents(out)
+    assert run("reconstruct", photos, "-o", out, "--overwrite") == 2
+    assert "out: holds sparse/notes.txt, which is no part" in capsys.readouterr().err
+    assert contents(out) == before
+
+
+def test_a_persons_own_photographs_in_a_scene_are_not_overwritten(tmp_path, capsys):
+    vertices, faces = icosphere(1)
+    write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "ball.ply")
+    small = ["--num-views", "2", "--width", "32", "--height", "24", "--processes", "1"]
+    assert run("render", tmp_path / "ball.ply", "-o", tmp_path / "out", *small) == 0
+    for part in ("photos", "masks"):
+        mine = tmp_path / "out" / part / "mine.png"
+        mine.write_text("mine")
+        assert run("render", tmp_path / "ball.ply", "-o", tmp_path / "out", "--overwrite") == 2
+        assert f"{part}/mine.png" in capsys.readouterr().err
+        assert mine.read_text() == "mine"
+        mine.unlink()
+    mesh = tmp_path / "out" / "truth" / "mesh.ply"
+    assert run("render", mesh, "-o", tmp_path / "out", "--overwrite") == 2
+    assert "lies in the folder of the result" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--images", "--masks", "--mesh"])
+def test_an_input_of_convert_in_its_output_is_refused(project, capsys, option):
+    others = ["--source", "colmap", "--target", "idr", "--overwrite"]
+    assert run("convert", project, "-o", project, *others) == 2
+    assert "DATA" in capsys.readouterr().err
+    inside = project / "sparse"
+    assert run("convert", project.parent, "-o", project, option, inside, *others) == 2
+    assert option in capsys.readouterr().err
+
+
+def test_an_input_of_bench_in_its_output_is_refused(project, capsys):
+    (project / "mine.yaml").write_text("seed: 3\n")
+    for given in (["--cache", project / "sparse"], ["--methods", project / "mine.yaml"]):
+        assert run("bench", "-o", project, "--overwrite", *given) == 2
+        assert "lies in the folder of the result" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "demo", "render", "bench", "convert"])
+def test_two_runs_into_one_folder_do_not_meet(photos, chain, tmp_path, capsys, command):
+    """While another run holds the folder, every command that writes there is refused."""
+    kind = {"render": "scene", "bench": "table", "convert": "data set"}.get(command, "result")
+    given = {
+        "reconstruct": [photos],
+        "render": ["mug"],
+        "convert": [photos, "--source", "idr", "--target", "colmap"],
+    }.get(command, [])
+    codes = []
+    with held_output(tmp_path / "out", kind):
+        other = threading.Thread(
+            target=lambda: codes.append(run(command, *given, "-o", tmp_path / "out"))
+        )
+        other.start()
+        other.join()
+    assert codes == [2]
+    assert "another run writes there: process" in capsys.readouterr().err
+    assert chain.given is None
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_holds_its_folder_from_the_first_photograph_on(photos, chain, tmp_path, monkeypatch):
+    codes = []
+
+    def meanwhile(self):
+        monkeypatch.setattr(chain, "work", lambda self: None)
+        codes.append(run("reconstruct", photos, "-o", tmp_path / "out"))
+
+    def in_a_thread(self):
+        other = threading.Thread(target=meanwhile, args=(self,))
+        other.start()
+        other.join()
+
+    monkeypatch.setattr(chain, "work", in_a_thread)
+    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
+    assert codes == [2]
