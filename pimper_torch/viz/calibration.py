@@ -5,6 +5,9 @@ from pathlib import Path
 
 _SIZE_IN = 4.5
 
+TITLE = "pimper_torch calibration"
+"""Of the PNG, by which a former one is known."""
+
 
 def draw_calibration(
     expected: Sequence[float],
@@ -39,4 +42,4 @@ def draw_calibration(
     )
     axes.set_aspect("equal")
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=150, format="png", metadata={"Title": TITLE})

@@ -49,7 +49,7 @@ RUNS = {
         "view_000 view_001 --thresholds-percent 0.5 1 --seen-from 2 --alignment icp "
         "--trimmed-fraction 0.1 --icp-distance point",
         "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500",
-        "{told} {true_mesh} --samples 500 --calibration {out}.png",
+        "{told} {true_mesh} --samples 500 --calibration {out}.png --overwrite",
     ],
     "bench": [
         "--out {out} --scale quick --scenes {scene} --methods smoothed --masks --cameras true "

@@ -2,7 +2,6 @@
 
 import json
 import re
-import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,10 +12,10 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
-from pimper_torch.cli.arguments import read_arguments
+from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.config import to_mapping
-from pimper_torch.errors import InputError, OutputError
+from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
 from pimper_torch.evidence.datasets.rendered import read_rendered
@@ -30,10 +29,11 @@ from pimper_torch.evidence.metrics.evaluate import (
 from pimper_torch.evidence.metrics.icp import IcpConfig
 from pimper_torch.evidence.metrics.report import report, rows
 from pimper_torch.io.estimates import read_estimate
+from pimper_torch.io.files import file_written_whole, is_titled, prepare_file, says_of_itself
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
-from pimper_torch.viz.calibration import draw_calibration
+from pimper_torch.viz.calibration import TITLE, draw_calibration
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
 
@@ -41,6 +41,7 @@ Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
 _POSITION = re.compile(r"(?:rect|view)_(\d+)")
 # Photographs of the DTU set are not compared with anything; small ones save a gigabyte.
 _THUMBNAIL_PX = 200
+FORMAT = "pimper_torch evaluation"
 # Columns that the explanation of a figure needs to stand beside it.
 _ROOM = 72
 
@@ -106,6 +107,7 @@ class Job:
     truth: Path
     out: Path | None
     calibration: Path | None = None
+    overwrite: bool = False
     options: EvaluateOptions = field(default_factory=EvaluateOptions)
 
 
@@ -128,6 +130,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     evaluation = evaluate(estimate, truth.capture, config, maps=truth.maps, dtu=truth.protocol)
     if not output.as_json:
         show(evaluation, Console())
+    _prepare_files(job)
     if job.out is not None:
         write_report(evaluation, job)
         output.remark(f"{job.out} has all figures.")
@@ -150,9 +153,7 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
     for path in (job.result, job.truth):
         if not path.exists():
             raise InputError(f"{path}: found nothing; needed: a result, and what it should be.")
-    for file in (job.out, job.calibration):
-        if file is not None:
-            _check_writable(file)
+    _prepare_files(job)
     return job
 
 
@@ -168,6 +169,7 @@ def parse(arguments: Sequence[str]) -> Job:
         truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")],
         out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
         calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+        overwrite: Flag = False,
         options: Annotated[EvaluateOptions, tyro.conf.arg(name="")] = EvaluateOptions(),
     ) -> Job:
         """Measure a result against the truth, each figure under its own named convention.
@@ -175,12 +177,20 @@ def parse(arguments: Sequence[str]) -> Job:
         Args:
             result: Folder that `pimper reconstruct` wrote, or a mesh of any method.
             truth: Folder of a rendered scene or of a data set, or a mesh.
-            out: JSON file for all figures; a former one is replaced.
+            out: JSON file for all figures.
             calibration: PNG file for the calibration curve of a result that tells its expected
-                error; a former one is replaced.
+                error.
+            overwrite: Replace files that a former evaluation wrote, and no others.
             options: The measuring.
         """
-        return Job(result=result, truth=truth, out=out, calibration=calibration, options=options)
+        return Job(
+            result=result,
+            truth=truth,
+            out=out,
+            calibration=calibration,
+            overwrite=overwrite,
+            options=options,
+        )
 
     return read_arguments(evaluate, "evaluate", arguments)
 
@@ -306,6 +316,7 @@ def write_report(evaluation: Evaluation, job: Job) -> None:
     """
     assert job.out is not None
     content = {
+        "format": FORMAT,
         "pimper_torch": installed_version(),
         "result": str(job.result),
         "truth": str(job.truth),
@@ -313,13 +324,8 @@ def write_report(evaluation: Evaluation, job: Job) -> None:
         **report(evaluation),
     }
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    staging = job.out.with_name(f".{job.out.name}.new-{secrets.token_hex(4)}")
-    try:
-        staging.write_text(text, encoding="utf-8")
-        staging.replace(job.out)
-    except OSError as error:
-        staging.unlink(missing_ok=True)
-        raise OutputError(f"{job.out}: cannot be written ({error.strerror}).") from error
+    with file_written_whole(job.out) as fresh:
+        fresh.write_text(text, encoding="utf-8")
 
 
 def _draw(evaluation: Evaluation, path: Path) -> None:
@@ -331,22 +337,23 @@ def _draw(evaluation: Evaluation, path: Path) -> None:
             "Check the alignment."
         )
     bins, percent = surface.calibration.bins, 100 / surface.diagonal
-    draw_calibration(
-        [percent * one.expected for one in bins],
-        [percent * one.root_mean_square for one in bins],
-        [percent * one.robust for one in bins],
-        "% of the diagonal",
-        path,
-    )
+    with file_written_whole(path) as fresh:
+        draw_calibration(
+            [percent * one.expected for one in bins],
+            [percent * one.root_mean_square for one in bins],
+            [percent * one.robust for one in bins],
+            "% of the diagonal",
+            fresh,
+        )
 
 
-def _check_writable(path: Path) -> None:
-    """Refuse, before the work, a file that cannot be written.
+def _prepare_files(job: Job) -> None:
+    """Refuse, before the work and before writing, files that are not ours to replace.
 
     Raises:
-        OutputError: The path is a folder, or lies in none.
+        OutputError: As :func:`pimper_torch.io.files.prepare_file`.
     """
-    if path.is_dir():
-        raise OutputError(f"{path}: is a folder; needed: the name of a file.")
-    if not path.resolve().parent.is_dir():
-        raise OutputError(f"{path}: its folder is not there. Make it, or write elsewhere.")
+    if job.out is not None:
+        prepare_file(job.out, job.overwrite, lambda file: says_of_itself(file, "format", FORMAT))
+    if job.calibration is not None:
+        prepare_file(job.calibration, job.overwrite, lambda file: is_titled(file, TITLE))

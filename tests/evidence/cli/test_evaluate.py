@@ -90,6 +90,61 @@ def test_expected_against_true_error_is_drawn(ball, tmp_path, capsys):
     assert "folder is not there" in capsys.readouterr().err
 
 
+def test_only_what_evaluate_wrote_is_replaced_and_only_on_demand(ball, tmp_path, capsys):
+    mesh = read_mesh(ball)
+    write_ply(mesh.replace(expected_error=0.05 * (2 + mesh.vertices_world[:, 2])), ball)
+    out, drawing = tmp_path / "report.json", tmp_path / "calibration.png"
+    larger = sphere(tmp_path / "larger.ply", 1.1)
+    both = ["-o", out, "--calibration", drawing, "--samples"]
+    assert run(ball, larger, *both, 3000) == 0
+    first = out.read_bytes(), drawing.read_bytes()
+    capsys.readouterr()
+    assert run(ball, larger, *both, 2000) == 2
+    assert f"{out}: is there already" in capsys.readouterr().err
+    assert (out.read_bytes(), drawing.read_bytes()) == first
+    assert run(ball, larger, *both, 2000, "--overwrite") == 0
+    assert json.loads(out.read_text())["settings"]["samples"] == 2000
+    assert drawing.read_bytes() != first[1]
+
+    mine = tmp_path / "mine.json"
+    mine.write_text('{"thesis": "years of work"}')
+    picture = tmp_path / "mine.png"
+    Image.new("L", (3, 3)).save(picture)
+    (tmp_path / "link").symlink_to(mine)
+    for option, path in (
+        ("-o", mine),
+        ("-o", ball),
+        ("-o", tmp_path / "link"),
+        ("-o", drawing),
+        ("--calibration", picture),
+        ("--calibration", out),
+    ):
+        before = path.read_bytes()
+        assert run(ball, larger, option, path, "--overwrite") == 2
+        assert "was not written by this command" in capsys.readouterr().err
+        assert path.read_bytes() == before
+    assert run(ball, larger, "-o", "/dev/null", "--overwrite") == 2
+    assert "is no ordinary file" in capsys.readouterr().err
+    assert run(ball, larger, "-o", tmp_path / ("x" * 300)) == 2
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_a_disk_that_is_full_leaves_the_former_report(ball, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "report.json"
+    assert run(ball, ball, "--samples", 500, "-o", out) == 0
+    before = out.read_bytes()
+
+    def full(path, *_, **__):
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(out), "write_text", full)
+    assert run(ball, ball, "--samples", 600, "-o", out, "--overwrite") == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert out.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "report.json"]
+
+
 def test_views_may_be_named(rendering, tmp_path, capsys):
     result, out = rendering / "truth" / "mesh.ply", tmp_path / "report.json"
     views = ["--views", "view_000.png", "view_002"]
