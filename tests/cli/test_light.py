@@ -48,6 +48,8 @@ REFUSED = [
     ["bench", "-o", "photos"],
     ["convert", "nowhere", "-o", "out", "--source", "idr", "--target", "colmap"],
     ["gamma", "nowhere"],
+    ["clean", "photos"],
+    ["clean", "nowhere"],
     ["gamma", "photos", "--mask", "nowhere"],
 ]
 

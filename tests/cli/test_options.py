@@ -67,6 +67,7 @@ RUNS = {
         "{photos} --max-size-px 48 --photographs.response linear --photographs.saturation 250 "
         "--photographs.black 2"
     ],
+    "clean": ["{scene}"],
     "gamma": ["{photos} --mask {masks}/view_000.png --rank 3 --max-size-px 40"],
 }
 TINY = "--num-views 2 --width 32 --height 24 --processes 1"

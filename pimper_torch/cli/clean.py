@@ -1,0 +1,52 @@
+"""``pimper clean``: the room that interrupted runs take."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pimper_torch.cli.arguments import read_arguments
+from pimper_torch.cli.output import Output
+from pimper_torch.io.clean import clean_output, require_cleanable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    out: Path
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``clean``, and tell how much was freed.
+
+    Raises:
+        OutputError: A folder that is not ours, or that a run holds.
+    """
+    job = checked(command, arguments)
+    freed = clean_output(job.out)
+    output.remark(f"{job.out}: {freed / 1e6:.1f} MB freed.")
+    output.result({"folder": job.out}, freed_bytes=freed)
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and refuse a folder that is not ours.
+
+    Raises:
+        OutputError: The folder.
+        SystemExit: ``--help`` was answered.
+    """
+
+    def clean(out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]) -> _Job:
+        """Remove what a run into OUT kept to go on from, and what killed runs left beside it.
+
+        The result itself stays.
+
+        Args:
+            out: Folder that was given to a run as `-o OUT`.
+        """
+        return _Job(out=out)
+
+    job = read_arguments(clean, command, arguments)
+    require_cleanable(job.out)
+    return job

@@ -1,0 +1,79 @@
+"""Cleaning removes what runs kept and left, and neither results nor what somebody else wrote."""
+
+import subprocess
+import sys
+
+import pytest
+
+from pimper_torch.cli.main import main
+from pimper_torch.errors import OutputError
+from pimper_torch.io.clean import clean_output
+from pimper_torch.io.folders import held_output, written_whole
+from pimper_torch.io.marker import MARKER, STAGES
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from pimper_torch.io.folders import held_output, written_whole
+folder = Path(sys.argv[1])
+with held_output(folder, "result", overwrite=True):
+    (folder / ".stages" / "mesh.pt").write_bytes(bytes(3_000_000))
+    with written_whole(folder, "result", overwrite=True) as filled:
+        (filled / "mesh.ply").write_bytes(bytes(2_000_000))
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def kill_a_run(folder):
+    ran = subprocess.run([sys.executable, "-c", KILLED, str(folder)])
+    assert ran.returncode == -9
+
+
+def held(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("former", [True, False])
+def test_what_a_killed_run_kept_and_left_is_removed(tmp_path, capsys, former):
+    out = tmp_path / "out"
+    if former:
+        with written_whole(out, "result") as filled:
+            (filled / "mesh.ply").write_text("whole")
+    kill_a_run(out)
+    assert STAGES in held(out)
+    assert len(held(tmp_path)) == 2  # and a hidden folder
+    assert main(["clean", str(out)]) == 0
+    assert "5.0 MB freed" in capsys.readouterr().out
+    assert held(tmp_path) == ["out"]
+    assert held(out) == ([MARKER, "mesh.ply"] if former else [])
+    if former:
+        assert (out / "mesh.ply").read_text() == "whole"
+        assert main(["clean", str(out)]) == 0  # again: there is nothing to remove
+        assert "0.0 MB freed" in capsys.readouterr().out
+
+
+def test_leftovers_are_found_where_the_folder_is_gone(tmp_path):
+    kill_a_run(tmp_path / "out")
+    for path in sorted((tmp_path / "out").rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    (tmp_path / "out").rmdir()
+    assert clean_output(tmp_path / "out") > 2_000_000
+    assert held(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["mine", "nowhere", "file", "mine/.stages"])
+def test_a_folder_that_is_not_ours_is_refused(tmp_path, name):
+    (tmp_path / "mine" / STAGES).mkdir(parents=True)
+    (tmp_path / "mine" / STAGES / "act_one.txt").write_text("a play")
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="needed: the folder"):
+        clean_output(tmp_path / name)
+    assert (tmp_path / "mine" / STAGES / "act_one.txt").exists()
+
+
+def test_a_folder_that_is_held_is_refused(tmp_path):
+    with held_output(tmp_path / "out", "result"):
+        (tmp_path / "out" / STAGES / "mesh.pt").touch()
+        with pytest.raises(OutputError, match="another run writes there"):
+            clean_output(tmp_path / "out")
+        assert (tmp_path / "out" / STAGES / "mesh.pt").exists()
