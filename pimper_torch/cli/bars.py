@@ -68,9 +68,8 @@ class Bars:
         if self._task is not None:
             self._progress.update(self._task, completed=1, total=1, found=found)
         if not self.console.is_terminal:
-            self.console.print(
-                f"{report.name:<12} {report.seconds:7.1f} s  {found}", highlight=False
-            )
+            took = "     kept" if report.kept else f"{report.seconds:7.1f} s"
+            self.console.print(f"{report.name:<12} {took}  {found}", highlight=False)
         self._task = None
 
 

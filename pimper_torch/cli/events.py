@@ -40,4 +40,5 @@ class Events:
             seconds=round(report.seconds, 3),
             peak_memory_mb=round(report.peak_memory_mb, 1),
             figures=report.figures,
+            kept=report.kept,
         )

@@ -31,7 +31,8 @@ class Output:
 
     - ``start``: ``command``, ``arguments``, ``versions``, ``format`` (1).
     - ``stage-begin``: ``stage``. ``progress``: ``stage``, ``done``, ``total``.
-    - ``stage-end``: ``stage``, ``seconds``, ``peak_memory_mb``, ``figures``.
+    - ``stage-end``: ``stage``, ``seconds``, ``peak_memory_mb``, ``figures``, and ``kept``,
+      whether an earlier run found the record; time and memory are that run's then.
     - ``warning``: ``message``. ``finding``, of ``doctor``: ``check``, ``severity``, ``found``,
       ``needed``, ``advice``.
     - ``result``: ``paths`` by name, and figures of the command.

@@ -13,10 +13,13 @@ from pimper_torch.cli.output import Output, stage
 from pimper_torch.doctor.examine import examine_views
 from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.io.folders import held_output
+from pimper_torch.io.marker import STAGES
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
+from pimper_torch.memory import bytes_of
 from pimper_torch.records import Reconstruction, Views
+from pimper_torch.store import Store
 from pimper_torch.viz.overview import headline
 
 
@@ -36,12 +39,20 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             figure("photographs", views.num_views)
         _examine(job, views)
         mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
-        result = make_chain(job.config, observer, common.cache)(
+        result = make_chain(job.config, observer, _store(job))(
             views.to(common.device), job.inputs.sparse, mesh
         )
         with stage(observer, "write"):
             _write(job, result)
     _conclude(output, job, result)
+
+
+def _store(job: Job) -> Store:
+    """Give the folder that every stage's record is kept in."""
+    common = job.common
+    folder = common.cache or job.out / STAGES
+    max_bytes = bytes_of(common.max_kept)
+    return Store(folder=folder, max_bytes=max_bytes, fresh=common.fresh)
 
 
 def _read(job: Job) -> Views:
@@ -113,7 +124,9 @@ def _costs(result: Reconstruction) -> str:
     return "\n".join(
         ["stage             seconds   peak MB"]
         + [
-            f"{report.name:<16}{report.seconds:9.1f}{report.peak_memory_mb:10.0f}"
+            f"{report.name:<16}"
+            + ("     kept" if report.kept else f"{report.seconds:9.1f}")
+            + f"{report.peak_memory_mb:10.0f}"
             for report in result.report
         ]
     )

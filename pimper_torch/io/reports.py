@@ -155,6 +155,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
                 "name": report.name,
                 "seconds": report.seconds,
                 "peak_memory_mb": report.peak_memory_mb,
+                "kept": report.kept,
                 **{key: _finite(value) for key, value in report.figures.items()},
             }
             for report in result.report

@@ -1,6 +1,7 @@
 """A folder of records that runs find again."""
 
 import json
+import math
 import os
 import secrets
 import time
@@ -18,7 +19,6 @@ from pimper_torch.store.settled import settled
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
-MAX_BYTES = 8 * 2**30
 _RECORD, _ABOUT = ".safetensors", ".json"
 _FORMAT = 1
 # Seconds after which a file that was never finished belongs to a run that is no more.
@@ -53,7 +53,7 @@ class Store:
     """
 
     folder: Path | str
-    max_bytes: int = MAX_BYTES
+    max_bytes: float = math.inf
     fresh: bool = False
 
     def find(self, key: str, cls: type[AnyRecord]) -> Kept[AnyRecord] | None:

@@ -25,7 +25,7 @@ def chain(reconstruction, monkeypatch):
         given = None
 
         def __init__(self, config, observer, cache):
-            self.config, self.observer, self.cache = config, observer, cache
+            self.config, self.observer, Chain.cache = config, observer, cache
 
         def __call__(self, views, sparse_model=None, mesh=None):
             Chain.given = (self.config, views, sparse_model)

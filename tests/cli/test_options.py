@@ -17,6 +17,7 @@ from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.io import results
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Mesh
+from pimper_torch.store import Store
 
 # What each option is given; {names} are places in the folder of `world`.
 RUNS = {
@@ -24,12 +25,13 @@ RUNS = {
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
         "--full-mesh --max-memory 20GB --scales (0.5,) --kernels torch --preset {preset} "
         "--reference view_002 --max-size-px 48 --overwrite "
-        "--cache {out}_kept --object masks --mask-object bright "
+        "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0)"
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
-        "--overwrite --full-mesh --cache {out}_kept --kernels numba --max-memory 20GB",
+        "--overwrite --full-mesh --fresh --cache {out}_kept --max-kept 1.5GB --kernels numba "
+        "--max-memory 20GB",
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
@@ -128,6 +130,13 @@ def test_every_option_of_the_demo_reaches_the_chain(chain, tmp_path):
     assert config.coarse_surface.reference == "38"
     assert config.scales == (0.5,)
     assert max(views.images.shape[-2:]) == 60
+    kept = tmp_path / "out_kept"
+    assert chain.cache == Store(folder=kept, max_bytes=1.5e9, fresh=True)
+
+
+def test_what_stages_find_is_kept_in_the_folder_of_the_result(chain, photos, tmp_path):
+    assert main(["reconstruct", str(photos), "-o", str(tmp_path / "out")]) == 0
+    assert chain.cache == Store(folder=tmp_path / "out" / ".stages", max_bytes=8e9)
 
 
 def test_the_reference_reaches_every_stage_that_has_one():

@@ -1,0 +1,224 @@
+"""Kill runs at random moments, and see that nothing is lost and that each goes on to the same bits.
+
+    python tests/kill/runs.py --count 50 --seed 0
+
+A run is ended by SIGKILL, by a full disk, or by too little memory, as often into a folder that is
+new as into one that holds a former result. Then: the former result is whole, or the new one; the
+same command, undisturbed, ends with the files of a run that never was disturbed, byte for byte;
+and no hidden folder is left beside it.
+
+Runs are forked from a process that has everything loaded; they take a second or two.
+"""
+
+import argparse
+import contextlib
+import hashlib
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ[name] = "1"  # a process that is forked must have one thread
+
+ENDINGS = ("killed", "disk", "memory")
+# What tells times, and so differs from run to run.
+TIMED = ("summary.json", "overview.png", ".pimper.json")
+SETTINGS = ("--preset", "fast")
+FORMER = (*SETTINGS, "--full-mesh", "--factorize.light-prior", "3")
+DISK_MB = 24  # the kept stages of a run take 3 MB, a former result and a new one 1 MB each
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a run ended, and what was wrong after it."""
+
+    ending: str
+    over_former: bool
+    moment: float
+    exit_code: int
+    kept: int
+    faults: tuple[str, ...]
+
+
+def main() -> int:
+    """Print a line a run; 1 where one lost or changed something."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--count", type=int, default=50)
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--endings", nargs="+", choices=ENDINGS, default=ENDINGS)
+    given = options.parse_args()
+    failed = 0
+    with tempfile.TemporaryDirectory(prefix="pimper-kill-") as folder:
+        for number, ended in enumerate(
+            ended_runs(Path(folder), given.count, given.seed, given.endings)
+        ):
+            where = "over a former result" if ended.over_former else "into a new folder"
+            print(
+                f"{number:3} {ended.ending:7} at {ended.moment:5.2f} {where:20} "
+                f"exit {ended.exit_code:4}, {ended.kept} stages kept: "
+                f"{'; '.join(ended.faults) or 'the same bits'}",
+                flush=True,
+            )
+            failed += bool(ended.faults)
+    print(f"{given.count} runs, {failed} of them lost or changed something")
+    return int(failed > 0)
+
+
+def ended_runs(
+    folder: Path, count: int, seed: int, endings: tuple[str, ...] = ENDINGS
+) -> Iterator[Ended]:
+    """Render a scene, run once undisturbed, then end runs at random moments."""
+    scene, random_moments = folder / "scene", random.Random(seed)
+    small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1 --seed 1"
+    assert forked(["render", "balls", "-o", str(scene), *small.split()]) == 0
+    inputs = [str(scene / "photos"), "--sparse", str(scene / "truth" / "sparse")]
+    command = ["reconstruct", *inputs]
+    whole, former = folder / "whole", folder / "former"
+    assert forked([*command, "-o", str(former), *FORMER]) == 0
+    forked([*command, "-o", str(folder / "first"), *SETTINGS])  # what is loaded once
+    began = time.perf_counter()
+    assert forked([*command, "-o", str(whole), *SETTINGS]) == 0
+    seconds = time.perf_counter() - began
+    for number in range(count):
+        ending, over_former = endings[number % len(endings)], random_moments.random() < 0.5
+        moment = random_moments.random()
+        with place(folder / f"run{number}", ending) as home:
+            out = home / "out"
+            if over_former:
+                copied(former, out)
+            line = [*command, "-o", str(out), *SETTINGS, *(["--overwrite"] * over_former)]
+            code = forked(line, disturbance(ending, moment, seconds, home))
+            faults = list(half_replaced(out, (whole, former) if over_former else (whole,)))
+            kept = len(list((out / ".stages").glob("*.safetensors")))
+            relieve(home)
+            again = forked([*command, "-o", str(out), *SETTINGS, "--overwrite"])
+            faults += [] if again == 0 else [f"the next run exits with {again}"]
+            faults += [f"{name} differs" for name in unlike(out, whole)]
+            hidden = sorted(path.name for path in home.iterdir() if path != out)
+            faults += [f"left beside it: {', '.join(hidden)}"] if hidden else []
+        yield Ended(ending, over_former, moment, code, kept, tuple(faults))
+
+
+@contextlib.contextmanager
+def place(home: Path, ending: str) -> Iterator[Path]:
+    """Give a folder for a run, on a small disk of its own where one is to be full."""
+    home.mkdir()
+    mounted = ending == "disk" and mount(home)
+    try:
+        yield home
+    finally:
+        if mounted:
+            subprocess.run(["umount", "-l", str(home)], check=True)
+
+
+def mount(home: Path) -> bool:
+    """Mount a disk in memory; False where that is not allowed."""
+    size = f"size={DISK_MB}m"
+    ran = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(home)], capture_output=True
+    )
+    return ran.returncode == 0
+
+
+Disturbance = tuple[Callable[[], None], float | None]
+
+
+def disturbance(ending: str, moment: float, seconds: float, home: Path) -> Disturbance:
+    """Give what a run does before it begins, and the seconds after which it is killed."""
+    if ending == "killed":
+        return (lambda: None), moment * seconds
+    if ending == "memory":  # of what the stages take on top of what is loaded
+        return (lambda: limit_memory(int(moment * 400e6))), None
+    if home.is_mount():
+        (home / "ballast").write_bytes(bytes(int((DISK_MB - 1 - 4 * moment) * 2**20)))
+        return (lambda: None), None
+    return (lambda: limit_files(int(moment * 1e6))), None
+
+
+def relieve(home: Path) -> None:
+    """Make room again."""
+    (home / "ballast").unlink(missing_ok=True)
+
+
+def limit_memory(more: int) -> None:
+    """Limit the address space to what is used, and some bytes more."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + more,) * 2)
+
+
+def limit_files(size: int) -> None:
+    """Refuse files that are larger, as a full disk does."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+def forked(line: list[str], disturbed: Disturbance = ((lambda: None), None)) -> int:
+    """Carry out a command in a process of its own; minus a signal's number where one ended it."""
+    from pimper_torch.cli.main import main
+
+    prepare, seconds = disturbed
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        quiet = os.open(os.devnull, os.O_WRONLY)
+        for stream in (1, 2):
+            os.dup2(quiet, stream)
+        code = 70
+        try:
+            prepare()
+            code = main(line)
+        finally:
+            os._exit(code)
+    if seconds is not None:
+        time.sleep(seconds)
+        os.kill(child, signal.SIGKILL)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def copied(source: Path, target: Path) -> None:
+    """Copy a result without what is kept for the next run."""
+    subprocess.run(["cp", "-r", str(source), str(target)], check=True)
+    subprocess.run(["rm", "-rf", str(target / ".stages")], check=True)
+
+
+def half_replaced(out: Path, results: tuple[Path, ...]) -> Iterator[str]:
+    """Tell what is wrong with a folder that should hold one of some results, or nothing new."""
+    visible = [path for path in out.iterdir() if path.name != ".stages"] if out.exists() else []
+    if not visible:
+        if len(results) > 1:
+            yield "the former result is gone"
+        return
+    if all(unlike(out, result) for result in results):
+        yield "what is there is neither the former result nor the new one"
+    names = json.loads((out / ".pimper.json").read_text())
+    if not names:
+        yield "its list is empty"
+
+
+def unlike(out: Path, other: Path) -> list[str]:
+    """Name the files that are not the same in two results, but for those that tell times."""
+    one, two = hashes(out), hashes(other)
+    return sorted(name for name in one.keys() | two.keys() if one.get(name) != two.get(name))
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """Hash every file of a result; those that tell times count as being there."""
+    files = [path for path in folder.rglob("*") if path.is_file()] if folder.exists() else []
+    return {
+        name: "" if name in TIMED else hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+        if not (name := path.relative_to(folder).as_posix()).startswith(".stages/")
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())
