@@ -49,6 +49,7 @@ ROOMS = [
     "cli",
     "single_view",
     "evidence",
+    "__main__",
 ]
 
 SOLE_IMPORTERS = {

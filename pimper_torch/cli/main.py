@@ -3,24 +3,27 @@
 What takes long to import is imported when a command needs it.
 
 Exit codes: 0 where the command did what it was asked for; 2 for what the user can correct, in one
-paragraph; 130 when interrupted; 1 for anything unexpected, which is a fault of the package.
+paragraph; 130 when interrupted, 143 when terminated; 1 for anything unexpected, which is a fault of
+the package. :mod:`pimper_torch.cli.supervise` gives 128 and the number of the signal where the
+process was killed.
 """
 
 import difflib
+import errno
+import io
 import os
-import signal
 import sys
-import tempfile
 import traceback
-import types
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from typing import TextIO
 
+from pimper_torch.cli.faults import write_report
 from pimper_torch.cli.output import Output, split
-from pimper_torch.errors import PimperError, PimperWarning
+from pimper_torch.cli.stopping import exit_code, stoppable
+from pimper_torch.errors import InputError, PimperError, PimperWarning
 
 _HELP = """\
 usage: pimper reconstruct PHOTOS -o OUT [options]
@@ -51,7 +54,8 @@ albedo and light.
 
 `pimper COMMAND --help` tells the options, `--help-all` those of every stage, too.
 
-Exit codes: 0 success, 2 bad input, 130 interrupted, 1 unexpected.
+Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpected; 130 interrupted;
+143 terminated; 137 killed and 139 crashed, as a rule for want of memory.
 """
 # Where each is carried out, and where its arguments are read if that is elsewhere.
 _COMMANDS = {
@@ -68,19 +72,32 @@ _COMMANDS = {
 }
 _READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}
 _LIGHT = ("config",)  # carried out without torch, too
-_UNEXPECTED, _BAD_INPUT, _INTERRUPTED = 1, 2, 130
+_UNEXPECTED, _BAD_INPUT = 1, 2
+_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
+# What no program can help.
+_REFUSALS = (
+    *_FULL,
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG, errno.ELOOP),
+    *(errno.EMFILE, errno.ENFILE, errno.ENOMEM),
+)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+def main(arguments: Sequence[str] | None = None, *, supervised: bool = False) -> int:
+    """Run the command line in this process.
+
+    Args:
+        arguments: Those of the process unless given.
+        supervised: Whether another process ends this one on a second signal to stop.
 
     Returns:
-        0 for success; 2 for anything the user can correct, in one paragraph; 130 when interrupted;
-        1 for anything unexpected, whose traceback is kept in a file.
+        0 for success; 2 for anything the user can correct, in one paragraph; 130 when interrupted,
+        143 when terminated; 1 for anything unexpected, whose traceback is kept in a file.
     """
+    if arguments is None:
+        _print_anything()
     try:
         try:
-            return _main(arguments)
+            return _main(arguments, supervised)
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # as of `pimper --help | head`: whoever reads has read enough
@@ -88,7 +105,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _main(arguments: Sequence[str] | None) -> int:
+def _print_anything() -> None:
+    """Let no character be one that cannot be printed."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _main(arguments: Sequence[str] | None, supervised: bool) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] in ("-h", "--help", "--help-all"):
         sys.stdout.write(_HELP)
@@ -108,11 +132,11 @@ def _main(arguments: Sequence[str] | None) -> int:
         text = f"there is no command `{given[0]}`.{hint} See `pimper --help`."
         output.error("ConfigError", text, _BAD_INPUT)
         return _BAD_INPUT
-    with _readable_warnings(output), _terminable():
-        return _run(given[0], rest, output)
+    with _readable_warnings(output):
+        return _run(given[0], rest, output, supervised)
 
 
-def _run(command: str, arguments: list[str], output: Output) -> int:
+def _run(command: str, arguments: list[str], output: Output, supervised: bool) -> int:
     # Read when torch is loaded. Threads that spin while they wait take the processor from
     # those they wait for when the machine is busy, and many small steps then take ten times
     # as long.
@@ -123,6 +147,7 @@ def _run(command: str, arguments: list[str], output: Output) -> int:
 
     home = _COMMANDS[command]
     try:
+        _refuse_names(arguments)
         _refuse_at_once(_READERS.get(home, home), command, arguments)
         if output.as_json:
             from pimper_torch.io.version import versions
@@ -131,7 +156,8 @@ def _run(command: str, arguments: list[str], output: Output) -> int:
                 "start", command=command, arguments=arguments, versions=versions(), format=1
             )
         run = light(home, "run") if command in _LIGHT else import_module(home).run
-        run(command, arguments, output)
+        with stoppable(repeat=not supervised):
+            run(command, arguments, output)
     except (Exception, KeyboardInterrupt) as error:
         return _failed(output, error)
     return 0
@@ -144,22 +170,52 @@ def _failed(output: Output, error: BaseException) -> int:
         raise error
     if output.shows("debug"):
         traceback.print_exception(error)
-    if isinstance(error, PimperError):
-        output.error(kind, str(error), _BAD_INPUT)
-        return _BAD_INPUT
+    notes = "".join(f" {note}" for note in getattr(error, "__notes__", ()))
     if isinstance(error, KeyboardInterrupt):
-        output.error("Interrupted", "interrupted; nothing was written.", _INTERRUPTED)
-        return _INTERRUPTED
-    with tempfile.NamedTemporaryFile(
-        "w", prefix="pimper-", suffix=".txt", delete=False, encoding="utf-8"
-    ) as file:
-        traceback.print_exception(error, file=file)
+        code = exit_code(error)
+        output.error("Interrupted", f"interrupted; no result was written.{notes}", code)
+        return code
+    expected = str(error) if isinstance(error, PimperError) else _of_the_world(error)
+    if expected is not None:
+        output.error(kind, expected + notes, _BAD_INPUT)
+        return _BAD_INPUT
+    report = write_report(error)
+    if report is None:
+        traceback.print_exception(error)
     text = (
-        f"unexpected {kind}: {str(error).rstrip('.')}. This is a fault of pimper_torch; nothing "
-        f"was written. {file.name} holds the traceback: please report it with `pimper --version`."
+        f"unexpected {kind}: {str(error).rstrip('.')}. This is a fault of pimper_torch; no result "
+        f"was written.{notes} {report or 'Above'} is what a report needs: please send it."
     )
     output.error(kind, text, _UNEXPECTED)
     return _UNEXPECTED
+
+
+def _of_the_world(error: BaseException) -> str | None:
+    """Tell of an error that is no fault of the package what to do; ``None`` of any other."""
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+        return (
+            "memory ran out; no result was written. Shrink the photographs (`--max-size-px`), "
+            "close other programs, or give `--max-memory` to be told beforehand."
+        )
+    if isinstance(error, OSError) and error.errno in _REFUSALS:
+        place = "" if error.filename is None else f"{error.filename}: "
+        advice = " Make room." if error.errno in _FULL else ""
+        return f"{place}the system refuses ({error.strerror}); no result was written.{advice}"
+    return None
+
+
+def _refuse_names(arguments: Sequence[str]) -> None:
+    """Refuse, before any work, names that libraries cannot be told.
+
+    Raises:
+        InputError: One is not UTF-8.
+    """
+    for argument in arguments:
+        try:
+            argument.encode("utf-8")
+        except UnicodeEncodeError as error:
+            shown = argument.encode("utf-8", "backslashreplace").decode()
+            raise InputError(f"{shown}: the name is not UTF-8; needed: one that is.") from error
 
 
 def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:
@@ -203,21 +259,3 @@ def _readable_warnings(output: Output) -> Iterator[None]:
 
         warnings.showwarning = show
         yield
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """Let a polite kill clean up as Ctrl-C does."""
-
-    def interrupt(number: int, frame: types.FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        former = signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:  # not in the main thread, where no signals arrive
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, former)

@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from types import FrameType
 from typing import Any, Literal
 
 from pimper_torch.errors import caution
@@ -185,16 +186,31 @@ def remove_leftovers(target: Path) -> None:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Let signals wait until the block ends, where the system can."""
-    if not hasattr(signal, "pthread_sigmask"):
+    """Let signals that stop the process wait until the block ends.
+
+    Blocking them would not do: another thread would receive them.
+    """
+    waiting: list[int] = []
+
+    def later(number: int, frame: FrameType | None) -> None:
+        waiting.append(number)
+
+    former = {}
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(number)
+            if callable(handler):
+                former[number] = signal.signal(number, later)
+    except ValueError:  # not in the main thread, where no signals arrive
         yield
         return
-    stopping = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
-    former = signal.pthread_sigmask(signal.SIG_BLOCK, stopping)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, former)
+        for number, handler in former.items():
+            signal.signal(number, handler)
+        for told in waiting[:1]:
+            signal.raise_signal(told)
 
 
 def _made(target: Path) -> Path:

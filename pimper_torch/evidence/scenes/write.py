@@ -17,7 +17,10 @@ file                            what
 
 import json
 import multiprocessing
+import os
 import pickle
+import signal
+import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -112,7 +115,8 @@ def _render_all(scene: Scene, folder: Path, processes: int) -> None:
         initializer=_open_studio,
         initargs=(packed,),
     ) as pool:
-        taken = [pool.submit(_take, view) for view in range(total)]
+        with _deaf():
+            taken = [pool.submit(_take, view) for view in range(total)]
         try:
             for done, one in enumerate(as_completed(taken), start=1):
                 one.result()
@@ -159,8 +163,30 @@ _studio: _Studio | None = None  # of this process
 
 def _open_studio(packed: bytes) -> None:
     global _studio
+    threading.Thread(target=_leave_with_the_parent, daemon=True).start()
     torch.set_num_threads(1)
     _studio = _Studio(*pickle.loads(packed))  # our own, from the parent process
+
+
+def _leave_with_the_parent() -> None:
+    """End this process when the one that started it is killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Let processes that are started in the block not hear Ctrl-C: their parent ends them."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
 
 def _take(view: int) -> None:

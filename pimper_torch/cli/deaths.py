@@ -1,0 +1,89 @@
+"""What is told of a process that was killed or crashed."""
+
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from pimper_torch.cli.faults import write_report
+from pimper_torch.cli.output import Output
+from pimper_torch.io.marker import STAGES
+from pimper_torch.io.stages import kept
+
+_CRASHES = ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGTRAP", "SIGSYS")
+_LESS = (
+    "Shrink the photographs (`--max-size-px`), close other programs, or give `--max-memory` to be "
+    "told before the surface takes too much."
+)
+
+
+def tell_death(number: int, said: str) -> int:
+    """Tell why the work ended, what to do, and what is kept.
+
+    Args:
+        number: Of the signal that ended it.
+        said: What native libraries said before.
+
+    Returns:
+        The exit code.
+    """
+    code = 128 + number
+    name = signal.Signals(number).name if number in {*signal.Signals} else f"signal {number}"
+    text = f"{_what(name)}{_limit()} {_LESS}{_kept(sys.argv[1:])}"
+    if name in _CRASHES:
+        report = write_report(f"{name}\n{said}")
+        if report is not None:
+            text += f" If memory was not the reason, please report {report}."
+    Output(as_json="--json" in sys.argv).error("Killed", text, code)
+    return code
+
+
+def _what(name: str) -> str:
+    if name == "SIGKILL":
+        return (
+            "the run was killed by the system or by somebody (SIGKILL), most likely because memory "
+            "ran out."
+        )
+    if name in _CRASHES:
+        return (
+            f"the run crashed in a native library ({name}), most likely because memory ran out "
+            "there."
+        )
+    return f"the run was ended by {name}."
+
+
+def _limit() -> str:
+    """Name the limit of this process's memory, if there is one."""
+    try:
+        import resource
+    except ImportError:  # as on Windows
+        return ""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return "" if limit == resource.RLIM_INFINITY else f" It may take {limit / 1e9:.1f} GB at most."
+
+
+def _kept(arguments: Sequence[str]) -> str:
+    """Tell what the folder of the result keeps, as far as the arguments name it."""
+    out = folder_of(arguments)
+    if out is None or not out.is_dir():
+        return " No result was written."
+    if not kept(out):
+        return " No result was written, and what was there before is there still."
+    return (
+        f" What was finished is kept in {out / STAGES}: the same command goes on from there, and "
+        f"`pimper clean {out}` removes it."
+    )
+
+
+def folder_of(arguments: Sequence[str]) -> Path | None:
+    """Find the folder for the result in a command line.
+
+    >>> folder_of(["reconstruct", "photos", "-o", "out"]).name
+    'out'
+    """
+    for index, argument in enumerate(arguments):
+        name, equals, value = argument.partition("=")
+        if name in ("-o", "--out"):
+            value = value if equals else "".join(arguments[index + 1 : index + 2])
+            return Path(value) if value else None
+    return Path("pimper_demo") if arguments[:1] == ["demo"] else None

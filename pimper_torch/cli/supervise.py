@@ -1,0 +1,164 @@
+"""The console's ``pimper``: a light process that watches the one that does the work.
+
+What kills the work, as a system without memory does, leaves the watcher, which says so. It passes
+on signals, and a second Ctrl-C ends the work at once. Where processes cannot be forked, as on
+Windows, there is one process alone.
+"""
+
+import os
+import signal
+import sys
+import time
+import types
+from contextlib import suppress
+
+from pimper_torch.cli.stopping import SIGNALS, heed, leave_at_once, say
+
+_PR_SET_PDEATHSIG = 1  # Linux: sys/prctl.h
+# One press of Ctrl-C reaches both processes, one of them twice; nobody presses so fast.
+_SAME_PRESS_SECONDS = 0.3
+_PATIENCE_SECONDS = 2.0
+_TAIL_BYTES = 100_000
+
+
+def main() -> int:
+    """Run the command line in a process of its own, and give its exit code.
+
+    Returns:
+        As :func:`pimper_torch.cli.main.main`; 128 and the number of the signal where the work was
+        killed.
+    """
+    if not hasattr(os, "fork"):
+        from pimper_torch.cli.main import main as carry_out
+
+        return carry_out()
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started this
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - for good
+    heed(leave_at_once)
+    said = _hidden_file()
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    watcher = os.getpid()
+    worker = os.fork()
+    if worker == 0:
+        return _work(watcher, said)
+    watch = _Watch(worker=worker)
+    heed(watch.heard)
+    signal.signal(signal.SIGALRM, watch.waited)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    _, status = os.waitpid(worker, 0)  # signals are heard while this waits
+    if os.WIFEXITED(status):
+        return os.WEXITSTATUS(status)
+    number = os.WTERMSIG(status)
+    if watch.killed:
+        code = 128 + watch.first
+        say("ended at once; what is left beside the result is removed by the next run.", code)
+        return code
+    from pimper_torch.cli.deaths import tell_death
+
+    return tell_death(number, _tail(said))
+
+
+class _Watch:
+    """What the watcher knows.
+
+    Attributes:
+        worker: The process that does the work.
+        first: Number of the first signal that told to stop; 0 before.
+        since: When that was.
+        killed: Whether the worker was ended at once.
+    """
+
+    def __init__(self, worker: int) -> None:
+        self.worker, self.first, self.since, self.killed = worker, 0, 0.0, False
+
+    def heard(self, number: int, frame: types.FrameType | None) -> None:
+        """Pass a signal on; a second one ends the worker at once."""
+        now = time.monotonic()
+        if self.first and now - self.since > _SAME_PRESS_SECONDS:
+            self.killed = True
+            number = signal.SIGKILL
+        elif not self.first:
+            self.first, self.since = number, now
+            signal.setitimer(signal.ITIMER_REAL, _PATIENCE_SECONDS)
+        with suppress(ProcessLookupError):  # it has just ended
+            os.kill(self.worker, number)
+
+    def waited(self, number: int, frame: types.FrameType | None) -> None:
+        """Tell that the worker is still busy with what cannot be interrupted."""
+        with suppress(OSError):  # the terminal is closed
+            os.write(2, b"stopping after this step; Ctrl-C again ends it at once.\n")
+
+
+def _work(watcher: int, said: int | None) -> int:
+    """Carry out the command, and end when the watcher does."""
+    _die_with(watcher)
+    heed(leave_at_once)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    if said is not None and "debug" not in sys.argv and "--log-level=debug" not in sys.argv:
+        _keep_apart(said)
+    from pimper_torch.cli.main import main as carry_out
+
+    code = carry_out(supervised=True)
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)  # nothing is left to stop
+    if code > 128:  # interrupted: whoever waits does not wait for libraries to tidy up
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _die_with(watcher: int) -> None:
+    """End this process when the watcher is killed, so that nobody works unwatched."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != watcher:  # killed already
+            os._exit(128 + signal.SIGKILL)
+        return
+    import threading
+
+    def look() -> None:
+        while os.getppid() == watcher:
+            time.sleep(1.0)
+        os._exit(128 + signal.SIGKILL)
+
+    threading.Thread(target=look, daemon=True).start()
+
+
+def _keep_apart(said: int) -> None:
+    """Send what native libraries say on standard error to a file, and keep Python's where it is.
+
+    A crash writes there where every thread was.
+    """
+    import faulthandler
+
+    shown = os.dup(2)
+    os.dup2(said, 2)
+    stream = open(  # noqa: SIM115, PTH123 - for good
+        shown, "w", buffering=1, encoding=sys.stderr.encoding, errors="backslashreplace"
+    )
+    for name in ("stderr", "__stderr__"):
+        setattr(sys, name, stream)
+    faulthandler.enable(2)
+
+
+def _hidden_file() -> int | None:
+    """Open a file that has no name any more."""
+    folder = os.environ.get("TMPDIR", "/tmp")
+    path = f"{folder}/.pimper-{os.getpid()}-{time.monotonic_ns()}"
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
+        os.unlink(path)  # noqa: PTH108 - pathlib takes longer to load than all else here
+    except OSError:
+        return None
+    return descriptor
+
+
+def _tail(said: int | None) -> str:
+    if said is None:
+        return ""
+    size = os.fstat(said).st_size
+    os.lseek(said, max(0, size - _TAIL_BYTES), os.SEEK_SET)
+    return os.read(said, _TAIL_BYTES).decode("utf-8", "replace")
