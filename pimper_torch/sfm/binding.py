@@ -10,8 +10,13 @@ from typing import Any
 
 
 def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace."""
+    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace.
+
+    Pillow is loaded before it: both carry zlib, and where pycolmap's comes first, Pillow damages
+    its memory as soon as it writes a PNG.
+    """
     fresh = "pycolmap" not in sys.modules
+    import PIL.Image  # noqa: F401 - see above
     import pycolmap
 
     if fresh and threading.current_thread() is threading.main_thread():

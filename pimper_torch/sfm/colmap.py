@@ -8,10 +8,12 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from pimper_torch.errors import InputError, OutputError
+from pimper_torch.errors import OutputError
 from pimper_torch.records import Cameras, Lens
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.model_files import read_files
+from pimper_torch.sfm.sound_model import sound_model
 
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
@@ -34,28 +36,11 @@ def read_model(folder: Path) -> SparseModel:
         folder: Holds ``cameras``, ``images`` and ``points3D``, each ``.txt`` or ``.bin``.
 
     Raises:
-        InputError: The folder holds no model, or one that COLMAP cannot read.
+        InputError: The folder holds no model, one that is cut short or of another format, or one of
+            which more than half is broken. A :class:`~pimper_torch.errors.PimperWarning` counts
+            what was broken and left out.
     """
-    pycolmap = loaded()
-
-    parts = ("cameras", "images", "points3D")
-    complete = any(
-        all((folder / f"{part}{ending}").is_file() for part in parts) for ending in (".bin", ".txt")
-    )
-    if not complete:
-        raise InputError(
-            f"{folder} holds no COLMAP model: needed are cameras, images and points3D, all .bin "
-            "or all .txt. Point to the folder that has them, often named sparse/0."
-        )
-    try:
-        with quiet():
-            reconstruction = pycolmap.Reconstruction(str(folder))
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise InputError(
-            f"The COLMAP model in {folder} cannot be read: {error}. Write it again with COLMAP's "
-            "model_converter, or leave it out to run structure from motion."
-        ) from error
-    return model_of(reconstruction)
+    return sound_model(read_files(folder), folder)
 
 
 def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: Path) -> None:

@@ -1,0 +1,355 @@
+"""COLMAP's model files, text and binary, as they stand: counts are checked before memory is taken.
+
+The format is that of COLMAP's ``scene/reconstruction_io_*.cc``. What rigs and frames add is left
+out: ``images`` holds every pose, too.
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from pimper_torch.errors import InputError
+
+Parsed = TypeVar("Parsed")
+
+# COLMAP's camera models by their number in binary files, with how many parameters each has.
+CAMERA_MODELS = (
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
+)
+_PARAMS = dict(CAMERA_MODELS)
+_MAX_NAME = 4096  # bytes, the longest path of Linux
+_POINT2D = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+_AGAIN = (
+    "Write it again with COLMAP's model_converter, or leave it out to run structure from motion"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileCamera:
+    """A camera as its file has it; any number may be nonsense."""
+
+    camera: int
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileImage:
+    """An image as its file has it.
+
+    Attributes:
+        image: Its number.
+        quaternion: Of ``cam_from_world``, real part first.
+        translation: Of ``cam_from_world``.
+        camera: Number of its camera.
+        name: Of its file.
+        pixels: Of its features, ``feature 2``.
+        points: The point that each sees; negative where none.
+    """
+
+    image: int
+    quaternion: tuple[float, ...]
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+    pixels: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilePoints:
+    """All points as their file has them.
+
+    Attributes:
+        points: Their numbers.
+        xyz: Where they are, ``point 3``.
+        track_point: Position in ``points`` of what each element of a track belongs to.
+        track_image: Number of the image of each element.
+        track_feature: Position among the features of that image.
+    """
+
+    points: np.ndarray
+    xyz: np.ndarray
+    track_point: np.ndarray
+    track_image: np.ndarray
+    track_feature: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileModel:
+    """The three files of a model."""
+
+    cameras: tuple[FileCamera, ...]
+    images: tuple[FileImage, ...]
+    points: FilePoints
+
+
+def read_files(folder: Path) -> FileModel:
+    """Read ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``.
+
+    Raises:
+        InputError: The folder holds no such files; or one is cut short, says that it holds more
+            than it has room for, or is of another format.
+    """
+    parts = ("cameras", "images", "points3D")
+    for ending in (".bin", ".txt"):
+        paths = [folder / f"{part}{ending}" for part in parts]
+        if all(path.is_file() for path in paths):
+            cameras, images, points = _BINARY if ending == ".bin" else _TEXT
+            return FileModel(
+                cameras=_read(paths[0], cameras, folder),
+                images=_read(paths[1], images, folder),
+                points=_read(paths[2], points, folder),
+            )
+    raise InputError(
+        f"{folder} holds no COLMAP model: needed are cameras, images and points3D, all .bin "
+        "or all .txt. Point to the folder that has them, often named sparse/0."
+    )
+
+
+class _Broken(Exception):  # noqa: N818 - what is broken, to be told with the name of the file
+    """Why a file cannot be read."""
+
+
+def _read(path: Path, parse: Callable[[bytes], Parsed], folder: Path) -> Parsed:
+    try:
+        return parse(path.read_bytes())
+    except OSError as error:
+        why = error.strerror or "the system refuses"
+    except _Broken as error:
+        why = str(error)
+    raise InputError(f"The COLMAP model in {folder} cannot be read: {path.name} {why}. {_AGAIN}.")
+
+
+class _Bytes:
+    """A file's bytes, read from the front; never beyond its end."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self.at = 0
+
+    def take(self, layout: str) -> tuple[float, ...]:
+        size = struct.calcsize(layout)
+        self.require(size)
+        values = struct.unpack_from(layout, self.data, self.at)
+        self.at += size
+        return values
+
+    def require(self, size: int) -> None:
+        if size > len(self.data) - self.at:
+            raise _Broken(f"is cut short: it ends after {len(self.data)} bytes")
+
+    def count(self, what: str, smallest: int) -> int:
+        (number,) = self.take("<Q")
+        if number * smallest > len(self.data) - self.at:
+            raise _Broken(
+                f"says that it holds {number} {what}, but has only {len(self.data)} bytes"
+            )
+        return int(number)
+
+    def array(self, kind: np.dtype, count: int) -> np.ndarray:
+        array = np.frombuffer(self.data, kind, count, self.at)
+        self.at += count * kind.itemsize
+        return array
+
+    def name(self) -> str:
+        end = self.data.find(b"\0", self.at, self.at + _MAX_NAME)
+        if end < 0:
+            raise _Broken(f"has a name without an end within {_MAX_NAME} bytes")
+        text = self.data[self.at : end].decode("utf-8", "surrogateescape")
+        self.at = end + 1
+        return text
+
+
+def _binary_cameras(data: bytes) -> tuple[FileCamera, ...]:
+    file = _Bytes(data)
+    cameras = []
+    for _ in range(file.count("cameras", 48)):
+        camera, kind, width, height = file.take("<IiQQ")
+        if not 0 <= kind < len(CAMERA_MODELS):
+            raise _Broken(f"has a camera of the unknown model {int(kind)}")
+        model, params = CAMERA_MODELS[int(kind)]
+        cameras.append(
+            FileCamera(
+                camera=int(camera),
+                model=model,
+                width=int(width),
+                height=int(height),
+                params=file.take(f"<{params}d"),
+            )
+        )
+    return tuple(cameras)
+
+
+def _binary_images(data: bytes) -> tuple[FileImage, ...]:
+    file = _Bytes(data)
+    images = []
+    for _ in range(file.count("images", 73)):
+        image, *pose, camera = file.take("<I7dI")
+        name = file.name()
+        features = file.array(_POINT2D, file.count("features of an image", _POINT2D.itemsize))
+        images.append(
+            FileImage(
+                image=int(image),
+                quaternion=tuple(pose[:4]),
+                translation=tuple(pose[4:]),
+                camera=int(camera),
+                name=name,
+                pixels=np.stack([features["x"], features["y"]], axis=1),
+                points=features["point"].astype(np.int64),
+            )
+        )
+    return tuple(images)
+
+
+def _binary_points(data: bytes) -> FilePoints:
+    file = _Bytes(data)
+    count = file.count("points", 51)
+    ids, xyz = np.empty(count, np.uint64), np.empty((count, 3))
+    lengths, tracks = np.empty(count, np.int64), []
+    pair = np.dtype([("image", "<u4"), ("feature", "<u4")])
+    head, size = struct.Struct("<Q3d3BdQ"), len(data)
+    for index in range(count):
+        if file.at + head.size > size:
+            file.require(head.size)
+        point, x, y, z, _, _, _, _, length = head.unpack_from(data, file.at)
+        file.at += head.size
+        if length * pair.itemsize > size - file.at:
+            raise _Broken(
+                f"says that {length} features see a point, but has only {size} bytes in all"
+            )
+        ids[index], xyz[index], lengths[index] = point, (x, y, z), length
+        tracks.append(data[file.at : file.at + length * pair.itemsize])
+        file.at += length * pair.itemsize
+    track = np.frombuffer(b"".join(tracks), pair)
+    return FilePoints(
+        points=ids.astype(np.int64),
+        xyz=xyz,
+        track_point=np.repeat(np.arange(count), lengths),
+        track_image=track["image"].astype(np.int64),
+        track_feature=track["feature"].astype(np.int64),
+    )
+
+
+def _lines(data: bytes) -> Iterator[tuple[int, str]]:
+    """Give the lines that are no comments, and their numbers; empty ones too."""
+    text = data.decode("utf-8-sig", "surrogateescape")
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.lstrip().startswith("#"):
+            yield number, line.strip()
+
+
+def _numbers(words: list[str], kind: type, number: int) -> list[float]:
+    try:
+        return [kind(word) for word in words]
+    except (ValueError, OverflowError):
+        shown = " ".join(words)[:60]
+        raise _Broken(f"has in line {number} no numbers: {shown!r}") from None
+
+
+def _whole(word: str, number: int) -> int:
+    value = int(_numbers([word], int, number)[0])
+    if not -(2**63) <= value < 2**63:
+        raise _Broken(f"has in line {number} the number {word[:30]}, which none of COLMAP's is")
+    return value
+
+
+def _text_cameras(data: bytes) -> tuple[FileCamera, ...]:
+    cameras = []
+    for number, line in _lines(data):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) < 5 or words[1] not in _PARAMS:
+            raise _Broken(f"has in line {number} no camera: {line[:60]!r}")
+        params = tuple(_numbers(words[4:], float, number))
+        if len(params) != _PARAMS[words[1]]:
+            needed = f"{_PARAMS[words[1]]} for {words[1]}"
+            raise _Broken(f"has in line {number} {len(params)} parameters; needed: {needed}")
+        camera, width, height = (_whole(words[at], number) for at in (0, 2, 3))
+        cameras.append(
+            FileCamera(camera=camera, model=words[1], width=width, height=height, params=params)
+        )
+    return tuple(cameras)
+
+
+def _text_images(data: bytes) -> tuple[FileImage, ...]:
+    images = []
+    lines = _lines(data)
+    for number, line in lines:
+        if not line:
+            continue
+        words = line.split(maxsplit=9)  # a name may have spaces
+        if len(words) < 10:
+            raise _Broken(f"has in line {number} no image: {line[:60]!r}")
+        pose = _numbers(words[1:8], float, number)
+        below, features = next(lines, (number, ""))
+        columns = features.split()
+        if len(columns) % 3:
+            raise _Broken(
+                f"has in line {below} {len(columns)} numbers; needed: three for each feature"
+            )
+        xy = np.array(_numbers(columns, float, below), dtype=np.float64).reshape(-1, 3)
+        points = [_whole(word, below) for word in columns[2::3]]
+        images.append(
+            FileImage(
+                image=_whole(words[0], number),
+                quaternion=tuple(pose[:4]),
+                translation=tuple(pose[4:]),
+                camera=_whole(words[8], number),
+                name=words[9],
+                pixels=xy[:, :2].copy(),
+                points=np.array(points, dtype=np.int64),
+            )
+        )
+    return tuple(images)
+
+
+def _text_points(data: bytes) -> FilePoints:
+    points, xyz, lengths, tracks = [], [], [], []
+    for number, line in _lines(data):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) < 8 or len(words) % 2:
+            raise _Broken(f"has in line {number} no point: {line[:60]!r}")
+        points.append(_whole(words[0], number))
+        xyz.append(_numbers(words[1:4], float, number))
+        track = [_whole(word, number) for word in words[8:]]
+        lengths.append(len(track) // 2)
+        tracks += track
+    pairs = np.array(tracks, dtype=np.int64).reshape(-1, 2)
+    return FilePoints(
+        points=np.array(points, dtype=np.int64),
+        xyz=np.array(xyz, dtype=np.float64).reshape(-1, 3),
+        track_point=np.repeat(np.arange(len(points)), lengths),
+        track_image=pairs[:, 0],
+        track_feature=pairs[:, 1],
+    )
+
+
+_BINARY = (_binary_cameras, _binary_images, _binary_points)
+_TEXT = (_text_cameras, _text_images, _text_points)
