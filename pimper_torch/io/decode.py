@@ -23,6 +23,10 @@ Result = TypeVar("Result")
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two hold published data sets
+# Choices: the largest sensors have 151 million pixels, in files of 1 GB at most; no photograph of
+# more than 32 million has less than a bit in 25 samples: pictures made to exhaust memory do.
+MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
+_MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
 # Diagonal of the 36 mm x 24 mm frame, to which CIPA DCG-001 relates the 35 mm equivalent.
 _FRAME_DIAGONAL_MM = math.hypot(36, 24)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's FocalPlaneResolutionUnit
@@ -76,12 +80,13 @@ def read_header(path: Path | str) -> Header:
     path = Path(path)
 
     def read(image: Image.Image) -> Header:
-        exif = image.getexif()
-        orientation = int(exif.get(ExifTags.Base.Orientation) or 1)
         width, height = image.size
+        grey = image.mode in ("1", "L", "LA", "La") or image.mode.startswith("I;16")
+        _refuse_huge(path, width, height, 1 if grey else 3)
+        exif = Image.Exif() if _is_bare_png(path, image) else image.getexif()
+        orientation = _orientation(exif)
         if orientation >= 5 and image.format != "TIFF":  # Pillow has turned a TIFF's size
             width, height = height, width
-        grey = image.mode in ("1", "L", "LA", "La") or image.mode.startswith("I;16")
         return Header(
             width=width,
             height=height,
@@ -91,7 +96,7 @@ def read_header(path: Path | str) -> Header:
             deep=_is_deep(path, image),
         )
 
-    return _with_image(path, read)
+    return _with_image(path, read, whole=False)
 
 
 def decode(path: Path | str) -> Decoded:
@@ -109,17 +114,16 @@ def decode(path: Path | str) -> Decoded:
     else:
         array = _with_image(path, _read_shallow)
     if array.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            f"{path}: its samples are {array.dtype}; needed: 8 or 16 bits. Convert the file."
-        )
-    full = np.iinfo(array.dtype).max
-    planes = torch.from_numpy(array.astype(np.float32) / np.float32(full))
-    planes = planes[..., None] if planes.ndim == 2 else planes
-    has_alpha = planes.shape[-1] in (2, 4)
-    colour = planes[..., :-1] if has_alpha else planes
+        raise _unfit(path, str(array.dtype))
+    array = array[..., None] if array.ndim == 2 else array
+    # Plane by plane, so that no more memory is taken than is returned.
+    planes = torch.empty(array.shape[2], *array.shape[:2])
+    for plane, channel in zip(planes, np.moveaxis(array, -1, 0), strict=True):
+        np.divide(channel, np.float32(np.iinfo(array.dtype).max), out=plane.numpy())
+    has_alpha = len(planes) in (2, 4)
     return Decoded(
-        samples=colour.permute(2, 0, 1).contiguous(),
-        alpha=planes[..., -1] if has_alpha else None,
+        samples=planes[:-1] if has_alpha else planes,
+        alpha=planes[-1] if has_alpha else None,
         lossy=path.suffix.lower() in (".jpg", ".jpeg"),
         bits=8 * array.dtype.itemsize,
     )
@@ -177,29 +181,98 @@ def _positive(value: object) -> float:
     return number if 0 < number < math.inf else 0.0
 
 
-def _with_image(path: Path, use: Callable[[Image.Image], Result]) -> Result:
-    """Open a file with Pillow and turn everything that may go wrong into one error."""
+def _is_bare_png(path: Path, image: Image.Image) -> bool:
+    """Tell whether a PNG says nothing but its pixels; Pillow decodes all to find that out."""
+    if image.format != "PNG":
+        return False
+    with path.open("rb") as file:
+        file.seek(8)
+        while len(head := file.read(8)) == 8:
+            if head[4:] in (b"eXIf", b"tEXt", b"zTXt", b"iTXt"):
+                return False
+            file.seek(int.from_bytes(head[:4], "big") + 4, 1)
+    return True
+
+
+def _orientation(exif: Image.Exif) -> int:
+    found = exif.get(ExifTags.Base.Orientation)
+    return found if isinstance(found, int) and 1 <= found <= 8 else 1
+
+
+def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
+    """Refuse, by its header, an image that memory should not be taken for."""
+    pixels, held = width * height, path.stat().st_size
+    if pixels > MAX_PIXELS or held > _MAX_BYTES:
+        raise InputError(
+            f"{path}: has {width} x {height} pixels in {held} bytes; needed: at most "
+            f"{MAX_PIXELS // 10**6} million pixels, {_MAX_BYTES // 2**30} GB. Scale it down."
+        )
+    if channels > 1 and pixels > _MANY_PIXELS and pixels * channels > _MAX_SAMPLES_PER_BYTE * held:
+        raise InputError(
+            f"{path}: says that it has {width} x {height} pixels in {held} bytes, which no "
+            "photograph has. Take it out of the folder, or scale it down."
+        )
+
+
+def _with_image(path: Path, use: Callable[[Image.Image], Result], *, whole: bool = True) -> Result:
+    """Open a file with Pillow and turn everything that may go wrong into one error.
+
+    Args:
+        path: Of the file.
+        use: What to do with it.
+        whole: Read all of it at once; not needed for its header.
+    """
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), path.open("rb") as file:
             warnings.simplefilter("ignore")  # size below Pillow's limit, odd but legible tags
             # From memory: Pillow 13 misreads an uncompressed, turned TIFF that it maps.
-            with Image.open(io.BytesIO(path.read_bytes()), formats=_FORMATS) as image:
+            source = io.BytesIO(file.read()) if whole else file
+            with Image.open(source, formats=_FORMATS) as image:
                 return use(image)
+    except InputError:
+        raise
     except Image.DecompressionBombError as error:
         raise InputError(
-            f"{path}: {error} Needed: a photograph of ordinary size; scale it down."
+            f"{path}: has more than {MAX_PIXELS // 10**6} million pixels; needed: at most as many. "
+            "Scale it down."
         ) from error
     except UnidentifiedImageError as error:
-        raise InputError(
-            f"{path}: holds no JPEG, PNG or TIFF image that can be read. Convert it, or take "
-            "it out of the folder."
-        ) from error
-    except (OSError, SyntaxError, ValueError, EOFError, TypeError, KeyError) as error:
-        # Pillow's plugins raise any of these on damaged files.
-        raise InputError(
-            f"{path}: cannot be read, it seems cut short or damaged ({error}). Copy it again, "
-            "or take it out of the folder."
-        ) from error
+        raise _unidentified(path) from error
+    except OSError as error:
+        if error.errno is not None:  # of the system, not of a decoder
+            raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+        raise _damaged(path) from error
+    except Exception as error:  # Pillow's plugins raise whatever a damaged file leads to
+        raise _damaged(path) from error
+
+
+def _damaged(path: Path) -> InputError:
+    return InputError(
+        f"{path}: cannot be read, it seems cut short or damaged. Copy it again, or take it out of "
+        "the folder."
+    )
+
+
+def _unfit(path: Path, kind: str) -> InputError:
+    return InputError(
+        f"{path}: its samples are {kind}; needed: 8 or 16 bits, whole numbers. Save it anew, as "
+        "16-bit TIFF for instance, with the level of saturation at full scale."
+    )
+
+
+def _unidentified(path: Path) -> InputError:
+    """Tell why Pillow does not know a file: a TIFF of samples that it has no name for, or none."""
+    try:
+        with tifffile.TiffFile(path) as file:
+            kind = file.pages.first.dtype
+            if kind is not None and kind not in (np.uint8, np.uint16):
+                return _unfit(path, str(kind))
+    except Exception:  # tifffile raises whatever its parser does: no TIFF, then
+        pass
+    return InputError(
+        f"{path}: holds no JPEG, PNG or TIFF image that can be read. Convert it, or take it out of "
+        "the folder."
+    )
 
 
 def _read_shallow(image: Image.Image) -> np.ndarray:
@@ -235,7 +308,8 @@ def _read_deep(path: Path) -> np.ndarray:
         raise
     except Exception as error:  # kornia_rs raises bare Exception
         raise InputError(
-            f"{path}: its 16-bit samples cannot be read ({error}). Save it anew as 16-bit PNG."
+            f"{path}: its 16-bit samples cannot be read, the file seems damaged or packed in an "
+            "unusual way. Save it anew as 16-bit PNG."
         ) from error
 
 

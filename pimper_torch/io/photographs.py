@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -24,6 +25,13 @@ _LIT_FRACTION = 1e-3  # more than hot pixels
 _MIN_USABLE = 0.1
 # Masks are turned round where more than the rest of it is bright at the border, and less inside.
 _TELLING = 0.25
+# What people take for photographs, and is none of SUFFIXES: images, camera raw, video.
+_PICTURES = re.compile(
+    r"\.(gif|hei[cf]|avif|webp|bmp|jp2|jxl|psd|exr|hdr|p[pg]m"
+    r"|cr[23]|nef|arw|dng|orf|raf|rw2|pef|srw|3fr|iiq|raw"
+    r"|mp4|mov|avi|mkv|m4v|webm|mts)",
+    re.IGNORECASE,
+)
 
 
 def load_views(
@@ -36,17 +44,18 @@ def load_views(
 ) -> Views:
     """Read the photographs of a folder, in the natural order of their names.
 
-    JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette; other files, hidden ones and
-    folders inside are passed over. EXIF's orientation is applied, its focal length kept in
-    pixels. The response, sRGB unless given, is undone, so that radiance is linear;
-    colour profiles are not looked at. Radiance 1 is saturation, in every colour: the level that
-    is told, or at which values pile up, or full scale. Photographs of unlike sizes are padded.
+    JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette; links are followed. Other files,
+    hidden ones and folders inside are passed over, with a warning where they look like
+    photographs. EXIF's orientation is applied, its focal length kept in pixels. The response, sRGB
+    unless given, is undone, so that radiance is linear; colour profiles are not looked at.
+    Radiance 1 is saturation, in every colour: the level that is told, or at which values pile up,
+    or full scale. Photographs of unlike sizes are padded.
 
     Masks are images of the photographs' sizes, zero off the object (JPEG: below half). Where all
     of them together are bright along the border and dark in the middle, they are turned round,
-    and a warning says so.
-    Without a folder of masks, alpha channels that are somewhere transparent are the masks,
-    and a photograph without one shows the object everywhere.
+    and a warning says so. Where no opaque pixel of a mask is bright, its alpha is the mask. Without
+    a folder of masks, alpha channels that are somewhere transparent are the masks, and a warning
+    says so; a photograph without one shows the object everywhere.
 
     Args:
         folder: With the photographs.
@@ -71,6 +80,7 @@ def load_views(
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
     paths = list_images(Path(folder))
     _check_count(Path(folder), paths)
+    _tell_passed_over(Path(folder))
     headers = [read_header(path) for path in paths]
     mask_paths = _match_masks(paths, Path(masks)) if masks is not None else None
     sizes = [shrunk_size(header, max_size_px) for header in headers]
@@ -92,7 +102,9 @@ def load_views(
         else:
             drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
     names = tuple(path.name for path in paths)
-    _refuse_black(images, names, Path(folder))
+    _refuse_black(images, sizes, names, Path(folder))
+    if has_masks and not opacities:
+        _tell_alpha(pictures.opaque, names, Path(folder))
     if has_masks:
         _refuse_empty(drawn, names, Path(masks) if masks is not None else None)
     _judge_saturation(images, drawn, names, Path(folder))
@@ -115,8 +127,7 @@ def list_images(folder: Path | str) -> list[Path]:
     """List the image files of a folder in natural order: ``img2`` before ``img10``.
 
     Raises:
-        InputError: No such folder, no images in it, two of one stem, or a link that leads
-            out of the folder.
+        InputError: No such folder, no images in it, or two of one stem.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -134,9 +145,6 @@ def list_images(folder: Path | str) -> list[Path]:
             "those in folders inside."
         )
     paths.sort(key=lambda path: _natural(path.name))
-    for path in paths:
-        if path.resolve().parent != folder.resolve():
-            raise InputError(f"{path}: is a link out of the folder; put a copy of the file there.")
     stems: dict[str, Path] = {}
     for path in paths:
         other = stems.setdefault(path.stem, path)
@@ -156,6 +164,56 @@ def some(names: Sequence[str], at_most: int = 5) -> str:
     """
     rest = len(names) - at_most
     return ", ".join(names[:at_most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _tell_passed_over(folder: Path) -> None:
+    """Warn of what looks like photographs and is not read, kind by kind with its count."""
+    kinds: Counter[str] = Counter()
+    examples: list[str] = []
+    for path in sorted(folder.iterdir()):
+        suffix = path.suffix.lower()
+        if path.name.startswith("."):
+            continue
+        if path.is_symlink() and not path.exists():
+            kind = "broken link"
+        elif path.is_dir():
+            kind = "folder of images" if _holds_images(path) else ""
+        else:
+            kind = suffix[1:].upper() if _PICTURES.fullmatch(suffix) else ""
+        if kind:
+            kinds[kind] += 1
+            examples.append(path.name)
+    if kinds:
+        counts = ", ".join(f"{kind} ({count})" for kind, count in kinds.items())
+        warnings.warn(
+            f"{folder}: these were not read: {counts}; {some(examples)}. Read are files ending in "
+            f"{', '.join(SUFFIXES)}, not those in folders inside. Convert or move what belongs to "
+            "the photographs.",
+            PimperWarning,
+            stacklevel=3,
+        )
+
+
+def _holds_images(folder: Path) -> bool:
+    try:
+        suffixes = {path.suffix.lower() for path in folder.iterdir()}
+    except OSError:
+        return False
+    return any(suffix in SUFFIXES or _PICTURES.fullmatch(suffix) for suffix in suffixes)
+
+
+def _tell_alpha(
+    opaque: Sequence[Bool[Tensor, "height width"] | None], names: tuple[str, ...], folder: Path
+) -> None:
+    """Say that transparency is taken for masks."""
+    drawn = [name for name, one in zip(names, opaque, strict=True) if one is not None]
+    warnings.warn(
+        f"{folder}: {len(drawn)} of {len(names)} photographs have transparent pixels "
+        f"({some(drawn)}), which are taken for masks: opaque is the object. If that is wrong, save "
+        "them without transparency, or give masks by `--masks`.",
+        PimperWarning,
+        stacklevel=3,
+    )
 
 
 def _check_count(folder: Path, paths: list[Path]) -> None:
@@ -230,9 +288,12 @@ def _is_dark(
 
 
 def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
-    """Read a drawn mask, true where it is brighter than half; shrunk as its photographs are."""
+    """Read a drawn mask, true where it is opaque and brighter than half; shrunk as photographs are.
+
+    Where no opaque pixel is bright, alpha alone is the mask.
+    """
     path = Path(path)
-    drawn = decode(path).samples.amax(dim=0) >= OPAQUE
+    drawn = _on_object(decode(path), lossless=OPAQUE) > 0
     if max_size_px == 0:
         return drawn
     return resized_mask(drawn.float(), *shrunk_size(read_header(path), max_size_px))
@@ -240,32 +301,54 @@ def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height wi
 
 def _read_mask(path: Path, photograph: Path, header: Header) -> Float[Tensor, "height width"]:
     """Give 1 on the object, 0 off it, the way the photograph is turned."""
+    found = read_header(path)
+    upright = (header.width, header.height)
+    if upright not in ((found.width, found.height), (found.height, found.width)):
+        raise _other_size(path, (found.width, found.height), photograph, header)
     drawn = _on_object(decode(path))
     lying = drawn.shape == (header.width, header.height)
     if header.orientation >= 5 and lying and header.width != header.height:
         # Drawn on the file's pixels by a program that does not know EXIF.
         drawn = torch.from_numpy(rotated(drawn.numpy(), header.orientation))
     size = (drawn.shape[1], drawn.shape[0])
-    if size != (header.width, header.height):
-        raise InputError(
-            f"{path}: is {size[0]} x {size[1]}, but the photograph {photograph.name} is "
-            f"{header.width} x {header.height}; needed: a mask of the same size."
-        )
+    if size != upright:
+        raise _other_size(path, size, photograph, header)
     return drawn
 
 
-def _on_object(decoded: Decoded) -> Float[Tensor, "height width"]:
+def _other_size(path: Path, size: tuple[int, int], photograph: Path, header: Header) -> InputError:
+    return InputError(
+        f"{path}: is {size[0]} x {size[1]}, but the photograph {photograph.name} is "
+        f"{header.width} x {header.height}; needed: a mask of the same size."
+    )
+
+
+def _on_object(decoded: Decoded, lossless: float | None = None) -> Float[Tensor, "height width"]:
+    """Give 1 where a mask is opaque and bright, or where it is opaque if no such pixel is bright.
+
+    Args:
+        decoded: Of the mask.
+        lossless: From which level on files without loss are bright; ``None`` is above 0.
+    """
     brightest = decoded.samples.amax(dim=0)
-    drawn = brightest >= OPAQUE if decoded.lossy else brightest > 0
+    level = OPAQUE if decoded.lossy else lossless
+    drawn = brightest > 0 if level is None else brightest >= level
     if decoded.alpha is not None:
-        drawn = drawn & (decoded.alpha > 0)
+        opaque = decoded.alpha > 0 if lossless is None else decoded.alpha >= lossless
+        drawn = drawn & opaque if bool((drawn & opaque).any()) else opaque & ~opaque.all()
     return drawn.float()
 
 
 def _refuse_black(
-    images: Float[Tensor, "view channel height width"], names: tuple[str, ...], folder: Path
+    images: Float[Tensor, "view channel height width"],
+    sizes: Sequence[tuple[int, int]],
+    names: tuple[str, ...],
+    folder: Path,
 ) -> None:
-    lit = [float((image > _BLACK).float().mean()) > _LIT_FRACTION for image in images]
+    lit = [
+        float((image[:, :high, :wide] > _BLACK).float().mean()) > _LIT_FRACTION
+        for image, (wide, high) in zip(images, sizes, strict=True)
+    ]
     black = [name for name, one in zip(names, lit, strict=True) if not one]
     if black:
         raise InputError(

@@ -22,6 +22,9 @@ OPAQUE = 0.5
 # Saturated light in a pixel's footprint counts from this fraction on; below is the rounding of the
 # filter's weights.
 _TOUCHED = 1e-3
+# Choices: photographs share one raster, and one that makes it so many times as large as all are
+# together is no photograph of theirs, from 400 MB of raster on.
+_MAX_PADDING, _MUCH_PADDING = 8, 10**8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -60,12 +63,14 @@ def read_pictures(
         encoding: Of all.
 
     Raises:
-        InputError: Names a file that cannot be read, or that the encoding does not fit.
+        InputError: Names a file that cannot be read, that the encoding does not fit, or that is
+            much larger than all others.
     """
     response = response_of(encoding)
     width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
     channels = max(header.channels for header in headers)
     files = [Path(path) for path in paths]
+    _refuse_padding(files, sizes_px, channels)
     images = torch.zeros(len(files), channels, height, width)
     given = None if encoding.saturation == "auto" else encoding
     opaque, tallies = _fill(images, files, sizes_px, response, encoding, {}, tally=given is None)
@@ -74,6 +79,24 @@ def read_pictures(
         _tell(files[0].parent, whites)
         opaque, _ = _fill(images, files, sizes_px, response, encoding, whites, tally=False)
     return Pictures(images=images, opaque=opaque)
+
+
+def _refuse_padding(
+    files: Sequence[Path], sizes_px: Sequence[tuple[int, int]], channels: int
+) -> None:
+    """Refuse, before memory is taken, a picture that all others would be padded to."""
+    width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
+    areas = [wide * high for wide, high in sizes_px]
+    raster = len(files) * width * height
+    if raster * channels < _MUCH_PADDING or raster < _MAX_PADDING * sum(areas):
+        return
+    largest = areas.index(max(areas))
+    (wide, high), usual = sizes_px[largest], sizes_px[areas.index(sorted(areas)[len(areas) // 2])]
+    raise InputError(
+        f"{files[largest]}: has {wide} x {high} pixels, others have {usual[0]} x {usual[1]}; "
+        "needed: photographs of similar sizes, as memory is taken for the largest. Take it out of the "
+        "folder, or give all one longest side by `--max-size-px`."
+    )
 
 
 def radiance_of(

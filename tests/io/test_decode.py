@@ -197,5 +197,25 @@ def test_other_formats_and_depths_are_refused_by_name(tmp_path, pixels, deep, wr
 def test_a_decompression_bomb_is_refused(tmp_path, monkeypatch, pixels):
     Image.fromarray(pixels).save(tmp_path / "bomb.png")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
-    with pytest.raises(InputError, match=r"bomb\.png.*decompression bomb"):
+    with pytest.raises(InputError, match=r"bomb\.png.*more than 160 million pixels"):
         decode(tmp_path / "bomb.png")
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_tiff_of_floats_is_told_from_no_tiff(tmp_path, channels):
+    values = np.zeros((8, 12) if channels == 1 else (8, 12, 3), dtype=np.float32)
+    kind = "minisblack" if channels == 1 else "rgb"
+    tifffile.imwrite(tmp_path / "float.tif", values, photometric=kind)
+    with pytest.raises(InputError, match=r"float\.tif: its samples are float32; needed: 8 or 16"):
+        decode(tmp_path / "float.tif")
+
+
+def test_messages_do_not_speak_for_libraries(tmp_path, deep, write_png16):
+    write_png16(tmp_path / "deep.png", deep[..., :3])
+    data = bytearray((tmp_path / "deep.png").read_bytes())
+    data[-30] ^= 1  # a checksum of what is compressed
+    (tmp_path / "deep.png").write_bytes(data)
+    with pytest.raises(InputError, match=r"16-bit samples cannot be read, the file seems damaged"):
+        decode(tmp_path / "deep.png")
+    with pytest.raises(InputError, match=r"a\.png: cannot be read \(No such file or directory\)"):
+        decode(tmp_path / "a.png")

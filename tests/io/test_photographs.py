@@ -1,3 +1,7 @@
+import struct
+import time
+import tracemalloc
+import zlib
 from contextlib import nullcontext
 
 import numpy as np
@@ -8,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.io.photographs import load_views
+from pimper_torch.io.photographs import load_views, read_mask
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import LINEAR, linear_from_srgb, srgb_from_linear
 
@@ -39,11 +43,24 @@ def test_photographs_come_in_natural_order_as_linear_radiance(photos, pixels):
     assert_close(load_views(photos, encoding=LINEAR).images[1].double(), stored, rtol=0, atol=1e-6)
 
 
-def test_other_files_hidden_ones_and_folders_are_passed_over(photos, pixels):
+def test_other_files_and_hidden_ones_are_passed_over(photos):
     (photos / "notes.txt").write_text("notes")
     (photos / "._1.png").write_bytes(b"what a Mac leaves behind")
-    save(photos / "more" / "4.png", pixels)
+    (photos / "settings").mkdir()
     assert load_views(str(photos)).num_views == 3
+
+
+def test_what_looks_like_photographs_and_is_not_read_is_named_and_counted(photos, pixels):
+    save(photos / "more" / "4.png", pixels)
+    for name in ("5.gif", "6.HEIC", "7.heic", "8.avif", "9.CR2", "11.mp4"):
+        (photos / name).write_bytes(b"")
+    (photos / "12.jpg").symlink_to(photos / "nowhere.jpg")
+    with pytest.warns(PimperWarning, match=r"\(1\)") as told:
+        assert load_views(photos).num_views == 3
+    assert len(told) == 1
+    text = str(told[0].message)
+    kinds = ("GIF (1)", "HEIC (2)", "AVIF (1)", "CR2 (1)", "MP4 (1)")
+    assert all(kind in text for kind in (*kinds, "broken link (1)", "folder of images (1)"))
 
 
 def test_grey_photographs_keep_one_channel_until_a_coloured_one_joins(photos, pixels):
@@ -156,7 +173,8 @@ def test_transparency_serves_as_mask_unless_masks_are_given(photos, tmp_path, pi
     assert load_views(photos).masks is None  # opaque all over says nothing
     alpha[:4] = 0
     save(photos / "2.png", np.concatenate([pixels, alpha], axis=-1))
-    masks = load_views(photos).masks
+    with pytest.warns(PimperWarning, match=r"1 of 3 photographs.*\(2\.png\).*taken for masks"):
+        masks = load_views(photos).masks
     assert masks[0].all()
     assert torch.equal(masks[1], torch.from_numpy(alpha[..., 0] > 0))
     for number in (1, 2, 10):
@@ -211,11 +229,72 @@ def test_a_damaged_file_is_refused_by_name(photos):
         load_views(photos)
 
 
-def test_a_link_out_of_the_folder_is_refused(photos, tmp_path, pixels):
-    save(tmp_path / "elsewhere.png", pixels)
+def test_links_are_followed_wherever_they_lead(photos, tmp_path, pixels):
+    save(tmp_path / "elsewhere.png", 255 - pixels)
     (photos / "3.png").symlink_to(tmp_path / "elsewhere.png")
-    with pytest.raises(InputError, match=r"3\.png: is a link out of the folder"):
+    views = load_views(photos, encoding=LINEAR)
+    assert views.names == ("1.png", "2.png", "3.png", "10.png")
+    stored = torch.from_numpy(1 - pixels / 255).permute(2, 0, 1)
+    assert_close(views.images[2].double(), stored, rtol=0, atol=1e-6)
+
+
+def test_a_mask_drawn_in_alpha_is_understood(photos, tmp_path):
+    drawn = np.zeros((8, 12, 4), dtype=np.uint8)
+    drawn[2:6, 3:9, 3] = 255  # black, and opaque on the object
+    for number in (1, 2, 10):
+        save(tmp_path / "masks" / f"{number}.png", drawn)
+    shown = torch.from_numpy(drawn[..., 3] > 0)
+    assert torch.equal(load_views(photos, masks=tmp_path / "masks").masks, shown.expand(3, 8, 12))
+    assert torch.equal(read_mask(tmp_path / "masks" / "1.png"), shown)
+    drawn[2:6, 3:6, :3] = 255  # of an opaque part, only what is bright
+    save(tmp_path / "masks" / "2.png", drawn)
+    masks = load_views(photos, masks=tmp_path / "masks").masks
+    assert torch.equal(masks[1], torch.from_numpy(drawn[..., 0] > 0))
+
+
+def bomb(path, width, height, kind=2):
+    """Write a PNG of this size that is black all over, in a file of its thousandth."""
+    header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
+    packer = zlib.compressobj(1)
+    line = bytes(1 + width * (3 if kind == 2 else 1))
+    body = b"".join(packer.compress(line * 100) for _ in range(height // 100)) + packer.flush()
+    chunks = ((b"IHDR", header), (b"IDAT", body), (b"IEND", b""))
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+            for name, body in chunks
+        )
+    )
+
+
+@pytest.mark.parametrize("kind", [0, 2])
+def test_one_huge_image_among_small_ones_is_refused_before_it_is_read(photos, kind):
+    bomb(photos / "3.png", 13_000, 2_000, kind)
+    data = bytearray((photos / "3.png").read_bytes())
+    data[20:24] = struct.pack(">I", 13_000)  # the header says more than the file holds
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    (photos / "3.png").write_bytes(data)
+    tracemalloc.start()
+    begin = time.perf_counter()
+    with pytest.raises(InputError, match=r"3\.png: .*13000 x 13000 pixels"):
         load_views(photos)
+    assert time.perf_counter() - begin < 0.5
+    assert tracemalloc.get_traced_memory()[1] < 2e7
+    tracemalloc.stop()
+
+
+def test_photographs_of_unlike_sizes_are_no_bomb(photos, pixels):
+    save(photos / "3.png", np.tile(pixels, (20, 20, 1)))
+    assert load_views(photos).num_views == 4
+
+
+def test_padding_does_not_make_a_photograph_black(photos):
+    dim = np.zeros((8, 12, 3), dtype=np.uint8)
+    dim[:2, :2] = 200
+    save(photos / "2.png", dim)
+    save(photos / "3.png", np.full((300, 300, 3), 99, dtype=np.uint8))
+    assert load_views(photos).num_views == 4
 
 
 def test_masks_that_do_not_match_are_refused_by_name(photos, tmp_path):
