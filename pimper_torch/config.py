@@ -22,6 +22,8 @@ from pimper_torch.errors import ConfigError
 
 Config = TypeVar("Config")
 
+_MAX_BYTES = 1_000_000  # all settings with comments take 20 kB
+
 
 def require(ok: bool, field: str, value: object, needed: str) -> None:
     """Refuse an impossible setting.
@@ -132,11 +134,23 @@ def read_mapping(path: Path | str) -> dict[str, object]:
     """
     path = Path(path)
     try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ConfigError(
+                f"{path}: has {path.stat().st_size} bytes; needed: a file of settings."
+            )
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceLoader)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}. Needed: a YAML text file.") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: is no valid YAML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: is nested too deeply; needed: settings in sections.") from error
+    except (ValueError, TypeError, OverflowError, AttributeError) as error:
+        # PyYAML's constructors of numbers and dates raise these.
+        raise ConfigError(
+            f"{path}: holds a value that is none ({_cut(str(error))}); needed: numbers, texts, "
+            "lists and sections."
+        ) from error
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -147,13 +161,29 @@ def read_mapping(path: Path | str) -> dict[str, object]:
 
 
 class _OnceLoader(yaml.SafeLoader):
-    """Safe YAML that refuses a key given twice, of which the first would silently be lost."""
+    """Safe YAML that refuses a key given twice, of which the first would silently be lost.
+
+    Aliases are refused, too: nine lines of them can stand for more values than memory holds.
+    """
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.composer.ComposerError(
+                problem="aliases (`*name`) are not read; write the value out",
+                problem_mark=self.peek_event().start_mark,  # type: ignore[no-untyped-call]
+            )
+        return super().compose_node(parent, index)
 
     def construct_mapping(
         self, node: yaml.MappingNode, deep: bool = False
     ) -> dict[Hashable, object]:
         seen: set[str] = set()
         for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(
+                    problem="a key is a list or a section; needed: a name",
+                    problem_mark=key.start_mark,
+                )
             if key.value in seen:
                 raise yaml.constructor.ConstructorError(
                     problem=f"the key `{key.value}` is given twice", problem_mark=key.start_mark
@@ -173,7 +203,7 @@ def _build(
 ) -> Config:
     if not isinstance(mapping, Mapping):
         raise ConfigError(
-            f"{where}: {section or 'the whole'} is {mapping!r} ({_kind(mapping)}); "
+            f"{where}: {section or 'the whole'} is {_shown(mapping)}; "
             f"needed: a section with some of {', '.join(_names(cls))}."
         )
     hints, values = typing.get_type_hints(cls), {}
@@ -219,7 +249,7 @@ def _convert(hint: object, value: object, where: str, field: str, root: type[obj
         converted = _scalar(hint, value)
         if converted is not None:
             return converted
-    raise ConfigError(f"{where}: {field} is {value!r} ({_kind(value)}); needed: {_needed(hint)}.")
+    raise ConfigError(f"{where}: {field} is {_shown(value)}; needed: {_needed(hint)}.")
 
 
 def _convert_union(
@@ -237,7 +267,7 @@ def _convert_union(
     if len(refusals) == 1:
         raise refusals[0]
     needed = " or ".join(_needed(choice) for choice in choices)
-    raise ConfigError(f"{where}: {field} is {value!r} ({_kind(value)}); needed: {needed}.")
+    raise ConfigError(f"{where}: {field} is {_shown(value)}; needed: {needed}.")
 
 
 def _scalar(hint: type[object], value: object) -> object | None:
@@ -260,16 +290,27 @@ def _number(value: object) -> float | None:
             return float(value)  # YAML 1.1 takes 1e-3, without a dot, for a text
         except ValueError:
             return None
-    return float(value) if isinstance(value, int | float) else None
+    try:
+        return float(value) if isinstance(value, int | float) else None
+    except OverflowError:  # a whole number of 310 digits
+        return None
+
+
+def _shown(value: object) -> str:
+    return f"{_cut(repr(value))} ({_kind(value)})"
+
+
+def _cut(text: str, most: int = 200) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def _unknown(key: object, cls: type[object], where: str, section: str, root: type[object]) -> str:
     homes = [path for path in _paths(root, "") if path.rpartition(".")[2] == key]
     elsewhere = f" Did you mean `{'` or `'.join(homes)}`?"
-    hint = elsewhere if homes else _nearest(str(key), _names(cls))
+    hint = elsewhere if homes else _nearest(_cut(str(key)), _names(cls))
     return (
         f"{where}: {'section `' + section + '`' if section else 'the top level'} has no setting "
-        f"`{key}`.{hint} Settings there: {', '.join(_names(cls))}."
+        f"`{_cut(str(key))}`.{hint} Settings there: {', '.join(_names(cls))}."
     )
 
 

@@ -259,3 +259,33 @@ def test_changes_are_laid_over_a_preset():
     changed = load_config("fast", {"reconstruct": {"seed": 12}})
     assert changed.reconstruct.seed == 12
     assert changed.decompose == load_config("fast").decompose
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("a: &a [x, x]\nb: *a\n", "aliases .* are not read"),
+        ("a: " + "[" * 100_000, "nested too deeply"),
+        ("a: " + "9" * 5000, "holds a value that is none"),
+        ("? [a, b]\n: 1\n", "a key is a list or a section"),
+        ("a: 2001-99-99\n", "holds a value that is none"),
+        ("# " + "x" * 1_000_000, "1000002 bytes; needed: a file of settings"),
+    ],
+)
+def test_yaml_that_would_take_memory_or_is_none_is_refused(tmp_path, text, why):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=why):
+        read_mapping(tmp_path / "a.yaml")
+
+
+def test_a_number_beyond_the_range_of_floats_and_a_long_text_are_refused_shortly(tmp_path):
+    for value in ("1" + "0" * 400, "x" * 9000):
+        (tmp_path / "a.yaml").write_text(f"learning_rate: {value}\n")
+        with pytest.raises(ConfigError, match="needed: a number") as told:
+            build(Rate, read_mapping(tmp_path / "a.yaml"), "a.yaml")
+        assert len(str(told.value)) < 400
+
+
+@dataclass(frozen=True)
+class Rate:
+    learning_rate: float = 1.0

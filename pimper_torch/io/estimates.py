@@ -1,15 +1,14 @@
 """Results to evaluate: a folder that ``pimper reconstruct`` wrote, or a mesh of any method."""
 
 import json
-import zipfile
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.reports import common_lights
 from pimper_torch.records import Cameras, Estimate, Reconstruction
@@ -107,9 +106,9 @@ def _read_reference(path: Path) -> str | None:
     if not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return str(arrays["name"]) if "name" in arrays else None
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        found = read_npz(path, lambda name: name == "name").get("name")
+        return None if found is None else str(found)
+    except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); needed: an .npz file with `name`, the reference "
             "view. Remove the file to do without one."

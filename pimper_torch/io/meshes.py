@@ -16,12 +16,16 @@ from torch.nn.functional import normalize
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.io.mesh_headers import impossible
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.records import Mesh
+from pimper_torch.records.faults import beyond, not_finite
 from pimper_torch.viz.maps import albedo_scale
 
 # One number a vertex, written and read under the names of the record's fields.
 _ERRORS = ("confidence", "expected_error")
+SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
+_NEEDED = "PLY, OBJ, STL, OFF or GLB"
 # Steps that the eye hardly sees on a rendered surface, and errors far below what these two
 # figures are known to.
 _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
@@ -87,12 +91,13 @@ def written_channels(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """Read a triangle mesh or a point cloud: PLY, OBJ, STL, OFF, GLB and what trimesh reads.
+    """Read a triangle mesh or a point cloud: PLY, OBJ, STL, OFF or GLB.
 
     Faces of more corners are split, the parts of a scene put together; vertices keep their
     order and number. Vertex normals are kept if the file has some; colours are taken for
     albedo (sRGB undone, except in glTF, whose colours are linear); ``confidence`` and
-    ``expected_error`` of PLY are kept too. A point cloud becomes a mesh without faces.
+    ``expected_error`` of PLY are kept too. What of these is not finite throughout is dropped. A
+    point cloud becomes a mesh without faces.
 
     Args:
         path: The file. Textures and materials beside it are not looked at.
@@ -101,34 +106,55 @@ def read_mesh(path: Path | str) -> Mesh:
         Float64 geometry on the CPU.
 
     Raises:
-        InputError: No such file, not a mesh, no vertices, or values that are not finite.
+        InputError: No such file, not a mesh, one that says it holds more than its file, no
+            vertices, vertices that are not finite, or faces of vertices that are not there.
     """
     path = Path(path)
     if not path.is_file():
         found = "a folder" if path.is_dir() else "nothing"
         raise InputError(f"{path}: found {found}; needed: a mesh file such as .ply or .obj.")
+    suffix, data = path.suffix.lower(), path.read_bytes()
+    why = impossible(data, suffix)
+    if suffix not in SUFFIXES:
+        why = f"it ends in {suffix}" if suffix else "its name has no ending"
+    if why:
+        raise InputError(f"{path}: cannot be read as a mesh, {why}; needed: {_NEEDED}.")
     try:
         # Without a resolver nothing but the file itself is opened.
         scene = trimesh.load_scene(
-            BytesIO(path.read_bytes()),
-            file_type=path.suffix.lower().lstrip("."),
+            BytesIO(data),
+            file_type=suffix.lstrip("."),
             process=False,
             maintain_order=True,
         )
     except Exception as error:  # trimesh's readers raise whatever their parsers do
         raise InputError(
-            f"{path}: cannot be read as a mesh ({error}); needed: PLY, OBJ, STL, OFF or GLB."
+            f"{path}: cannot be read as a mesh, it seems damaged; needed: {_NEEDED}."
         ) from error
-    linear = path.suffix.lower() == ".glb"
-    placed = (scene.graph[node] for node in scene.graph.nodes_geometry)
-    parts = [_mesh(scene.geometry[name], pose, linear=linear) for pose, name in placed]
+    try:
+        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+        parts = [
+            _mesh(scene.geometry[name], pose, linear=suffix == ".glb") for pose, name in placed
+        ]
+    except Exception as error:  # what trimesh made of a damaged file may be anything
+        raise InputError(
+            f"{path}: cannot be read as a mesh, it seems damaged; needed: {_NEEDED}."
+        ) from error
     parts = [part for part in parts if len(part.vertices_world)]
     if not parts:
         raise InputError(f"{path}: holds no vertices; needed: a mesh or a point cloud.")
     mesh = _joined(parts)
     if not bool(mesh.vertices_world.isfinite().all()):
         raise InputError(f"{path}: some vertices are not finite; needed: numbers throughout.")
-    return mesh
+    if found := beyond(mesh.faces, len(mesh.vertices_world)):
+        raise InputError(
+            f"{path}: the corners of its faces {found}; needed: indices of its "
+            f"{len(mesh.vertices_world)} vertices. Export it again."
+        )
+    names = ("normals_world", "albedo", *_ERRORS)
+    known = {name: getattr(mesh, name) for name in names}
+    broken = [name for name, one in known.items() if one is not None and not_finite(one)]
+    return mesh.replace(**dict.fromkeys(broken)) if broken else mesh
 
 
 def write_glb(mesh: Mesh, path: Path | str) -> None:

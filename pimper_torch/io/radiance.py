@@ -94,8 +94,8 @@ def _refuse_padding(
     (wide, high), usual = sizes_px[largest], sizes_px[areas.index(sorted(areas)[len(areas) // 2])]
     raise InputError(
         f"{files[largest]}: has {wide} x {high} pixels, others have {usual[0]} x {usual[1]}; "
-        "needed: photographs of similar sizes, as memory is taken for the largest. Take it out of the "
-        "folder, or give all one longest side by `--max-size-px`."
+        "needed: photographs of similar sizes, as memory is taken for the largest. Take it out of "
+        "the folder, or give all one longest side by `--max-size-px`."
     )
 
 

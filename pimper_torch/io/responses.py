@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from pimper_torch.errors import InputError
+from pimper_torch.io.arrays import read_npy
 from pimper_torch.radiometry import Curve, Encoding, Gamma, Linear, Response, Srgb
 from pimper_torch.radiometry.response import curve_from_table
 
@@ -74,9 +75,10 @@ def read_curve(path: Path | str) -> Curve:
         raise InputError(f"{path}: has {path.stat().st_size} bytes; needed: a small table.")
     try:
         table = reader(path)
-    except (OSError, ValueError, TypeError, KeyError, EOFError, csv.Error) as error:
+    except (OSError, ValueError, TypeError, OverflowError, RecursionError, csv.Error) as error:
+        why = "nested too deeply" if isinstance(error, RecursionError) else f"{error}"[:200]
         raise InputError(
-            f"{path}: holds no table of a response curve ({error}); needed: {_LAYOUT}."
+            f"{path}: holds no table of a response curve ({why}); needed: {_LAYOUT}."
         ) from error
     if table.ndim != 2 or not 1 <= table.shape[1] <= 4:
         raise InputError(
@@ -106,7 +108,7 @@ def _read_csv(path: Path) -> np.ndarray:
 
 def _read_json(path: Path) -> np.ndarray:
     report = json.loads(path.read_text(encoding="utf-8"))
-    if not isinstance(report, dict):
+    if not isinstance(report, dict) or "radiance" not in report:
         raise ValueError("it is no object with `radiance`")
     radiance = np.array(report["radiance"], dtype=np.float64)
     rows = radiance[None] if radiance.ndim == 1 else radiance
@@ -116,8 +118,8 @@ def _read_json(path: Path) -> np.ndarray:
 
 
 def _read_npy(path: Path) -> np.ndarray:
-    table = np.load(path, allow_pickle=False)
-    if not isinstance(table, np.ndarray) or table.dtype.kind not in "iuf":
+    table = read_npy(path)
+    if table.dtype.kind not in "iuf":
         raise ValueError("it is no array of numbers")
     if table.ndim == 3 and table.shape[1] == 1:  # as OpenCV has it
         table = table[:, 0]

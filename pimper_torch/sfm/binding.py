@@ -6,7 +6,10 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
+
+from pimper_torch.errors import caution
 
 
 def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
@@ -21,7 +24,19 @@ def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
 
     if fresh and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    _tell_order()
     return pycolmap
+
+
+@cache
+def _tell_order() -> None:
+    """Warn, once, where a script has loaded pycolmap before Pillow."""
+    names = list(sys.modules)  # in the order of loading
+    if names.index("pycolmap") < names.index("PIL._imaging"):
+        caution(
+            "pycolmap was imported before Pillow: both carry zlib, and writing a PNG will end this "
+            "process. Put `import PIL.Image` before `import pycolmap`."
+        )
 
 
 @contextmanager

@@ -1,3 +1,6 @@
+import json
+import struct
+
 import numpy as np
 import pytest
 import torch
@@ -6,6 +9,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
+from pimper_torch.io import mesh_headers
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.viz.maps import albedo_scale
@@ -101,3 +105,79 @@ def test_a_point_clouds_normals_are_read(tmp_path, text):
     assert cloud.faces.shape == (0, 3)
     wanted = torch.tensor([[0, 0.6, 0.8], [0, 0, 1]], dtype=torch.float64)
     assert_close(cloud.normals_world, wanted, rtol=0, atol=1e-6)
+
+
+def ply(element, count, properties, body):
+    lines = ["ply", "format binary_little_endian 1.0", f"element {element} {count}", *properties]
+    return "\n".join([*lines, "end_header", ""]).encode() + body
+
+
+XYZ = tuple(f"property float {axis}" for axis in "xyz")
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.ply", ply("vertex", 2**40, XYZ, bytes(36))),
+        ("a.ply", ply("vertex", -3, XYZ, bytes(36))),
+        ("a.ply", ply("vertex", 4, XYZ, bytes(36))),
+        ("a.ply", ply("face", 2**31, ("property list uchar int vertex_indices",), bytes(9))),
+        ("a.ply", ply("vertex", 2**40, XYZ, b"0 0 0\n").replace(b"binary_little_endian", b"ascii")),
+        ("a.stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(50)),
+    ],
+)
+def test_a_count_beyond_the_files_length_is_refused_before_memory_is_taken(
+    name, content, tmp_path, monkeypatch
+):
+    monkeypatch.delattr(trimesh, "load_scene")  # the parser that would take it is not asked
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=r"says that it holds -?\d+"):
+        read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda tree: tree["accessors"][0].update(count=2**40), "says that it holds"),
+        (lambda tree: tree["accessors"][0].pop("bufferView"), "not in the file itself"),
+        (lambda tree: tree["bufferViews"][0].update(byteLength=2**40), "says that it holds"),
+        (lambda tree: tree["nodes"].append({"children": [len(tree["nodes"])]}), "circle of nodes"),
+        (lambda tree: tree["nodes"].extend([{"mesh": 0}] * 10**5), "500005 vertices"),
+        (lambda tree: tree["accessors"][0].update(type="VEC9"), "damaged"),
+    ],
+)
+def test_a_scene_that_is_none_or_too_much_is_refused(mesh, change, why, tmp_path, monkeypatch):
+    monkeypatch.setattr(mesh_headers, "_MAX_PLACED", 10**5)
+    write_glb(mesh, tmp_path / "a.glb")
+    data = (tmp_path / "a.glb").read_bytes()
+    (size,) = struct.unpack_from("<I", data, 12)
+    tree = json.loads(data[20 : 20 + size])
+    change(tree)
+    text = json.dumps(tree).encode()
+    head = struct.pack("<4s3I4s", b"glTF", 2, len(data) - size + len(text), len(text), b"JSON")
+    (tmp_path / "a.glb").write_bytes(head + text + data[20 + size :])
+    with pytest.raises(InputError, match=why):
+        read_mesh(tmp_path / "a.glb")
+
+
+def test_faces_of_vertices_that_are_not_there_are_refused(mesh, tmp_path):
+    for corner in (5, -1):
+        write_ply(mesh.replace(faces=torch.tensor([[0, 1, corner]])), tmp_path / "a.ply")
+        with pytest.raises(InputError, match=r"corners of its faces reach from .*its 5 vertices"):
+            read_mesh(tmp_path / "a.ply")
+
+
+def test_normals_that_are_not_finite_are_dropped_and_the_rest_is_kept(mesh, tmp_path):
+    normals = mesh.normals_world.clone()
+    normals[3, 1] = torch.nan
+    write_ply(mesh.replace(normals_world=normals), tmp_path / "a.ply")
+    read = read_mesh(tmp_path / "a.ply")
+    assert read.normals_world is None
+    assert read.albedo is not None
+    assert torch.equal(read.faces, mesh.faces)
+
+
+def test_another_kind_of_file_is_refused_by_its_ending(tmp_path):
+    (tmp_path / "a.zip").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"ends in \.zip; needed: PLY, OBJ, STL, OFF or GLB"):
+        read_mesh(tmp_path / "a.zip")

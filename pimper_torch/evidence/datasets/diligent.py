@@ -21,6 +21,7 @@ from pimper_torch.evidence.datasets.raster import (
     there,
 )
 from pimper_torch.evidence.datasets.sampling import choose_photographs
+from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.decode import decode
 from pimper_torch.io.photographs import read_mask
 from pimper_torch.radiometry import LINEAR
@@ -257,9 +258,8 @@ def _rows_of_three(path: Path, kind: str) -> Float[Tensor, "row 3"]:
 
 def _read_depth(path: Path, kind: str) -> Float[Tensor, "height width"]:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            array = arrays["depth_gt"].astype(np.float32)
-    except Exception as error:  # numpy's readers raise whatever a damaged file leads to
+        array = read_npz(path, lambda name: name == "depth_gt")["depth_gt"].astype(np.float32)
+    except (OSError, ValueError, KeyError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); needed: an array depth_gt. Copy the file again."
         ) from error

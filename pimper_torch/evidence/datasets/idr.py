@@ -1,8 +1,7 @@
 """IDR and NeuS: ``cameras.npz`` beside ``image/`` and ``mask/``; read and written."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from pimper_torch.evidence.datasets.posed import (
 from pimper_torch.evidence.datasets.projections import decompose_projections
 from pimper_torch.geometry.pixels import indices_from_pixels, pixels_from_indices
 from pimper_torch.geometry.projection import project
+from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.decode import read_header
 from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Cameras, Capture, Views
@@ -236,11 +236,8 @@ def _camera_file(folder: Path, name: str | None) -> Path:
 def _matrices(path: Path, key: str, count: int) -> Float[Tensor, "view 4 4"]:
     """Read ``key_0`` and so on, and refuse more or fewer than there are images."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            expect(isinstance(file, Mapping), path, _KIND, "an .npz archive", "a lone array")
-            present = sorted(name for name in file.files if name.startswith(f"{key}_"))
-            arrays = {name: np.asarray(file[name]) for name in present if "inv" not in name}
-    except (OSError, ValueError, EOFError, BadZipFile, TypeError, AttributeError) as error:
+        arrays = read_npz(path, lambda name: name.startswith(f"{key}_") and "inv" not in name)
+    except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); needed: an archive of arrays as numpy.savez "
             "writes it. Copy it again."

@@ -30,10 +30,15 @@ def expect(ok: bool, path: Path, kind: str, needed: str, found: str | None = Non
         return
     if found is None:
         found = contents(path)
+    needed, found = _shortened(needed), _shortened(found)
     raise InputError(
         f"{path}: not the layout of {kind}. Needed: {needed}. Found: {found}. Point to the folder "
         "that holds it, or choose the reader of another layout."
     )
+
+
+def _shortened(text: str, most: int = 400) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def contents(path: Path) -> str:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.layout import contents, expect, first_of
+from pimper_torch.evidence.datasets.layout import expect, first_of
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
@@ -19,6 +19,7 @@ from pimper_torch.evidence.datasets.posed import (
     rigid_or_refuse,
 )
 from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.io.arrays import read_npy
 from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Capture, Lens
 
@@ -103,16 +104,15 @@ def read_llff(
 def _read_rows(path: Path, folder: Path) -> Float[Tensor, "view 3 5"]:
     expect(path.is_file(), folder, _KIND, "a file poses_bounds.npy")
     try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        rows = read_npy(path)
+    except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); needed: an array of numbers as numpy.save writes "
             "it. Copy it again."
         ) from error
-    ok = isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == 17
+    ok = rows.ndim == 2 and rows.shape[1] == 17
     ok = ok and rows.dtype.kind == "f" and bool(np.isfinite(rows).all())
-    shape = getattr(rows, "shape", contents(path))
-    expect(ok, path, _KIND, "finite numbers of shape (views, 17)", f"shape {shape}")
+    expect(ok, path, _KIND, "finite numbers of shape (views, 17)", f"shape {rows.shape}")
     return torch.from_numpy(rows[:, :15].reshape(-1, 3, 5).astype(np.float64))
 
 

@@ -1,5 +1,6 @@
 """Arrays from MATLAB files, and cameras as its calibration toolbox writes them."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,10 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.layout import expect
 from pimper_torch.io.photographs import some
+
+_BYTES = {"logical": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4}
+# zlib packs at most so much; and a choice: the largest array of these sets has 0.1 GB.
+_MAX_RATIO, _MAX_BYTES = 1100, 2**29
 
 
 def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.ndarray]:
@@ -27,6 +32,7 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
             numbers; lists what the file holds.
     """
     present = variables(path, kind)
+    _refuse_bomb(path, names)
     try:
         found = scipy.io.loadmat(path, variable_names=list(names))
     except Exception as error:  # scipy's readers raise whatever a damaged file leads to
@@ -104,10 +110,28 @@ def read_toolbox_projections(
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
+    why = "its version is 7.3" if isinstance(error, NotImplementedError) else "it seems damaged"
     return InputError(
-        f"{path}: cannot be read as a MATLAB file ({error}); needed: version 7 or older, not 7.3. "
+        f"{path}: cannot be read as a MATLAB file, {why}; needed: version 7 or older, not 7.3. "
         "Unpack the data set again, or save the file with `-v7`."
     )
+
+
+def _refuse_bomb(path: Path, names: Sequence[str]) -> None:
+    """Refuse, by their headers, arrays that no file of this length can hold.
+
+    Raises:
+        InputError: Names the largest.
+    """
+    held = path.stat().st_size
+    for name, shape, kind in scipy.io.whosmat(path):
+        needed = math.prod(shape) * _BYTES.get(kind, 8)
+        if name in names and not 0 <= needed <= min(_MAX_BYTES, _MAX_RATIO * held):
+            raise InputError(
+                f"{path}: says that {name} is of shape {shape}, {needed} bytes, but has only "
+                f"{held}; needed: what the file can hold, at most {_MAX_BYTES}. Unpack the data "
+                "set again."
+            )
 
 
 def _shaped(

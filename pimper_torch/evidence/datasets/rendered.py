@@ -1,11 +1,9 @@
 """Rendered scenes, as :func:`pimper_torch.evidence.scenes.render_scene` writes them."""
 
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,6 +14,7 @@ from pimper_torch.evidence.datasets.layout import expect, inside
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.maps import MAP_NAMES, unpack_maps
 from pimper_torch.evidence.scenes.write import FORMAT, FORMAT_VERSION
+from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.decode import decode
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.progress import track
@@ -175,9 +174,8 @@ def _read_maps(folder: Path, names: Sequence[str], settings: SceneConfig) -> dic
     for name in track(names):
         path = _file(folder / "truth" / "maps", Path(name).stem + ".npz")
         try:
-            with np.load(path, allow_pickle=False) as arrays:
-                maps = unpack_maps(arrays)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            maps = unpack_maps(read_npz(path))
+        except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
             raise InputError(
                 f"{path}: cannot be read, it seems damaged ({error}). Render the scene again."
             ) from error
@@ -189,6 +187,8 @@ def _read_maps(folder: Path, names: Sequence[str], settings: SceneConfig) -> dic
                 f"{key} of {settings.width} x {settings.height} pixels as scene.json says",
                 f"a shape of {tuple(values.shape)}",
             )
+            finite = key == "depth" or bool(values.isfinite().all())  # depth is infinite off it
+            expect(finite, path, _KIND, f"finite numbers as {key}", "others")
             read[key].append(values)
     return {key: torch.stack(values) for key, values in read.items()}
 
@@ -220,7 +220,7 @@ def _read_json(path: Path, folder: Path) -> Mapping[str, object]:
     expect(path.is_file(), folder, _KIND, f"{path.relative_to(folder)} in it")
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: is no JSON that can be read ({error}). Render the scene again."
         ) from error

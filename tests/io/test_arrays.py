@@ -1,0 +1,84 @@
+"""NumPy's files: what NumPy wrote comes back, and what a stranger wrote takes no memory."""
+
+import io
+import struct
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+from pimper_torch.io.arrays import read_npy, read_npz
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(12.0).reshape(3, 4),
+        np.asfortranarray(np.arange(24, dtype=np.int16).reshape(2, 3, 4)),
+        np.zeros((0, 3), dtype=np.float32),
+        np.array("name"),
+        np.array([True, False]),
+        np.arange(3, dtype=">f4"),
+    ],
+)
+def test_arrays_come_back_as_numpy_reads_them(array, tmp_path):
+    np.save(tmp_path / "a.npy", array)
+    np.savez_compressed(tmp_path / "a.npz", first=array, second=array[..., None])
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), array)
+    read = read_npz(tmp_path / "a.npz", lambda name: name == "first")
+    assert list(read) == ["first"]
+    np.testing.assert_array_equal(read["first"], array)
+    assert read["first"].dtype == array.dtype
+
+
+def header(text):
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999, 99), }\n", "says that it"),
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 3), }\n", "shape is"),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n", "objects of Python"),
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': (", "no header"),
+        ("(" * 9000, "no header"),
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': (2**9**9,), }\n", "no header"),
+    ],
+)
+def test_a_header_that_says_too_much_is_refused_before_memory_is_taken(tmp_path, text, why):
+    (tmp_path / "a.npy").write_bytes(header(text) + bytes(64))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("a.npy", header(text) + bytes(64))
+    tracemalloc.start()
+    for read in (read_npy, read_npz):
+        with pytest.raises(ValueError, match=why):
+            read(tmp_path / ("a.npy" if read is read_npy else "a.npz"))
+    assert tracemalloc.get_traced_memory()[1] < 1e7
+    tracemalloc.stop()
+
+
+def test_an_archive_that_unpacks_to_more_than_is_allowed_is_refused(tmp_path):
+    with (
+        zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("a.npy", "w") as member,
+    ):
+        for _ in range(33):
+            member.write(bytes(2**24))
+    assert (tmp_path / "a.npz").stat().st_size < 10_000_000
+    with pytest.raises(ValueError, match="would take 553648128 bytes"):
+        read_npz(tmp_path / "a.npz")
+
+
+def test_what_is_no_array_or_archive_is_refused(tmp_path):
+    path = tmp_path / "a"
+    whole = io.BytesIO()
+    np.savez_compressed(whole, a=np.random.default_rng(0).random(100))
+    damaged = bytearray(whole.getvalue())
+    damaged[len(damaged) // 3 : len(damaged) // 2] = bytes(len(damaged) // 2 - len(damaged) // 3)
+    for content in (b"", b"PK", b"text", bytes(damaged), whole.getvalue()[:200]):
+        path.write_bytes(content)
+        for read in (read_npy, read_npz):
+            with pytest.raises(ValueError, match="it "):
+                read(path)
