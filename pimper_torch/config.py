@@ -35,6 +35,29 @@ def require(ok: bool, field: str, value: object, needed: str) -> None:
         raise ConfigError(f"{field} is {value!r}; needed: {needed}.")
 
 
+def require_at_most(config: object, section: str = "", /, **most: float) -> None:
+    """Refuse values above the bounds of their fields: slips that no memory or time suffices for.
+
+    Args:
+        config: Whose fields they are.
+        section: Of the config, for the message.
+        most: The largest value of each field.
+
+    Raises:
+        ConfigError: Names the field, its value and the bound.
+
+    >>> from pimper_torch.coarse.densify import DensifyConfig
+    >>> require_at_most(DensifyConfig(), "densify", levels=2)
+    Traceback (most recent call last):
+        ...
+    pimper_torch.errors.ConfigError: densify.levels is 3; needed: 2 at most.
+    """
+    for name, bound in most.items():
+        value = getattr(config, name)
+        field = f"{section}.{name}" if section else name
+        require(value <= bound, field, value, f"{bound:,.12g} at most")
+
+
 def build(cls: type[Config], mapping: Mapping[str, object], where: str) -> Config:
     """Make a config dataclass, nested ones included, from a mapping such as YAML gives.
 

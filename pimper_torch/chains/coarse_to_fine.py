@@ -84,8 +84,9 @@ class CoarseToFineConfig:
 
     def __post_init__(self) -> None:
         bytes_of(self.max_memory)
-        sound = bool(self.scales) and all(scale > 0 for scale in self.scales)
-        require(sound, "scales", self.scales, "one at least, above 0 each")
+        # Photographs hold nothing between their pixels, and memory goes with the square.
+        sound = bool(self.scales) and all(0 < scale <= 4 for scale in self.scales)
+        require(sound, "scales", self.scales, "one at least, above 0 and at most 4 each")
 
 
 class CoarseToFine(Chain):

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from pimper_torch.coarse.matching import Level, Matcher, Windows, level_of, pair, shifted
 from pimper_torch.coarse.neighbours import choose_sources, step_for_one_pixel
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.parallel import side_by_side
@@ -54,6 +54,9 @@ class DensifyConfig:
         require(self.coarsest_px >= 32, "coarsest_px", self.coarsest_px, "32 or more")
         require(self.levels >= 1, "levels", self.levels, "1 or more")
         require(self.max_hypotheses >= 8, "max_hypotheses", self.max_hypotheses, "8 or more")
+        # A search of a pixel takes 4 bytes a hypothesis and source; photographs end at
+        # 65,535.
+        require_at_most(self, coarsest_px=65_535, levels=16, max_hypotheses=10_000)
 
     def factors(self, longest_px: int) -> tuple[int, ...]:
         """Give by how much photographs of that size are reduced, the coarsest first."""

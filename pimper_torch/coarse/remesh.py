@@ -11,7 +11,7 @@ from pimper_torch.coarse.contradicted import contradicted, misfit_of
 from pimper_torch.coarse.inherit import fitted_normals, normal_weights, with_points
 from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.coarse.trim import enclosed_holes
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.surfaces import face_normals, side_lengths
 from pimper_torch.geometry.topology import corners_of, face_edges, vertex_fans
@@ -68,6 +68,12 @@ class RemeshConfig:
         require(self.min_samples > 0, "remesh.min_samples", self.min_samples, "above 0")
         require(self.max_facets >= 1, "remesh.max_facets", self.max_facets, "1 or more")
         require(0 <= self.max_hole < 1, "remesh.max_hole", self.max_hole, "in [0, 1)")
+        # A facet of fewer samples than 45 says nothing of its light.
+        require_at_most(self, "remesh", max_facets=1_000_000)
+        # No directions differ by more.
+        require_at_most(self, "remesh", max_spread_deg=180.0)
+        # One facet has not more.
+        require_at_most(self, "remesh", min_samples=1e9)
 
 
 class Remesh(Stage):

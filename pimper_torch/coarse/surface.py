@@ -14,7 +14,7 @@ from pimper_torch.coarse.given_mesh import oriented_outward
 from pimper_torch.coarse.matched import pixel_size
 from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.trim import supported_components
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import triangulation_angles
@@ -51,6 +51,9 @@ class CoarseSurfaceConfig:
 
     def __post_init__(self) -> None:
         require(self.num_facets >= 4, "num_facets", self.num_facets, "4 or more")
+        # A facet of fewer samples than 45 says nothing of its light: 45 million are a
+        # pass's.
+        require_at_most(self, "coarse_surface", num_facets=1_000_000)
 
 
 class CoarseSurface(Stage):

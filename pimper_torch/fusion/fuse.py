@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.contacts import Contacts, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.continuation import about_mean
@@ -63,7 +63,9 @@ class FuseConfig:
 
     def __post_init__(self) -> None:
         each = self.samples_per_vertex
-        require(each > 0, "fuse.samples_per_vertex", each, "above 0")
+        # The number of vertices goes with the square: 16 a sample tell all that it says.
+        sound = 0.25 <= each <= 65_535
+        require(sound, "fuse.samples_per_vertex", each, "at least 0.25, at most 65,535")
         require(
             self.bias_iterations >= 0, "fuse.bias_iterations", self.bias_iterations, "0 or more"
         )
@@ -73,6 +75,8 @@ class FuseConfig:
         )
         some = self.slopes or self.heights or self.points or self.contours
         require(some, "fuse.slopes", self.slopes, "true unless heights or points are")
+        # A solve each.
+        require_at_most(self, "fuse", bias_iterations=1000, noise_iterations=1000, error_draws=1000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

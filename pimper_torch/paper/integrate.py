@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.geometry.surfaces import slopes_from_normals
@@ -45,6 +45,8 @@ class IntegrateConfig:
 
     def __post_init__(self) -> None:
         require(self.iterations >= 0, "iterations", self.iterations, "0 or more")
+        # A solve each.
+        require_at_most(self, iterations=1000)
 
 
 class Integrate(Stage):

@@ -9,7 +9,7 @@ from torch.nn.functional import grid_sample, normalize
 
 from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.surface import smoothed_normals
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
@@ -76,6 +76,8 @@ class TriangulateConfig:
 
     def __post_init__(self) -> None:
         require(self.num_points >= 4, "num_points", self.num_points, "4 or more")
+        # As many points as the largest clouds have.
+        require_at_most(self, num_points=1_000_000)
 
 
 class Triangulate(Stage):

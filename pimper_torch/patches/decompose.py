@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pixels import pixel_centers
@@ -42,6 +42,12 @@ class DecomposeConfig:
         require(self.overlap_samples >= 1, "overlap_samples", self.overlap_samples, "1 or more")
         require(self.max_samples >= 1, "max_samples", self.max_samples, "1 or more")
         require(self.bucket_entries >= 1, "bucket_entries", self.bucket_entries, "1 or more")
+        # Memory goes with the square; photographs hold nothing between their pixels.
+        require_at_most(self, samples_per_pixel=8.0)
+        # Wider than any photograph.
+        require_at_most(self, overlap_samples=65_535.0)
+        # A hundred bytes each, of every batch that is worked on.
+        require_at_most(self, bucket_entries=100_000_000)
 
 
 class Decompose(Stage):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import RayCaster
@@ -56,6 +56,8 @@ class WarpConfig:
         )
         require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
         require(self.occlusion_stride >= 1, "occlusion_stride", self.occlusion_stride, ">= 1")
+        # Wider than any template.
+        require_at_most(self, occlusion_stride=65_535)
 
 
 class Warp(Stage):

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import side_by_side
@@ -138,6 +138,20 @@ class FactorizeConfig:
         limit = self.max_iterations
         require(limit >= 1, "factorize.max_iterations", limit, "1 or more")
         require(self.tolerance > 0, "factorize.tolerance", self.tolerance, "above 0")
+        # More photographs than fit a machine's memory.
+        require_at_most(self, "factorize", min_views=100_000)
+        # It has converged, or never will.
+        require_at_most(self, "factorize", max_iterations=100_000)
+        # Finite, so that no product with zero is undefined; squares are a loss of their
+        # own.
+        require_at_most(
+            self,
+            "factorize",
+            light_prior=1e12,
+            geometry_weight=1e12,
+            loss_scale=1e12,
+            tolerance=1.0,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 
 # Scale of Cauchy's loss in standard deviations, at which it is 95 % efficient on Gaussian noise
 # (Holland & Welsch, 1977).
@@ -50,6 +50,8 @@ class Cauchy:
 
     def __post_init__(self) -> None:
         require(self.scale > 0, "scale", self.scale, "above 0")
+        # Finite, so that no product with zero is undefined.
+        require_at_most(self, scale=1e12)
 
     def weights(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import InputError, OutputError, ReconstructionError, caution, overheard
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
@@ -92,6 +92,16 @@ class ReconstructConfig:
         require(self.track_iterations >= 0, "track_iterations", self.track_iterations, "0 or more")
         require(self.threads >= 0, "threads", self.threads, "0 for all cores, or a number of them")
         require(self.seed >= 0, "seed", self.seed, "0 or more")
+        # Two photographs' matches take 4 bytes for every pair of features.
+        require_at_most(self, max_features=65_536)
+        # More than any photograph has neighbours, and more processors than COLMAP counts.
+        require_at_most(self, guided_pairs=100_000, threads=1024)
+        # A structure from motion each, and a bundle adjustment each.
+        require_at_most(self, starts=1000, track_iterations=1000)
+        # COLMAP's seeds are whole numbers of 32 bits.
+        require_at_most(self, seed=2**31 - 1)
+        # Contrasts are fractions of full scale; the others reach beyond any photograph.
+        require_at_most(self, peak_threshold=1.0, edge_threshold=1e6, max_error_px=1e6)
 
     @property
     def features(self) -> FeatureSettings:

@@ -12,7 +12,7 @@ from skimage.measure import find_contours
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.parallel import side_by_side
@@ -66,6 +66,18 @@ class RayConfig:
             require(0 < degrees <= 180, f"contours.{name}", degrees, "in (0, 180]")
         require(self.border_px >= 0, "contours.border_px", self.border_px, "0 or more")
         require(self.min_length_px >= 0, "contours.min_length_px", self.min_length_px, "0 up")
+        # A pixel of a contour each; the longest photographs' have so many.
+        require_at_most(self, "contours", per_view=1_000_000)
+        # Photographs end there.
+        require_at_most(
+            self,
+            "contours",
+            blur_px=65_535.0,
+            tangent_px=65_535.0,
+            corner_px=65_535.0,
+            border_px=65_535.0,
+            min_length_px=65_535.0,
+        )
 
 
 def contour_rays(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +29,8 @@ class SilhouetteConfig:
         low, high = self.region[:3], self.region[3:]
         fits = len(self.region) in (0, 6) and all(a < b for a, b in zip(low, high, strict=True))
         require(fits, "region", self.region, "nothing, or smallest x, y, z, then largest")
+        # Photographs end there.
+        require_at_most(self, size_px=65_535)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

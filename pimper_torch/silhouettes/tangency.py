@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.parallel import num_workers
 from pimper_torch.records import Cameras, ContourPoints, ContourRays
 from pimper_torch.silhouettes.hull import Hull
@@ -44,6 +44,10 @@ class TangencyConfig:
         require(self.refined_steps >= 2, "touch.refined_steps", self.refined_steps, "2 or more")
         require(self.tolerance_px >= 0, "touch.tolerance_px", self.tolerance_px, "0 or more")
         require(self.ambiguous_px >= 0, "touch.ambiguous_px", self.ambiguous_px, "0 or more")
+        # Each takes every ray's nearest distance.
+        require_at_most(self, "touch", steps=100_000, refined_steps=100_000)
+        # Photographs end there.
+        require_at_most(self, "touch", tolerance_px=65_535.0, ambiguous_px=65_535.0)
 
 
 @torch.no_grad()

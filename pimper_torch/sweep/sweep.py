@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.kernels.switch import compiled_for
@@ -80,6 +80,8 @@ class SweepConfig:
         require(self.min_views >= 2, "sweep.min_views", self.min_views, "2 or more")
         least = self.min_views
         require(self.num_views >= least, "sweep.num_views", self.num_views, "min_views or more")
+        # Memory and time go with both; it moves by half a sample a step.
+        require_at_most(self, "sweep", steps=1000, num_views=100_000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

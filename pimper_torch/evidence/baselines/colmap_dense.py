@@ -13,7 +13,7 @@ from typing import Literal
 
 import torch
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import MissingProgramError, ReconstructionError
 from pimper_torch.evidence.baselines.exchange import (
     estimate_of,
@@ -76,9 +76,14 @@ class ColmapDenseConfig:
             "-1, or above 0",
         )
         trim = self.poisson_trim
-        require(trim is None or trim >= 0, "poisson_trim", trim, "0 or more, or nothing")
+        within = trim is None or 0 <= trim <= 32
+        require(within, "poisson_trim", trim, "0 to 32, as deep as octrees are, or nothing")
         require(self.threads >= 0, "threads", self.threads, "0 or more")
         require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
+        # Photographs end there.
+        require_at_most(self, max_size_px=65_535)
+        # More processors than COLMAP counts.
+        require_at_most(self, threads=1024)
 
 
 @dataclass(frozen=True, slots=True)

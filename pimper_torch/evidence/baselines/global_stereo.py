@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.evidence.baselines.anchoring import (
     apply_bas_relief,
@@ -93,6 +93,14 @@ class GlobalStereoConfig:
         require(self.upgrades >= 0, "upgrades", self.upgrades, "0 or more")
         steps = self.integration_steps
         require(steps >= 0, "integration_steps", steps, "0 or more")
+        # Memory goes with the square.
+        require_at_most(self, samples_per_pixel=8.0, start_samples=100_000_000)
+        # More photographs than fit a machine's memory.
+        require_at_most(self, min_views=100_000)
+        # They have converged, or never will.
+        require_at_most(
+            self, max_iterations=100_000, upgrades=100_000, integration_steps=100_000, tolerance=1.0
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

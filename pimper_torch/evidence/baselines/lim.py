@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.evidence.baselines.anchoring import (
     apply_bas_relief,
     bas_relief_through,
@@ -82,13 +82,20 @@ class LimConfig:
 
     def __post_init__(self) -> None:
         scales = self.samples_per_pixel
-        require(len(scales) > 0 and min(scales) > 0, "samples_per_pixel", scales, "above 0")
+        within = len(scales) > 0 and all(0 < scale <= 8 for scale in scales)
+        require(within, "samples_per_pixel", scales, "above 0, at most 8 each")
         require(self.light_samples >= 16, "light_samples", self.light_samples, "16 or more")
         require(self.min_views >= 3, "min_views", self.min_views, "3 or more")
         require(self.alternations >= 1, "alternations", self.alternations, "1 or more")
         require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
         steps = self.integration_steps
         require(steps >= 0, "integration_steps", steps, "0 or more")
+        # A sample takes 100 bytes in every photograph.
+        require_at_most(self, light_samples=100_000_000)
+        # More photographs than fit a machine's memory.
+        require_at_most(self, min_views=100_000)
+        # They have converged, or never will.
+        require_at_most(self, alternations=100_000, integration_steps=100_000)
 
 
 class Lim(Stage):

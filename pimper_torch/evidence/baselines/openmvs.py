@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.evidence.baselines.exchange import (
     estimate_of,
@@ -74,6 +74,10 @@ class OpenMvsConfig:
         )
         require(self.threads >= 0, "threads", self.threads, "0 or more")
         require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
+        # Photographs end there; 16 halvings leave a pixel.
+        require_at_most(self, resolution_level=16, min_resolution_px=65_535)
+        # More than there are processors.
+        require_at_most(self, threads=1024)
 
 
 class OpenMvs(Stage):

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.evidence.baselines.exchange import (
     estimate_of,
     read_surface,
@@ -75,6 +75,10 @@ class PmvsConfig:
         require(self.quad > 0, "quad", self.quad, "above 0")
         require(self.threads >= 0, "threads", self.threads, "0 or more")
         require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
+        # 16 halvings leave a pixel of any photograph.
+        require_at_most(self, level=16, csize=65_535, wsize=65_535, min_images=100_000, quad=1e6)
+        # More than there are processors.
+        require_at_most(self, threads=1024)
 
 
 class Pmvs(Stage):

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
@@ -60,6 +60,10 @@ class SmoothedConfig:
         require(self.fidelity > 0, "fidelity", self.fidelity, "above 0")
         filled = self.filled_fidelity
         require(filled >= 0, "filled_fidelity", filled, "0 or more")
+        # Half a kilobyte each.
+        require_at_most(self, num_vertices=10_000_000)
+        # Finite, so that no product with zero is undefined.
+        require_at_most(self, fidelity=1e12, filled_fidelity=1e12)
 
 
 class Smoothed(Stage):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.evidence.metrics.evaluate import EvaluateConfig
 from pimper_torch.evidence.scenes.config import SceneConfig
 
@@ -63,6 +63,8 @@ class BenchConfig:
         require(self.seed >= 0, "seed", self.seed, "0 or more")
         require(self.samples >= 1, "samples", self.samples, "1 or more")
         require(self.processes >= 1, "processes", self.processes, "1 or more")
+        # A seed has 32 bits; a sample takes 100 bytes.
+        require_at_most(self, seed=2**32 - 1, samples=10_000_000, processes=1024)
 
     @property
     def chosen_methods(self) -> tuple[str, ...]:

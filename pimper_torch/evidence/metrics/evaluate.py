@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics.alignment import (
     Alignment,
@@ -63,10 +63,13 @@ class EvaluateConfig:
     icp: IcpConfig = field(default_factory=IcpConfig)
 
     def __post_init__(self) -> None:
-        positive = all(percent > 0 for percent in self.thresholds_percent)
-        require(positive, "thresholds_percent", self.thresholds_percent, "more than 0 each")
+        within = all(0 < percent <= 100 for percent in self.thresholds_percent)
+        require(within, "thresholds_percent", self.thresholds_percent, "above 0, at most 100 each")
+        require(self.seed >= 0, "seed", self.seed, "0 or more")
         require(self.seen_from >= 1, "seen_from", self.seen_from, "at least 1")
         require(self.samples >= 1, "samples", self.samples, "at least 1")
+        # A seed has 32 bits; a sample takes 100 bytes.
+        require_at_most(self, seen_from=100_000, seed=2**32 - 1, samples=10_000_000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.evidence.metrics.sampling import sample_surface
 from pimper_torch.evidence.metrics.similarity import similarity_between_points
 from pimper_torch.geometry.frames import rigid, transform
@@ -49,6 +49,8 @@ class IcpConfig:
         require(self.samples >= 100, "samples", self.samples, "at least 100")
         require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
         require(self.tolerance > 0, "tolerance", self.tolerance, "more than 0")
+        # A sample takes 100 bytes; it has converged, or never will.
+        require_at_most(self, samples=10_000_000, iterations=100_000, tolerance=1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

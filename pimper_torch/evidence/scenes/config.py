@@ -1,10 +1,14 @@
 """Settings of rendered scenes."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.evidence.scenes.sensor import SensorConfig
+
+# 64 GB, in which no photograph of a camera is rendered.
+_MOST_RAYS = 640_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,9 +106,21 @@ class SceneConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be photographed."""
         require(self.num_views >= 1, "num_views", self.num_views, "1 or more")
-        require(self.width >= 8, "width", self.width, "8 or more")
-        require(self.height >= 8, "height", self.height, "8 or more")
+        require(8 <= self.width <= 65_535, "width", self.width, "8 to 65,535, as of a JPEG")
+        require(8 <= self.height <= 65_535, "height", self.height, "8 to 65,535, as of a JPEG")
+        # Rays of a photograph take 100 bytes each.
+        most = int((_MOST_RAYS / (self.width * self.height)) ** 0.5)
+        require(
+            self.supersample <= most,
+            "supersample",
+            self.supersample,
+            f"{most} at most with {self.width} x {self.height} pixels; or fewer of these",
+        )
         require(self.seed >= 0, "seed", self.seed, "0 or more")
+        require(math.isfinite(self.rotation_deg), "rotation_deg", self.rotation_deg, "finite")
+        for name in ("specular", "roughness"):
+            value = getattr(self, name)
+            require(value is None or 0 <= value <= 1, name, value, "between 0 and 1")
         require(0 < self.span_deg <= 360, "span_deg", self.span_deg, "above 0, at most 360")
         lowest, highest = self.elevation_deg - self.sway_deg, self.elevation_deg + self.sway_deg
         require(
@@ -122,14 +138,13 @@ class SceneConfig:
                 fixed,
                 f"path turntable instead of {self.path}, for what stands still before the camera",
             )
-        most = 0.3 * min(self.width, self.height)
+        widest = 0.3 * min(self.width, self.height)
+        needed = (
+            f"0 or more, and both jitters together at most {widest:.0f}, 0.3 of the tighter side"
+        )
         for name in ("pan_jitter_px", "crop_jitter_px"):
-            require(
-                getattr(self, name) >= 0 and self.jitter_px <= most,
-                name,
-                getattr(self, name),
-                f"0 or more, and both jitters together at most {most:.0f}, 0.3 of the tighter side",
-            )
+            require(0 <= getattr(self, name) <= widest, name, getattr(self, name), needed)
+        require(self.jitter_px <= widest, "pan_jitter_px", self.pan_jitter_px, needed)
         require(
             not (self.constant_light and self.fixed_point_light),
             "constant_light",
@@ -151,6 +166,7 @@ class SceneConfig:
             self.irradiance,
             "some light: irradiance, ambient or flash",
         )
+        _ = self.sensor  # refuses its own
         for channel in self.albedo or ():
             require(0 <= channel <= 1, "albedo", self.albedo, "between 0 and 1 in every channel")
         require(
@@ -160,7 +176,8 @@ class SceneConfig:
             "none with albedo or specular: a metal has no matte part, and its own reflectance",
         )
         require(0 <= self.bounces <= 8, "bounces", self.bounces, "between 0 and 8")
-        _ = self.sensor  # refuses its own
+        # A seed has 32 bits; lights farther than a thousand sizes are the sun's.
+        require_at_most(self, num_views=100_000, seed=2**32 - 1, point_light_distance=1000.0)
 
     @property
     def surrounded(self) -> Literal["none", "constant", "changing"]:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +32,10 @@ class SensorConfig:
         require(self.read_noise >= 0, "read_noise", self.read_noise, "0 or more")
         require(self.shot_noise >= 0, "shot_noise", self.shot_noise, "0 or more")
         require(self.exposure > 0, "exposure", self.exposure, "more than 0")
+        # In multiples of full scale.
+        require_at_most(self, read_noise=1.0, shot_noise=1.0, exposure=1000.0)
+        # Rays a pixel and direction: 256 tell all that 8 or 16 bits can.
+        require_at_most(self, supersample=16)
 
 
 def expose(

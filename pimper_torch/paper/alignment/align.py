@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.paper.alignment.anchors import (
     Anchors,
     anchor_certainty,
@@ -93,6 +93,10 @@ class AlignConfig:
         require(self.prior > 0, "prior", self.prior, "above 0")
         require(self.scale_limit > 1, "scale_limit", self.scale_limit, "above 1")
         require(self.outlier > 0, "outlier", self.outlier, "above 0")
+        # A solve each.
+        require_at_most(self, iterations=1000)
+        # Finite, so that no product with zero is undefined.
+        require_at_most(self, anchor=1e12, points=1e12, prior=1e12)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.fusion.continuation import about_mean
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
@@ -45,6 +45,8 @@ class RefineConfig:
         for name in ("smoothing_radius_samples", "outlier_samples"):
             value = getattr(self, name)
             require(value > 0, name, value, "above 0")
+        # Wider than any template.
+        require_at_most(self, smoothing_radius_samples=65_535.0)
 
 
 class Refine(Stage):

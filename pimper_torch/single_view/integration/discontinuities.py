@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import require, require_at_most
 from pimper_torch.linalg.multigrid import Iterate
 from pimper_torch.paper.poisson import differences, differences_transposed
 from pimper_torch.progress import report
@@ -79,6 +79,10 @@ class DiscontinuityConfig:
             require(value > 0, name, value, "above 0")
         require(0 < self.tie < 1, "tie", self.tie, "in (0, 1)")
         require(self.max_iterations >= 1, "max_iterations", self.max_iterations, "1 or more")
+        # Finite, so that no product with zero is undefined.
+        require_at_most(self, scale_px=1e12, noise_scales=1e12, kink=1e12, twist=1e12)
+        # It has converged, or never will.
+        require_at_most(self, tolerance=1.0, max_iterations=100_000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -1,0 +1,132 @@
+"""No number of a setting ends in a killed process, an endless run or a silent NaN."""
+
+import dataclasses
+import importlib
+import math
+import pkgutil
+import typing
+
+import pytest
+import yaml
+
+import pimper_torch
+from pimper_torch.config import build, require_at_most, to_yaml
+from pimper_torch.errors import ConfigError
+
+ABSURD = (10**11, -1, 0, math.nan, math.inf)
+# A whole number above this is no count: an array of as many numbers does not fit a machine.
+LARGEST_COUNT = 2**32
+# Thresholds and limits that may be infinite: then nothing exceeds them, which is sound.
+MAY_BE_INFINITE = {
+    "FineSurfaceConfig.hole_px",
+    "RemeshConfig.max_departure",
+    "ColmapDenseConfig.max_minutes",
+    "OpenMvsConfig.max_minutes",
+    "PmvsConfig.max_minutes",
+    "ExtractConfig.max_expected_error",
+    "ExtractConfig.max_hole",
+    "ExtractConfig.max_stretch",
+    "RepairConfig.max_extent",
+    "RepairConfig.max_stretch",
+    "AlignConfig.scale_limit",
+    "AlignConfig.outlier",
+    "RefineConfig.outlier_samples",
+    "DecomposeConfig.max_samples",
+    "WarpConfig.saturation_level",
+}
+# Numbers that say how much there is to compute.
+AMOUNTS = (
+    *("DecomposeConfig.samples_per_pixel", "DecomposeConfig.overlap_samples"),
+    *("FuseConfig.samples_per_vertex", "CoarseToFineConfig.scales", "LimConfig.samples_per_pixel"),
+    *("GlobalStereoConfig.samples_per_pixel", "RefineConfig.smoothing_radius_samples"),
+)
+
+
+def is_config(kind, module):
+    own = isinstance(kind, type) and kind.__module__ == module and dataclasses.is_dataclass(kind)
+    return own and (kind.__name__.endswith("Config") or kind.__name__ == "Encoding")
+
+
+def configs():
+    """List the dataclasses of settings that the package has."""
+    for found in pkgutil.walk_packages(pimper_torch.__path__, "pimper_torch."):
+        module = importlib.import_module(found.name)
+        yield from (kind for kind in vars(module).values() if is_config(kind, found.name))
+
+
+def holds_number(hint):
+    return hint in (int, float) or any(map(holds_number, typing.get_args(hint)))
+
+
+def numbers():
+    """List every field of every config that holds numbers, with its type."""
+    for kind in configs():
+        hints = typing.get_type_hints(kind)
+        for field in dataclasses.fields(kind):
+            if holds_number(hints[field.name]):
+                yield kind, field.name, hints[field.name]
+
+
+NUMBERS = list(numbers())
+
+
+def shaped(value, hint, default):
+    """Give a value the form that a field asks for, or None where it has none."""
+    if hint is int or (default is None and int in typing.get_args(hint)):
+        return value if isinstance(value, int) else None
+    if isinstance(default, tuple):
+        return (float(value),) * max(1, len(default))
+    if default is None and any(typing.get_origin(arg) is tuple for arg in typing.get_args(hint)):
+        return (float(value),) * 3
+    return float(value)
+
+
+def made(kind, name, value):
+    """Make a config with one value changed, or give why it is refused."""
+    try:
+        return dataclasses.replace(kind(), **{name: value}), ""
+    except ConfigError as refusal:
+        return None, str(refusal)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "hint"), NUMBERS, ids=[f"{kind.__name__}.{name}" for kind, name, _ in NUMBERS]
+)
+def test_an_absurd_number_is_refused_or_gives_a_sound_config(kind, name, hint):
+    field = f"{kind.__name__}.{name}"
+    for absurd in ABSURD:
+        value = shaped(absurd, hint, getattr(kind(), name))
+        if value is None:
+            continue
+        config, refusal = made(kind, name, value)
+        if config is None:
+            assert name in refusal
+            assert "needed" in refusal
+            continue
+        assert build(kind, yaml.safe_load(to_yaml(config)), "again") == config
+        for one in value if isinstance(value, tuple) else (value,):
+            assert not math.isnan(one), f"{field} takes NaN"
+            assert math.isfinite(one) or field in MAY_BE_INFINITE, f"{field} takes infinity"
+            assert isinstance(one, float) or one <= LARGEST_COUNT, f"{field} takes {one}"
+            assert field not in AMOUNTS or one < 10**11, f"{field} takes {one}"
+
+
+def test_every_config_is_looked_at():
+    names = {kind.__name__ for kind, _, _ in NUMBERS}
+    assert {"CoarseToFineConfig", "FactorizeConfig", "ReconstructConfig", "SceneConfig"} <= names
+    assert len(NUMBERS) > 100
+    listed = {f"{kind.__name__}.{name}" for kind, name, _ in NUMBERS}
+    assert listed >= MAY_BE_INFINITE | {*AMOUNTS}
+
+
+@dataclasses.dataclass(frozen=True)
+class Some:
+    count: int = 3
+
+
+def test_the_bound_itself_is_allowed():
+    require_at_most(Some(), count=3)
+    with pytest.raises(ConfigError, match=r"some.count is 3; needed: 2 at most"):
+        require_at_most(Some(), "some", count=2)
+    with pytest.raises(ConfigError, match="count is nan"):
+        require_at_most(Some(count=math.nan), count=2)
