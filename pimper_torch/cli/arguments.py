@@ -8,6 +8,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
+from itertools import takewhile
 from typing import Any, TypeVar
 
 import tyro
@@ -68,7 +69,8 @@ def read_arguments(
     except SystemExit as ended:
         if not ended.code:
             raise
-        raise ConfigError(_paragraph(told.getvalue(), name)) from None
+        options = options_of(command, "," if levels else " ")
+        raise ConfigError(_paragraph(told.getvalue(), name, options, arguments)) from None
 
 
 def page(
@@ -130,13 +132,29 @@ def _value(option: Option, longest: int) -> str:
     return option.value
 
 
-def _paragraph(told: str, name: str) -> str:
+def _paragraph(told: str, name: str, options: Iterator[Option], arguments: Sequence[str]) -> str:
     """Make one paragraph of what tyro says in a box."""
-    rows = re.findall(r"^\W*[│|] (.*?)\s*[│|]$", told, flags=re.MULTILINE)
-    text = " ".join(row.strip() for row in rows if not re.fullmatch(r"\W*", row))
+    # A title, then rows between bars; or without any, where the terminal has no such characters.
+    _, *rows = [row.strip(" │|") for row in told.strip().splitlines()] or [""]
+    text = " ".join(row for row in rows if not re.fullmatch(r"\W*", row))
     text = re.split(r"For full helptext", text)[0].strip()
     text = text.replace(f"Missing from pimper {name}:", "missing:")
+    wrong = re.match(r"Error parsing (?:-\w/)?(--[\w.-]+)", text)
+    for option in options if wrong else ():
+        if wrong and wrong[1] in option.names:  # tyro tells of its types, and of Python's
+            text = f"{wrong[1]} is {_given(wrong[1], arguments)}; needed: {option.value}. "
+            text += option.meaning
     return f"{text or told.strip()} See `pimper {name} --help`."
+
+
+def _given(option: str, arguments: Sequence[str]) -> str:
+    """Give what stands behind an option, as it was written."""
+    for index, argument in enumerate(arguments):
+        name, equals, value = argument.partition("=")
+        if name.replace("_", "-") == option:
+            behind = takewhile(lambda word: not word.startswith("--"), arguments[index + 1 :])
+            return repr(value if equals else " ".join(behind))
+    return "something else"
 
 
 @contextmanager

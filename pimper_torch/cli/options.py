@@ -12,6 +12,8 @@ import tyro
 from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.coarse.reference import view_named
+from pimper_torch.config import require
 from pimper_torch.io.folders import prepare_output, require_apart
 from pimper_torch.io.marker import require_name
 from pimper_torch.io.photographs import list_images
@@ -51,6 +53,9 @@ class CommonOptions:
 
     def __post_init__(self) -> None:
         bytes_of(self.max_kept, "max_kept")
+        # The smallest photographs in which depth is searched; see DensifyConfig.
+        sound = self.max_size_px == 0 or self.max_size_px >= 32
+        require(sound, "max_size_px", self.max_size_px, "0, or 32 pixels at least")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,8 +167,8 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
     """Read the arguments, and check what can be checked without reading photographs.
 
     Raises:
-        PimperError: As :func:`parse`; the folder for the result is taken, or there are no
-            photographs.
+        PimperError: As :func:`parse`; the folder for the result is taken, there are no
+            photographs, or none of the name of the reference.
     """
     job = parse(command, arguments)
     require_apart(job.out, _inputs(job))
@@ -172,6 +177,8 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
         if folder is not None:
             for path in list_images(folder):
                 require_name(path)
+    for name in _references(job.config):
+        view_named(name, [path.name for path in list_images(job.photos)])
     return job
 
 
@@ -184,6 +191,14 @@ def _inputs(job: Job) -> dict[str, Path | None]:
         "--mesh": job.inputs.mesh,
         "--cache": job.common.cache,
     }
+
+
+def _references(config: Config) -> set[str]:
+    """Give the names of photographs that settings ask for."""
+    of_stages = [config.coarse_surface.reference]
+    if isinstance(config, PublishedConfig):
+        of_stages.append(config.triangulate.reference)
+    return {name for name in of_stages if name}
 
 
 def bundled_photographs() -> Path:

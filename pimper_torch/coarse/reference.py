@@ -1,5 +1,7 @@
 """The reference view: the frontal one, or the one that a setting names."""
 
+from collections.abc import Sequence
+
 from pimper_torch.errors import InputError
 from pimper_torch.records import SparseScene
 
@@ -21,11 +23,19 @@ def reference_view(scene: SparseScene, name: str = "") -> int:
         observed = scene.observed.to(scene.points_world.dtype)
         shared = (observed.mT @ observed).fill_diagonal_(0)
         return int(shared.sqrt().sum(dim=1).argmax())
-    names = scene.views.names
+    return view_named(name, scene.views.names, "registered photographs")
+
+
+def view_named(name: str, names: Sequence[str], of: str = "photographs") -> int:
+    """Find the one photograph of a name, with its suffix or without.
+
+    Raises:
+        InputError: None, or more than one, has that name.
+    """
     found = [index for index, known in enumerate(names) if name in (known, known.rsplit(".", 1)[0])]
     if len(found) != 1:
         raise InputError(
-            f"reference view: {len(found)} registered photographs are named {name!r}; needed: "
-            f"one of {', '.join(names)}."
+            f"reference view: {len(found)} {of} are named {name!r}; needed: one of "
+            f"{', '.join(names)}."
         )
     return found[0]

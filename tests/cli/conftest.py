@@ -9,7 +9,7 @@ from pimper_torch.records import StageReport
 def photos(tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
-    noise = np.random.default_rng(76).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    noise = np.random.default_rng(76).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     for number in range(3):
         Image.fromarray(noise).save(folder / f"{number}.png")
     return folder

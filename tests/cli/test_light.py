@@ -40,6 +40,8 @@ REFUSED = [
     ["reconstruct", "empty", "-o", "out"],
     ["reconstruct", "photos", "-o", "out", "--masks", "nowhere"],
     ["reconstruct", "photos", "-o", "out", "--factorize.solver", "none"],
+    ["reconstruct", "photos", "-o", "out", "--reference", "nosuch"],
+    ["reconstruct", "photos", "-o", "out", "--max-size-px", "1"],
     ["demo", "--preset", "papr"],
     ["demo", "-o", "photos"],
     ["render", "mug", "-o", "out", "--num-views", "-3"],

@@ -52,12 +52,12 @@ def test_options_reach_their_stages(photos, chain, tmp_path):
     out = tmp_path / "out"
     code = run(
         *("reconstruct", "--photographs.saturation", "250,251,252", photos, "--out", out),
-        *("--photographs.response", "linear", "--max-size-px", "16"),
+        *("--photographs.response", "linear", "--max-size-px", "32"),
         *("--reference", "1.png", "--sparse", tmp_path, "--reconstruct.starts", "7"),
     )
     assert code == 0
     config, views, sparse = chain.given
-    assert views.images.shape[-2:] == (12, 16)
+    assert views.images.shape[-2:] == (24, 32)
     assert (config.reconstruct.starts, config.coarse_surface.reference) == (7, "1.png")
     assert sparse == tmp_path
     written = yaml.safe_load((out / "config.yaml").read_text())
@@ -121,7 +121,13 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
         (["--preset", "papre"], "Did you mean `paper`?"),
         (["--preset", "nowhere/mine.yaml"], "there is no such file"),
         (["--reconstruct.starts", "-1"], "starts is -1; needed: 0 or more"),
-        (["--max-size-px", "-3"], "max_size_px is -3"),
+        (["--max-size-px", "-3"], "max_size_px is -3; needed: 0, or 32 pixels at least"),
+        (["--max-size-px", "1"], "max_size_px is 1; needed: 0, or 32 pixels at least"),
+        (["--reference", "nosuch"], "0 photographs are named 'nosuch'; needed: one of 0.png, 1"),
+        (["--preset", "paper", "--triangulate.reference", "9"], "0 photographs are named '9'"),
+        (["--photographs.saturation", "x"], "is 'x'; needed: {auto}|FLOAT|FLOAT,FLOAT,FLOAT."),
+        (["--scales", "x"], "--scales is 'x'; needed: FLOAT,.... Of the photographs"),
+        (["--region", "1"], "--region is '1'; needed: FLOAT,.... Box that the object is inside"),
         (["--masks", "nowhere"], "nowhere: found nothing; needed: a folder"),
     ],
 )
@@ -222,7 +228,7 @@ def test_every_setting_is_an_option_with_its_help(capsys):
     ("given", "told"),
     [
         (["--sede", "3"], "Unrecognized options: --sede, 3"),
-        (["--reconstruct.starts", "many"], "--reconstruct.starts: invalid literal"),
+        (["--reconstruct.starts", "many"], "--reconstruct.starts is 'many'; needed: INT."),
         (["--log-level", "loud"], "--log-level is 'loud'; needed: one of error"),
         (["--log-level"], "--log-level is nothing"),
     ],
