@@ -28,6 +28,7 @@ from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import connected_to
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.linalg.sums import total
 from pimper_torch.records import Cameras, ContourPoints, Record, SparseScene, Support
 from pimper_torch.sfm.surfaces import poisson_surface
 from pimper_torch.silhouettes.contours import Contours
@@ -350,7 +351,7 @@ def seen_surface(
     possible = inside & ((counts.behind < _MIN_BEHIND) | (support == Support.POINTS))
     possible = without_small_holes(vertices, faces, possible, small)
     kept = possible & ((counts.seen > 0) | known)
-    area = float(face_normals(vertices, faces[kept]).norm(dim=1).sum()) / 2
+    area = float(total(face_normals(vertices, faces[kept]).norm(dim=1))) / 2
     holes = enclosed_holes(vertices, faces, kept, config.max_unseen * area)
     kept = kept | (holes & ~connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)

@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.coarse.splitting import Split
 from pimper_torch.geometry.surfaces import barycentric_2d, vertex_normals
 from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.sums import average
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Surface
 
 # Standard error of the normals that a facet blends from those of its corners, and the weight of a
@@ -60,7 +61,7 @@ def fitted_normals(
         0, faces.flatten(), blocks.diagonal(dim1=1, dim2=2).flatten()
     )
     rhs = torch.zeros_like(vertices).index_add(0, faces.flatten(), sums.flatten(0, 1))
-    damping = (_DAMPING * diagonal.mean()).clamp_min(1e-12).expand(len(vertices))
+    damping = (_DAMPING * average(diagonal)).clamp_min(1e-12).expand(len(vertices))
     own = vertex_normals(vertices, faces)
     every = torch.arange(len(vertices), device=faces.device)
     fitted = SparseCholesky(

@@ -16,6 +16,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.geometry.surfaces import face_normals, side_lengths
 from pimper_torch.geometry.topology import corners_of, face_edges, vertex_fans
 from pimper_torch.geometry.visibility import ambient_occlusion
+from pimper_torch.linalg.sums import total
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.silhouettes.hull import Hull
@@ -267,7 +268,7 @@ def _with_data(
     if not bool(known.any()):
         return everything
     area = face_normals(vertices, faces).norm(dim=1) / 2
-    return known | enclosed_holes(vertices, faces, known, max_hole * float(area.sum()))
+    return known | enclosed_holes(vertices, faces, known, max_hole * float(total(area)))
 
 
 def _severity(

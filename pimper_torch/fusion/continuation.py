@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.geometry.topology import boundary_vertices, vertex_components
+from pimper_torch.linalg.sums import average, total
 from pimper_torch.linalg.systems import solutions
 
 # The mean counts as much as this fraction of a neighbour at least, so that the system is not
@@ -81,9 +82,9 @@ def about_mean(
         return values
     given = values[known]
     mean = given.mean(dim=0)
-    spread = (given - mean).double().square().sum(dim=1).mean()
+    spread = average((given - mean).double().square().sum(dim=1))
     one, other = values.double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
-    step = (one - other).square().sum() / max(len(one), 1)
+    step = total((one - other).square()) / max(len(one), 1)
     damping = torch.where(spread > 0, step / torch.where(spread > 0, spread, 1), 0)
     damping = damping.clamp_min(_MIN_DAMPING).expand(len(values))
     return continued(values, known, edges, mean.expand_as(values), damping)

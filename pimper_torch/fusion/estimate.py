@@ -21,6 +21,7 @@ from pimper_torch.fusion.terms import Terms
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
+from pimper_torch.linalg.sums import total
 from pimper_torch.linalg.systems import solutions, solve_compressed
 from pimper_torch.photometry.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.records import Record
@@ -107,7 +108,7 @@ def fuse_terms(
             if not kind.evaluated or len(kind.targets) == 0:
                 continue
             square, used = _evaluated(kind, weights[index], heights, probe, answer)
-            redundancy = 1 - used / found[index] / weights[index].sum()
+            redundancy = 1 - used / found[index] / total(weights[index])
             square = square / redundancy.clamp_min(_MIN_REDUNDANCY)
             found[index] = noise_factor(square[:: max(1, len(square) // _SUBSET)])
             weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[index]))
@@ -177,7 +178,7 @@ def _evaluated(
         return square, torch.tensor(evaluate(*arrays), dtype=torch.float64)
     square = kind.information.double() * kind.residual(heights).square() * kind.correlated
     used = weight * kind.information * _sum(kind, probe) * _sum(kind, answer)
-    return square, used.sum()
+    return square, total(used)
 
 
 def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:

@@ -22,6 +22,7 @@ from pimper_torch.fusion.problem import FINEST, Problem, pose
 from pimper_torch.fusion.terms import Terms
 from pimper_torch.geometry.subdivision import transferred
 from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.linalg.sums import average
 from pimper_torch.records import Convergence, Record, StopCause, Surface, SweptPatches
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
@@ -166,7 +167,7 @@ class Fuse(Stage):
             expected_error=error,
             convergence=Convergence(
                 iterations=torch.full((1,), solves, device=moved.device),
-                residual=moved.square().mean().sqrt()[None],
+                residual=average(moved.square()).sqrt()[None],
                 cause=torch.full((1,), int(StopCause.CONVERGED), device=moved.device),
             ),
         )

@@ -25,6 +25,7 @@ from pimper_torch.fusion.terms import (
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_edges
+from pimper_torch.linalg.sums import total
 from pimper_torch.records import DepthPatches, Depths, Record, SweptPatches
 
 # Information of every vertex about its present height, in units of one over its spacing squared:
@@ -258,4 +259,4 @@ def _rotation(
     """Give the mean squared angle between normals along edges, folds cut; squared radians."""
     one, other = normals[edges].unbind(dim=1)
     square = (one - other).square().sum(dim=1).clamp_max(_FOLD**2)
-    return (square.sum() / max(len(edges), 1)).clamp_min(_MIN_ROTATION)
+    return (total(square) / max(len(edges), 1)).clamp_min(_MIN_ROTATION)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.linalg.aggregation import parts_of
+from pimper_torch.linalg.sums import total
 from pimper_torch.parallel import over_rows
 
 
@@ -44,7 +45,10 @@ def conjugate_gradients(
     """
 
     def inner(one: Tensor, other: Tensor) -> Tensor:
-        return (one * other).sum(dim=dims, keepdim=True)
+        each = one * other
+        if each.dim() == len(dims):  # one system: torch would sum it as threads divide it
+            return total(each).reshape((1,) * each.dim())
+        return each.sum(dim=dims, keepdim=True)
 
     found = torch.zeros_like(rhs) if start is None else start.clone()
     residual = rhs.clone() if start is None else rhs - product(found)

@@ -12,6 +12,7 @@ from pimper_torch.linalg.aggregation import parts_of
 from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid, solve_by_cycles
 from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.sums import total
 from pimper_torch.parallel import over_rows
 
 # At this size a factor takes three times as long to make as a hierarchy, and a third as long to
@@ -136,5 +137,5 @@ def _like_a_laplacian(
     rows: Int[Tensor, " entry"], cols: Int[Tensor, " entry"], values: Float[Tensor, " entry"]
 ) -> bool:
     off = values.detach()[rows != cols]
-    positive = float(torch.where(off > 0, off, 0).sum())
-    return positive <= _POSITIVE_FRACTION * float(off.abs().sum())
+    positive = float(total(torch.where(off > 0, off, 0)))
+    return positive <= _POSITIVE_FRACTION * float(total(off.abs()))

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.linalg.sums import average
 from pimper_torch.paper.alignment.anchors import (
     Anchors,
     anchor_certainty,
@@ -371,7 +372,7 @@ def _with_one(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
 
 def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, ""]:
     square = mismatches(pulls, transforms).square().sum(dim=-1)
-    return square[pulls.weight > 0].mean().sqrt()
+    return average(square[pulls.weight > 0]).sqrt()
 
 
 def _apply(

@@ -13,6 +13,7 @@ from pimper_torch.fusion.continuation import about_mean
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_edges
+from pimper_torch.linalg.sums import average
 from pimper_torch.linalg.systems import solutions
 from pimper_torch.paper.refinement.energy import assemble, facet_trends, plane_regularization
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
@@ -99,7 +100,7 @@ class Refine(Stage):
             height_information=blend.offset_information,
             convergence=Convergence(
                 iterations=torch.ones(1, dtype=torch.long, device=points.device),
-                residual=apart.square().sum(dim=-1).mean().sqrt()[None].to(points),
+                residual=average(apart.square().sum(dim=-1)).sqrt()[None].to(points),
                 cause=torch.full((1,), int(StopCause.CONVERGED), device=points.device),
             ),
         )

@@ -1,0 +1,30 @@
+"""Sums that come out the same whatever the number of threads.
+
+Torch gives each thread a part of a long sum, so that the order of additions, and with it the last
+bits, depend on how many there are.
+"""
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+# Values of a block: a row, which one thread sums; and so many rows are summed by one thread, too.
+_BLOCK = 4096
+
+
+def total(values: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """Sum all values, block by block. Differentiable.
+
+    >>> import torch
+    >>> total(torch.arange(5.0))
+    tensor(10.)
+    """
+    flat = values.reshape(-1)
+    while len(flat) > _BLOCK:
+        flat = pad(flat, (0, -len(flat) % _BLOCK)).reshape(-1, _BLOCK).sum(dim=1)
+    return flat.sum()
+
+
+def average(values: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """Give the mean of all values, summed as by :func:`total`; NaN where there are none."""
+    return total(values) / values.numel()

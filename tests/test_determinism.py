@@ -1,0 +1,83 @@
+"""Same input, settings and seed: same bits, in one process and two, on one thread and several."""
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.sparse import sparse_scene
+from tests.test_chain import photographed, small_chain
+from tests.threads import on_threads
+
+
+def digests(record, path=""):
+    """Give the bits of every tensor in a record, shortened."""
+    if isinstance(record, torch.Tensor):
+        data = record.detach().contiguous().numpy().tobytes()
+        yield path, hashlib.sha256(data).hexdigest()[:16]
+    elif dataclasses.is_dataclass(record):
+        for field in dataclasses.fields(record):
+            yield from digests(getattr(record, field.name), f"{path}.{field.name}")
+    elif isinstance(record, tuple):
+        for index, one in enumerate(record):
+            yield from digests(one, f"{path}[{index}]")
+
+
+def of_every_stage(preset):
+    """Run a chain with known cameras; give the bits of what each stage returned.
+
+    Stages that work on parts are called in the order in which threads come to them: what they
+    gave is sorted.
+    """
+    scene = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
+    chain = small_chain(preset, sparse_scene(scene, 150, torch.Generator().manual_seed(17)))
+    found = {name: [] for name, _ in chain.named_children()}
+
+    def keep(name):
+        return lambda stage, given, record: found[name].append(tuple(digests(record)))
+
+    for name, stage in chain.named_children():
+        stage.register_forward_hook(keep(name))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PimperWarning)
+        chain(scene.views)
+    return {name: sorted(records) for name, records in found.items()}
+
+
+def first_difference(one, other):
+    for name, records in one.items():
+        for a, b in zip(records, other[name], strict=True):
+            differing = [path for (path, x), (_, y) in zip(a, b, strict=True) if x != y]
+            if differing:
+                return name, differing
+    return None
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_every_stage_gives_the_same_bits_again_and_on_any_number_of_threads(preset):
+    first, *others = on_threads(lambda: of_every_stage(preset), 1, 2, 2)
+    assert {name for name, records in first.items() if records} >= {"warp", "decompose", "extract"}
+    for other in others:
+        assert first_difference(first, other) is None
+
+
+def test_what_two_processes_give_has_the_same_bits():
+    """As is shown for one process, of hashes of objects and addresses nothing may depend."""
+    code = (
+        "import hashlib, torch; torch.set_num_threads(2)\n"
+        "from tests.test_determinism import of_every_stage\n"
+        "print(hashlib.sha256(repr(of_every_stage('paper')).encode()).hexdigest())"
+    )
+    told = {
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
+    }
+    assert len(told) == 1

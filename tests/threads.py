@@ -1,0 +1,19 @@
+"""The same work on several numbers of threads."""
+
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import torch
+
+Result = TypeVar("Result")
+
+
+def on_threads(work: Callable[[], Result], *counts: int) -> Iterator[Result]:
+    """Do the work once for each number of torch's threads; afterwards it is what it was."""
+    former = torch.get_num_threads()
+    try:
+        for count in counts:
+            torch.set_num_threads(count)
+            yield work()
+    finally:
+        torch.set_num_threads(former)
