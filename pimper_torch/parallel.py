@@ -7,7 +7,7 @@ its batch alone: neither the number of workers nor who is first changes it.
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from functools import cache
@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import torch
 
+from pimper_torch.failures import halved, out_of_memory, skipped
 from pimper_torch.progress import listening, report
 
 Item = TypeVar("Item")
@@ -36,7 +37,8 @@ def side_by_side(
     """Apply ``work`` to every item, a few at a time, and yield the results in order.
 
     Not more results than workers wait to be taken, so that memory stays bounded. Context variables
-    and whether gradients are recorded are those of the caller.
+    and whether gradients are recorded are those of the caller. An item that there was too little
+    memory for is worked on again by itself, once the others that had begun are done.
 
     Args:
         work: Called in a worker thread.
@@ -105,16 +107,29 @@ def _in_threads(
         with torch.set_grad_enabled(grad), listening(None):
             return work(item)
 
-    waiting: deque[Future[Result]] = deque()
+    waiting: deque[tuple[Item, Future[Result]]] = deque()
     pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
     # A worker's setting reaches other threads of the process too: theirs is put back.
     with _threads(torch.get_num_threads()), _closing(pool):
         for item in items:
             if len(waiting) > workers:
-                yield waiting.popleft().result()
-            waiting.append(pool.submit(copy_context().run, one, item))
+                yield _result(waiting, one)
+            waiting.append((item, pool.submit(copy_context().run, one, item)))
         while waiting:
-            yield waiting.popleft().result()
+            yield _result(waiting, one)
+
+
+def _result(waiting: deque[tuple[Item, Future[Result]]], one: Callable[[Item], Result]) -> Result:
+    """Take the first result; where memory did not suffice, repeat it alone."""
+    item, future = waiting.popleft()
+    try:
+        return future.result()
+    except Exception as error:
+        if not out_of_memory(error):
+            raise
+        wait([other for _, other in waiting])
+        skipped(halved("parallel", "batches side by side", error), error=error)
+    return copy_context().run(one, item)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.failures import over_patches
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import RayCaster
@@ -94,12 +95,31 @@ class Warp(Stage):
         sources = sources or self.prepare(views)
         if sources.caster is None:
             sources = sources.hidden_by(patches.surface or patches.coarse.mesh)
-        one = partial(self._register, cameras, sources)
+        one = partial(self._registered, views.images.shape[1], cameras, sources)
         return PatchViews(patches=patches, buckets=tuple(side_by_side(one, patches.buckets)))
 
     def prepare(self, views: Views) -> Sources:
         """Build pyramids of photographs for any number of calls, here and in the sweep."""
         return prepare(views, self.config.saturation_level, LEVELS)
+
+    def _registered(
+        self, channels: int, cameras: Cameras, sources: Sources, templates: Templates
+    ) -> Observations:
+        """Register a bucket; patches that cannot be have no valid sample."""
+
+        def lost(some: slice) -> Observations:
+            raster = templates.take(some).depth
+            shape = len(raster), cameras.num_views, channels, *raster.shape[1:]
+            radiance = raster.new_zeros(shape, dtype=sources.images.finest.dtype)
+            return Observations(radiance=radiance, valid=radiance[:, :, 0] > 0)
+
+        return over_patches(
+            lambda some: self._register(cameras, sources, templates.take(some)),
+            templates.facet,
+            "warp",
+            lost,
+            "These patches have no samples, as if no view showed them",
+        )
 
     def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
         images, config = sources.images.finest, self.config

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.failures import by_data, out_of_memory, over_patches, reason_of, skipped
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import side_by_side
@@ -29,12 +30,15 @@ from pimper_torch.photometry.shadows import cast_shadows_on_rasters
 from pimper_torch.photometry.status import light_varies, patch_status, warn_of_undetermined
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import (
+    Convergence,
+    Failure,
     Observations,
     PatchStatus,
     PatchViews,
     PhotometricPatches,
     Photometry,
     Record,
+    StopCause,
     Templates,
 )
 from pimper_torch.stage import Stage
@@ -75,6 +79,8 @@ SHADOW_SAMPLES = 2.0
 
 # Entries of J that are factorized together: a choice, their working set fits the cache.
 PART_ENTRIES = 400_000
+
+_COARSE_NORMALS = "These patches keep the coarse mesh's normals"
 
 # The deviation of a patch's residuals is estimated from about this many samples: a choice.
 SPREAD_SAMPLES = 512
@@ -235,11 +241,29 @@ class Factorize(Stage):
                 :func:`~pimper_torch.photometry.lights.thinned` are enough.
         """
         coarse = [transferred_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
-        field = light_of_mesh(seen, coarse, self.config.min_views, self.config.light)
+        field = self._field(seen, coarse)
         if not self.config.shadows or not bool(field.point_light.any()):
             return Illumination(field=field, caster=None)
         mesh = seen.patches.surface or seen.patches.coarse.mesh
         return Illumination(field=field, caster=RayCaster(mesh.vertices_world, mesh.faces))
+
+    def _field(self, seen: PatchViews, coarse: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
+        """Fit the light field; soft light, which is simpler, where what was asked for fails."""
+        min_views, model = self.config.min_views, self.config.light
+        try:
+            return light_of_mesh(seen, coarse, min_views, model)
+        except Exception as error:
+            if model == "soft" or not by_data(error) or out_of_memory(error):
+                raise
+            failure = Failure(
+                stage="factorize",
+                what="solver",
+                name=f"fit of {model} light",
+                reason=reason_of(error),
+                done="Soft light was fitted instead",
+            )
+            skipped(failure, error=error)
+        return light_of_mesh(seen, coarse, min_views, "soft")
 
     def solve(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
         """Factorize some patches, independently of others.
@@ -251,9 +275,20 @@ class Factorize(Stage):
         for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
             normals = transferred_normals(seen.patches.coarse, templates)
             bucket = _Bucket(templates=templates, registered=registered, normals=normals)
-            prepared = self._prepare(bucket, _illuminated(bucket, light), light.field)
-            buckets.append(self._photometry(bucket, prepared, self._solve(prepared.problem)))
+            found = over_patches(
+                partial(self._solved, bucket, light),
+                templates.facet,
+                "factorize",
+                partial(_lost, bucket),
+                _COARSE_NORMALS,
+            )
+            buckets.append(found)
         return PhotometricPatches(patches=seen.patches, buckets=tuple(buckets))
+
+    def _solved(self, bucket: _Bucket, light: Illumination, some: slice) -> Photometry:
+        bucket = bucket.take(some)
+        prepared = self._prepare(bucket, _illuminated(bucket, light), light.field)
+        return self._photometry(bucket, prepared, self._solve(prepared.problem))
 
     def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
         """Set the scale of albedo over all patches, and warn of those that are undetermined."""
@@ -310,6 +345,7 @@ class Factorize(Stage):
         ).any(dim=1)
         failed = (prepared.status == int(PatchStatus.DETERMINED)) & ~is_solved
         status = torch.where(failed, int(PatchStatus.FAILED), prepared.status)
+        _tell_failed(bucket.templates.facet[failed])
         determined = status == int(PatchStatus.DETERMINED)
         valid = enough_views & determined[:, None] & finite_normals & (found.normals[..., 2] < 0)
         fitted = factors.lights.isfinite().flatten(1).all(dim=1) & rows.seen.flatten(1).any(dim=1)
@@ -329,7 +365,7 @@ class Factorize(Stage):
             valid=on_raster(valid, rows.index, nowhere),
             information=on_raster(found.information * valid, rows.index, blank),
             status=status,
-            convergence=factors.convergence,
+            convergence=_finite(factors.convergence, status),
         )
 
     def _problem(
@@ -391,6 +427,52 @@ def _in_parts(seen: PatchViews, bucket: int) -> list[PatchViews]:
         for first in range(0, max(count, 1), size)
         for some in (slice(first, first + size),)
     ]
+
+
+def _tell_failed(facets: Int[Tensor, " failed"]) -> None:
+    """Note the patches for which the solver found no finite solution."""
+    skipped(
+        *(
+            Failure(
+                stage="factorize",
+                what="patch",
+                name=str(facet),
+                reason="the solver found no finite solution",
+                done=_COARSE_NORMALS,
+            )
+            for facet in facets.tolist()
+        )
+    )
+
+
+def _finite(convergence: Convergence, status: Int[Tensor, " patch"]) -> Convergence:
+    """Give patches without a solution no residual, where it is not finite."""
+    failed = status == int(PatchStatus.FAILED)
+    residual = convergence.residual
+    return convergence.replace(
+        residual=torch.where(failed & ~residual.isfinite(), torch.zeros_like(residual), residual)
+    )
+
+
+def _lost(bucket: _Bucket, some: slice) -> Photometry:
+    """Give a patch that cannot be factorized: coarse normals, and nothing else."""
+    registered, normals = bucket.registered.take(some), bucket.normals[some]
+    _, views, channels, _, _ = registered.radiance.shape
+    blank = torch.zeros_like(normals[..., 0])
+    each = torch.zeros_like(blank[:, 0, 0])
+    return Photometry(
+        normals_patch=normals,
+        albedo=blank[..., None].expand(-1, -1, -1, channels),
+        lights_patch=blank.new_zeros(len(blank), views, 4),
+        valid=blank > 0,
+        information=blank,
+        status=torch.full_like(each, int(PatchStatus.FAILED), dtype=torch.long),
+        convergence=Convergence(
+            iterations=torch.zeros_like(each, dtype=torch.long),
+            residual=each,
+            cause=torch.full_like(each, int(StopCause.EMPTY), dtype=torch.long),
+        ),
+    )
 
 
 def _illuminated(bucket: _Bucket, light: Illumination) -> Bool[Tensor, "patch view height width"]:

@@ -1,6 +1,7 @@
 """Frozen data that travels between stages; no algorithms."""
 
 from pimper_torch.records.contours import ContourPoints, ContourRays
+from pimper_torch.records.failure import Failure
 from pimper_torch.records.patches import (
     AlignStatus,
     Convergence,
@@ -46,6 +47,7 @@ __all__ = [
     "DtuProtocol",
     "Estimate",
     "FacetPoints",
+    "Failure",
     "Heights",
     "Lens",
     "Mesh",

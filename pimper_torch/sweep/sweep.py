@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.failures import over_patches, skipped
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.kernels.switch import compiled_for
@@ -19,6 +20,7 @@ from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
+    Failure,
     Heights,
     Observations,
     PatchViews,
@@ -51,6 +53,8 @@ MIN_SPREAD = 1e-4
 # Samples of the template between heights that are tried, and in the standard deviation of the
 # window that costs are averaged over: choices.
 _STEP, _WINDOW = 0.7, 1.5
+
+_NO_HEIGHTS = "These patches keep their template's heights there"
 
 # Of the robust cost, in standard deviations of the patch's residuals: a choice (2.385 is 95 %
 # efficient on Gaussian noise).
@@ -146,11 +150,51 @@ class Sweep(Stage):
         """
         buckets = zip(photometric.patches.buckets, seen.buckets, photometric.buckets, strict=True)
         coarse = photometric.patches.coarse
-        one = partial(self._sweep, cameras, sources or prepare(views), coarse)
+        one = partial(self._swept, cameras, sources or prepare(views), coarse)
         return SweptPatches(
             photometric=photometric,
             buckets=tuple(side_by_side(one, list(buckets))),
             averaged=window_size(_WINDOW),
+        )
+
+    def _swept(
+        self,
+        cameras: Cameras,
+        sources: Sources,
+        coarse: CoarseMesh,
+        bucket: tuple[Templates, Observations, Photometry],
+    ) -> Heights:
+        """Sweep a bucket; patches that cannot be have no heights."""
+        templates = bucket[0]
+
+        def lost(some: slice) -> Heights:
+            zero = torch.zeros_like(templates.depth[some])
+            none = templates.facet.new_zeros(len(zero))
+            return Heights(offset=zero, information=zero, num_views=none)
+
+        def work(some: slice) -> Heights:
+            part = tuple(each.take(some) for each in bucket)
+            return self._sweep(cameras, sources, coarse, part)
+
+        found = over_patches(work, templates.facet, "sweep", lost, _NO_HEIGHTS)
+        finite = found.offset.isfinite() & found.information.isfinite()
+        if bool(finite.all()):
+            return found
+        skipped(
+            *(
+                Failure(
+                    stage="sweep",
+                    what="patch",
+                    name=str(int(facet)),
+                    reason="heights are not finite",
+                    done=_NO_HEIGHTS,
+                )
+                for facet in templates.facet[~finite.flatten(1).all(dim=1)]
+            )
+        )
+        return found.replace(
+            offset=torch.where(finite, found.offset, 0),
+            information=torch.where(finite, found.information, 0),
         )
 
     def _sweep(

@@ -1,0 +1,211 @@
+"""One bad patch, view or solver does not end a run: it is left out, and told at the end.
+
+Only what data can cause is left out: numbers that are not finite or matrices that are singular, too
+little memory, and input of one part that cannot be used. Other errors are mistakes in a program,
+and end the run.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from itertools import groupby
+from typing import Literal
+
+import numpy as np
+import torch
+
+from pimper_torch.errors import InputError, ReconstructionError, caution
+from pimper_torch.records.failure import Failure
+from pimper_torch.records.record import AnyRecord
+
+OnFailure = Literal["skip", "fail"]
+
+_on_failure: ContextVar[OnFailure] = ContextVar("on_failure", default="skip")
+_collected: ContextVar[list[Failure] | None] = ContextVar("collected", default=None)
+
+# What torch says when an allocation fails on the CPU; CUDA's error has a class of its own.
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
+
+# Names that a warning lists at most: a choice; `summary.json` has all.
+_LISTED = 5
+
+
+@contextmanager
+def collecting(on_failure: OnFailure = "skip") -> Iterator[list[Failure]]:
+    """Collect what is skipped inside the ``with`` block, in threads that it starts, too.
+
+    Where the block ends in an error, what was skipped before is told first.
+
+    Args:
+        on_failure: ``"fail"`` refuses instead of skipping.
+
+    Yields:
+        The failures so far, for :func:`warn_of` at the end.
+    """
+    failures: list[Failure] = []
+    policy, collected = _on_failure.set(on_failure), _collected.set(failures)
+    try:
+        yield failures
+    except BaseException:
+        warn_of(failures)
+        raise
+    finally:
+        _on_failure.reset(policy)
+        _collected.reset(collected)
+
+
+def skipped(*failures: Failure, error: BaseException | None = None) -> None:
+    """Note what failed and was left out; outside of :func:`collecting`, warn of it at once.
+
+    Args:
+        failures: What failed.
+        error: That they failed with.
+
+    Raises:
+        ReconstructionError: Failures are to end the run.
+    """
+    if failures and _on_failure.get() == "fail":
+        first = failures[0]
+        raise ReconstructionError(
+            f"{first.stage}: {first.what} {first.name} failed: {first.reason}. Failures are to end "
+            f"the run (`on_failure` is fail); with skip it goes on: {first.done}."
+        ) from error
+    collected = _collected.get()
+    if collected is None:
+        warn_of(failures)
+    else:
+        collected.extend(failures)
+
+
+def distinct(failures: Sequence[Failure]) -> tuple[Failure, ...]:
+    """List each failure once, in an order that threads do not change."""
+    return tuple(sorted(set(failures), key=_order))
+
+
+def warn_of(failures: Sequence[Failure]) -> None:
+    """Warn once of each kind of failure, with how many there are and the first of them."""
+    for (stage, what, done), some in groupby(distinct(failures), key=_kind):
+        kind = list(some)
+        names = list(dict.fromkeys(failure.name for failure in kind))
+        listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+        caution(
+            f"{stage}: {len(names)} failed ({what} {listed}): {kind[0].reason}. {done}. "
+            "`failures` in summary.json lists all; `--on-failure fail` ends the run instead.",
+            stacklevel=3,
+        )
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Tell whether an allocation failed."""
+    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(text in str(error) for text in _NO_MEMORY)
+
+
+def by_data(error: BaseException) -> bool:
+    """Tell whether numbers may have caused an error, rather than a mistake in a program.
+
+    >>> by_data(torch.linalg.LinAlgError("singular")), by_data(KeyError("lights"))
+    (True, False)
+    """
+    numeric = (FloatingPointError, ZeroDivisionError, np.linalg.LinAlgError, InputError)
+    # Torch's kernels raise RuntimeError; its subclasses but the first are of other kinds.
+    return isinstance(error, numeric) or type(error) in (RuntimeError, torch.linalg.LinAlgError)
+
+
+def reason_of(error: BaseException) -> str:
+    """Give an error in a line."""
+    text = " ".join(str(error).split()).rstrip(".")
+    return f"{type(error).__name__.lstrip('_')}: {text}" if text else type(error).__name__
+
+
+def over_patches(
+    work: Callable[[slice], AnyRecord],
+    facets: Sequence[int] | torch.Tensor,
+    stage: str,
+    lost: Callable[[slice], AnyRecord],
+    done: str,
+) -> AnyRecord:
+    """Work on a batch of patches; on its halves, and theirs, where it fails as a whole.
+
+    So a patch that cannot be worked on is found and left out, and too little memory for the batch
+    may be enough for its parts. Patches must be independent; those of a batch that was divided are
+    as in the whole one, up to rounding.
+
+    Args:
+        work: Called with a range of patches; gives their record.
+        facets: One for each patch.
+        stage: Named in failures.
+        lost: Gives the record of a patch that failed.
+        done: What that means, for the warning.
+
+    Raises:
+        BaseException: What no data can cause, what all of several patches failed with, or a lack
+            of memory for one patch.
+    """
+    whole = slice(0, len(facets))
+    try:
+        return work(whole)
+    except Exception as error:
+        if not (by_data(error) or out_of_memory(error)) or len(facets) == 0:
+            raise
+        first = error
+    failed: list[tuple[int, Exception]] = []
+    parts = _divided(work, whole, first, failed)
+    if len(failed) == len(facets) > 1:
+        raise first
+    numbers = [int(facet) for facet in facets]
+    if out_of_memory(first):
+        name = f"{len(numbers)} patches from facet {numbers[0]} on"
+        skipped(halved(stage, name, first), error=first)
+    for index, error in failed:
+        reason, name = reason_of(error), str(numbers[index])
+        failure = Failure(stage=stage, what="patch", name=name, reason=reason, done=done)
+        skipped(failure, error=error)
+        parts.append((index, lost(slice(index, index + 1))))
+    ordered = [record for _, record in sorted(parts, key=lambda part: part[0])]
+    return type(ordered[0]).cat(ordered)
+
+
+def halved(stage: str, name: str, error: BaseException) -> Failure:
+    """Say that work was divided for lack of memory."""
+    return Failure(
+        stage=stage,
+        what="memory",
+        name=name,
+        reason=reason_of(error),
+        done="Memory did not suffice; the work was done again in smaller parts, nothing is missing",
+    )
+
+
+def _divided(
+    work: Callable[[slice], AnyRecord],
+    some: slice,
+    error: Exception,
+    failed: list[tuple[int, Exception]],
+) -> list[tuple[int, AnyRecord]]:
+    """Work on both halves of a range that failed; list the patches that failed by themselves."""
+    if some.stop - some.start == 1:
+        if out_of_memory(error):
+            raise error
+        failed.append((some.start, error))
+        return []
+    middle = (some.start + some.stop) // 2
+    found = []
+    for half in (slice(some.start, middle), slice(middle, some.stop)):
+        try:
+            found.append((half.start, work(half)))
+        except Exception as again:
+            if not (by_data(again) or out_of_memory(again)):
+                raise
+            found += _divided(work, half, again, failed)
+    return found
+
+
+def _kind(failure: Failure) -> tuple[str, str, str]:
+    return failure.stage, failure.what, failure.done
+
+
+def _order(failure: Failure) -> tuple[object, ...]:
+    number = int(failure.name) if failure.name.isdigit() else -1
+    return (*_kind(failure), number, failure.name, failure.reason)
