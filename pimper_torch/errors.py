@@ -29,6 +29,10 @@ class ReconstructionError(PimperError):
     """Structure from motion, or a stage after it, found too little to go on."""
 
 
+class NumericalError(PimperError):
+    """Equations that the data leave open or contradict."""
+
+
 class MissingProgramError(ReconstructionError):
     """A program that somebody else wrote is not installed here."""
 

@@ -9,16 +9,17 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import groupby
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
 
-from pimper_torch.errors import InputError, ReconstructionError, caution
+from pimper_torch.errors import InputError, NumericalError, ReconstructionError, caution
 from pimper_torch.records.failure import Failure
 from pimper_torch.records.record import AnyRecord
 
 OnFailure = Literal["skip", "fail"]
+Result = TypeVar("Result")
 
 _on_failure: ContextVar[OnFailure] = ContextVar("on_failure", default="skip")
 _collected: ContextVar[list[Failure] | None] = ContextVar("collected", default=None)
@@ -31,23 +32,36 @@ _LISTED = 5
 
 
 @contextmanager
-def collecting(on_failure: OnFailure = "skip") -> Iterator[list[Failure]]:
+def collecting(
+    on_failure: OnFailure = "skip", failures: list[Failure] | None = None
+) -> Iterator[list[Failure]]:
     """Collect what is skipped inside the ``with`` block, in threads that it starts, too.
 
     Where the block ends in an error, what was skipped before is told first.
 
     Args:
         on_failure: ``"fail"`` refuses instead of skipping.
+        failures: Those so far, which more are added to.
 
     Yields:
         The failures so far, for :func:`warn_of` at the end.
+
+    Raises:
+        ReconstructionError: In place of an error of memory.
     """
-    failures: list[Failure] = []
+    failures = [] if failures is None else failures
     policy, collected = _on_failure.set(on_failure), _collected.set(failures)
     try:
         yield failures
-    except BaseException:
+    except BaseException as error:
+        _collected.set(None)
         warn_of(failures)
+        if out_of_memory(error):
+            raise ReconstructionError(
+                f"Memory did not suffice, for the smallest parts either: {reason_of(error)}. "
+                "Shrink the photographs (`--max-size-px`), take fewer samples "
+                "(`decompose.samples_per_pixel`), or close other programs."
+            ) from error
         raise
     finally:
         _on_failure.reset(policy)
@@ -95,6 +109,36 @@ def warn_of(failures: Sequence[Failure]) -> None:
         )
 
 
+def solved_or(
+    solve: Callable[[], Result],
+    otherwise: Callable[[], Result],
+    *,
+    stage: str,
+    name: str,
+    done: str,
+    memory: bool = False,
+) -> Result:
+    """Solve, or give something else where equations have no solution.
+
+    Args:
+        solve: What may fail.
+        otherwise: Gives what stands in for the solution.
+        stage: Named in the failure.
+        name: Of the system.
+        done: What stands in.
+        memory: Whether that also helps where memory does not suffice.
+    """
+    try:
+        return solve()
+    except Exception as error:
+        if not (memory if out_of_memory(error) else by_data(error)):
+            raise
+        reason = reason_of(error)
+        failure = Failure(stage=stage, what="solver", name=name, reason=reason, done=done)
+        skipped(failure, error=error)
+    return otherwise()
+
+
 def out_of_memory(error: BaseException) -> bool:
     """Tell whether an allocation failed."""
     if isinstance(error, MemoryError | torch.OutOfMemoryError):
@@ -108,9 +152,9 @@ def by_data(error: BaseException) -> bool:
     >>> by_data(torch.linalg.LinAlgError("singular")), by_data(KeyError("lights"))
     (True, False)
     """
-    numeric = (FloatingPointError, ZeroDivisionError, np.linalg.LinAlgError, InputError)
-    # Torch's kernels raise RuntimeError; its subclasses but the first are of other kinds.
-    return isinstance(error, numeric) or type(error) in (RuntimeError, torch.linalg.LinAlgError)
+    numeric = (ArithmeticError, np.linalg.LinAlgError, InputError, NumericalError)
+    # Torch's kernels raise RuntimeError itself; its subclasses but one are of other kinds.
+    return isinstance(error, numeric) or type(error) in (RuntimeError, torch._C._LinAlgError)
 
 
 def reason_of(error: BaseException) -> str:
@@ -158,10 +202,10 @@ def over_patches(
     if out_of_memory(first):
         name = f"{len(numbers)} patches from facet {numbers[0]} on"
         skipped(halved(stage, name, first), error=first)
-    for index, error in failed:
-        reason, name = reason_of(error), str(numbers[index])
+    for index, cause in failed:
+        reason, name = reason_of(cause), str(numbers[index])
         failure = Failure(stage=stage, what="patch", name=name, reason=reason, done=done)
-        skipped(failure, error=error)
+        skipped(failure, error=cause)
         parts.append((index, lost(slice(index, index + 1))))
     ordered = [record for _, record in sorted(parts, key=lambda part: part[0])]
     return type(ordered[0]).cat(ordered)

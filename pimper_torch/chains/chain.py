@@ -11,11 +11,13 @@ from torch import nn
 from pimper_torch.chains.kept import kept_call
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
+from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
 from pimper_torch.kernels.switch import Kernels, compile_all, using
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     DepthPatches,
+    Failure,
     Mesh,
     PatchSet,
     PhotometricPatches,
@@ -29,6 +31,7 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer, Silent, recorded, stage
+from pimper_torch.sfm.sound_views import sound
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store
 
@@ -47,6 +50,7 @@ class Step(Record):
         heights: Depth maps of all patches, with their normals, albedo and lights.
         surface: Joined over all facets, on the subdivided coarse mesh.
         reports: One of each stage that ran for this step, in order.
+        failures: What was left out so far, as it failed.
     """
 
     scale: float
@@ -56,6 +60,7 @@ class Step(Record):
     heights: DepthPatches | SweptPatches
     surface: Surface
     reports: tuple[StageReport, ...] = ()
+    failures: tuple[Failure, ...] = ()
 
     @property
     def photometric(self) -> PhotometricPatches:
@@ -90,9 +95,14 @@ class Chain(Stage):
     extract: Callable[[Surface], Mesh]
 
     def __init__(
-        self, kernels: Kernels, observer: Observer | None, store: Store | None = None
+        self,
+        kernels: Kernels,
+        observer: Observer | None,
+        store: Store | None = None,
+        on_failure: OnFailure = "skip",
     ) -> None:
         super().__init__()
+        self.on_failure: OnFailure = on_failure
         self.kernels: Kernels = kernels
         self.observer = observer or Silent()
         self.store = store
@@ -118,17 +128,19 @@ class Chain(Stage):
     def placed(self, views: Views | SparseScene, sparse_model: Path | str | None) -> SparseScene:
         """Give photographs with their cameras: those that come with them, or else find them.
 
+        Views that cannot be used are left out.
+
         Raises:
             InputError: Cameras come twice.
         """
         if isinstance(views, Views):
-            return self.reconstruct(views, sparse_model)
+            return sound(self.reconstruct(views, sparse_model))
         if sparse_model is not None:
             raise InputError(
                 f"{type(self).__name__}: cameras come twice, with the scene and as the model in "
                 f"{sparse_model}; needed: one of the two."
             )
-        return views
+        return sound(views)
 
     def steps(
         self,
@@ -143,8 +155,13 @@ class Chain(Stage):
         """
         passes = self.passes(views, sparse_model, mesh)
         compiled = self.kernels == "torch"
+        failures: list[Failure] = []
         while True:
-            with using(self.kernels), recorded(self, self.observer) as reports:
+            with (
+                using(self.kernels),
+                collecting(self.on_failure, failures),
+                recorded(self, self.observer) as reports,
+            ):
                 if not compiled:
                     with stage("compile"):  # next to nothing but for an installation's first run
                         compile_all()
@@ -152,7 +169,9 @@ class Chain(Stage):
                 step = next(passes, None)
             if step is None:
                 return
-            yield step.replace(reports=tuple(reports))
+            if step.last:
+                warn_of(failures)
+            yield step.replace(reports=tuple(reports), failures=distinct(failures))
 
     def forward(
         self,
@@ -190,6 +209,7 @@ class Chain(Stage):
             coarse=step.coarse,
             patches=step.heights,
             report=(*reports, *last),
+            failures=step.failures,
         )
 
     def _swap(self, stages: Mapping[str, nn.Module]) -> None:

@@ -20,6 +20,7 @@ from pimper_torch.coarse.remesh import Remesh, RemeshConfig
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.config import require
 from pimper_torch.errors import caution, held
+from pimper_torch.failures import OnFailure
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.memory import bytes_of, release_memory, require_memory
@@ -61,6 +62,7 @@ class CoarseToFineConfig:
     Attributes:
         chain: Which chain these are the settings of.
         kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or none.
+        on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         max_memory: Such as 4GB: a run whose last pass would take more is refused in its first.
         scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
@@ -68,6 +70,7 @@ class CoarseToFineConfig:
 
     chain: ClassVar[str] = "coarse-to-fine"
     kernels: Kernels = "numba"
+    on_failure: OnFailure = "skip"
     max_memory: str = ""
     scales: tuple[float, ...] = (0.25, 0.5, 1.0)
     photographs: Encoding = field(default_factory=Encoding)
@@ -105,7 +108,7 @@ class CoarseToFine(Chain):
     ) -> None:
         self.config = config = config or CoarseToFineConfig()
         store = opened(cache)
-        super().__init__(config.kernels, observer, store)
+        super().__init__(config.kernels, observer, store, config.on_failure)
         self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()

@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 from pimper_torch.coarse.matching import Level, Matcher, Windows, level_of, pair, shifted
 from pimper_torch.coarse.neighbours import choose_sources, step_for_one_pixel
 from pimper_torch.config import require, require_at_most
+from pimper_torch.failures import solved_or
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.parallel import side_by_side
@@ -106,7 +107,7 @@ def depth_maps(
     maps: list[DepthMaps] = []
     for factor in config.factors(max(scene.views.images.shape[-2:])):
         level, before = level_of(scene, factor), maps[-1] if maps else None
-        search = partial(_search, scene, points, level, config, before)
+        search = partial(_searched, scene, points, level, config, before)
         found = list(side_by_side(search, range(scene.cameras.num_views)))
         maps.append(_checked(factor, level, found))
     return tuple(maps)
@@ -118,6 +119,29 @@ class _Found(Record):
     score: Float[Tensor, "height width"]
     step: float
     sources: Int[Tensor, " source"]
+
+
+def _searched(
+    scene: SparseScene,
+    points: Int[Tensor, " chosen"],
+    level: Level,
+    config: DensifyConfig,
+    before: DepthMaps | None,
+    view: int,
+) -> _Found:
+    """Search a view's depths; none are found where that fails."""
+
+    def nothing() -> _Found:
+        blank, none = torch.zeros_like(level.tone[view]), points.new_zeros(0)
+        return _Found(inverse_depth=blank, score=blank, step=0.0, sources=none)
+
+    return solved_or(
+        lambda: _search(scene, points, level, config, before, view),
+        nothing,
+        stage="coarse_surface",
+        name=f"depths of {scene.views.names[view]}",
+        done="The coarse surface is found without these",
+    )
 
 
 def _search(

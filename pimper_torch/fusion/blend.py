@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.nn.utils.rnn import pad_sequence
 
+from pimper_torch.failures import over_patches
 from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
 from pimper_torch.geometry.subdivision import Subdivision
@@ -136,12 +137,31 @@ def blend_patches(
     buckets = zip(
         depths.patches.buckets, depths.buckets, depths.photometric.buckets, heights, strict=True
     )
-    estimates = list(
-        side_by_side(
-            lambda bucket: _estimates(coarse, *bucket, subdivision, directions, around, vertices),
-            list(buckets),
-        )
-    )
+
+    def of_bucket(
+        bucket: tuple[Templates, Depths, Photometry, Heights | None],
+    ) -> _Estimates:
+        def of_some(some: slice) -> _Estimates:
+            templates, height_field, photometry, offsets = bucket
+            return _estimates(
+                coarse,
+                templates.take(some),
+                height_field.take(some),
+                photometry.take(some),
+                None if offsets is None else offsets.take(some),
+                subdivision,
+                directions,
+                around,
+                vertices,
+            )
+
+        def lost(some: slice) -> _Estimates:
+            return of_some(slice(some.start, some.start))
+
+        facets = bucket[0].facet
+        return over_patches(of_some, facets, "fuse", lost, "These patches are left out")
+
+    estimates = list(side_by_side(of_bucket, list(buckets)))
     return _blend(_Estimates.cat(estimates), len(subdivision.points), outlier_samples)
 
 

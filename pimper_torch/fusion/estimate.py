@@ -17,14 +17,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.failures import reason_of, skipped
 from pimper_torch.fusion.terms import Terms
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
+from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.linalg.sums import total
 from pimper_torch.linalg.systems import solutions, solve_compressed
 from pimper_torch.photometry.robust import CAUCHY_TUNING, robust_variance
-from pimper_torch.records import Record
+from pimper_torch.records import Failure, Record
 
 # Of the heights, in the energy norm, relative. With 1e-5 vertices of the demo move by 5e-5 of a
 # spacing, with 1e-3 by 1.6e-3; to estimate noise, that is enough. Gradients ask for more.
@@ -91,8 +93,8 @@ def fuse_terms(
     the factors too: every solve answers by the implicit function. That takes as many more solves
     as there were, once gradients are asked for.
 
-    Raises:
-        SingularSystemError: See :func:`~pimper_torch.linalg.systems.solutions`.
+    Where the equations have no solution, heights are those of the solve before, or ``start``, and
+    that is told (:func:`~pimper_torch.failures.skipped`).
     """
     found = [torch.ones((), dtype=torch.float64, device=start.device) for _ in kinds]
     weights = [torch.ones_like(kind.information).double() for kind in kinds]
@@ -101,9 +103,13 @@ def fuse_terms(
     probe = probe.double().to(start.device)
     heights = near
     for _ in range(iterations - 1):
-        heights, answer = _solved(
-            kinds, weights, found, start, damping, probe, guess=heights, tolerance=_ESTIMATING
-        )
+        try:
+            heights, answer = _solved(
+                kinds, weights, found, start, damping, probe, guess=heights, tolerance=_ESTIMATING
+            )
+        except SingularSystemError as error:
+            _kept(error)
+            break
         for index, kind in enumerate(kinds):
             if not kind.evaluated or len(kind.targets) == 0:
                 continue
@@ -112,14 +118,32 @@ def fuse_terms(
             square = square / redundancy.clamp_min(_MIN_REDUNDANCY)
             found[index] = noise_factor(square[:: max(1, len(square) // _SUBSET)])
             weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[index]))
-    (heights,) = _solved(kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE)
+    else:
+        try:
+            (heights,) = _solved(
+                kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE
+            )
+        except SingularSystemError as error:
+            _kept(error)
     return Fused(
-        heights=heights,
+        heights=start.double() if heights is None else heights,
         factors=tuple(float(factor.detach()) for factor in found),
         kinds=tuple(kinds),
         weights=tuple(weight.detach() for weight in weights),
         damping=damping.detach(),
     )
+
+
+def _kept(error: SingularSystemError) -> None:
+    """Note that a solve failed."""
+    failure = Failure(
+        stage="fuse",
+        what="solver",
+        name="the fusion",
+        reason=reason_of(error),
+        done="The surface is the one before that solve: of the solve before, or of the patches",
+    )
+    skipped(failure, error=error)
 
 
 def _solved(

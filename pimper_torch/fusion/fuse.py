@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.failures import solved_or
 from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.contacts import Contacts, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.continuation import about_mean
@@ -151,9 +152,16 @@ class Fuse(Stage):
         heights = solved.to(blend.heights)
         vertices = subdivision.points + heights[:, None] * directions
         normals = vertex_normals(vertices, subdivision.faces)
-        error = None
+        error: Float[Tensor, " vertex"] | None = None
         if expected and config.error_draws > 0:
-            error = self._expected_error(coarse, shared, fine, normals)
+            error = solved_or(
+                lambda: self._expected_error(coarse, shared, fine, normals),
+                lambda: None,
+                stage="fuse",
+                name="the expected error",
+                done="The surface has no expected errors",
+                memory=True,
+            )
         moved = (heights - blend.heights).detach()
         return Surface(
             vertices_world=vertices,
@@ -263,8 +271,19 @@ class Fuse(Stage):
         detail = self._fused(problem, [*terms, problem.slopes(normals)]).heights
         correlated = [*terms, problem.slopes(normals, shared.tilt_variance)]
         coarse = self._fused(problem, correlated, near=detail).heights
-        part = CoarsePart(problem.subdivision, problem.facets)
-        return detail + part(coarse - detail), 2 * iterations
+
+        def with_coarse_shape() -> Float[Tensor, " vertex"]:
+            part = CoarsePart(problem.subdivision, problem.facets)
+            return detail + part(coarse - detail)
+
+        found = solved_or(
+            with_coarse_shape,
+            lambda: detail,
+            stage="fuse",
+            name="the fusion's coarse shape",
+            done="The surface has the coarse shape of independent errors",
+        )
+        return found, 2 * iterations
 
     def _heights(self, problem: Problem, shared: Float[Tensor, ""] | None) -> list[Terms]:
         return problem.heights(shared) if self.config.heights else []

@@ -1,7 +1,7 @@
 """What a run found, in numbers: lights and the summary, ready for JSON."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.io.version import installed_version
-from pimper_torch.records import Reconstruction
+from pimper_torch.records import Failure, Reconstruction
 
 # What JSON can hold.
 Report = dict[str, object]
@@ -136,6 +136,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "registered": scene.views.num_views,
         "unregistered": list(scene.unregistered),
         "doubt": scene.doubt or None,
+        "failures": _failures(result.failures),
         "sparse_points": len(scene.points_world),
         "mesh_points": len(result.coarse.mesh.vertices_world),
         "triangles": len(result.coarse.mesh.faces),
@@ -161,6 +162,17 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
             for report in result.report
         ],
     }
+
+
+def _failures(failures: Sequence[Failure]) -> list[Report]:
+    """List failures of one kind and reason together, by the names of what failed."""
+    names: dict[tuple[str, str, str, str], list[str]] = {}
+    for each in failures:
+        names.setdefault((each.stage, each.what, each.reason, each.done), []).append(each.name)
+    return [
+        {"stage": stage, "what": what, "names": some, "reason": reason, "done": done}
+        for (stage, what, reason, done), some in names.items()
+    ]
 
 
 def _finite(value: float | int) -> float | int | None:

@@ -4,14 +4,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import PimperError
+from pimper_torch.errors import NumericalError
 
 # Maximum residual of a solution, with the diagonal scaled to 1, relative to the right-hand side: a
 # choice, far above rounding and far below any noise of the data.
 WORST_RESIDUAL = 1e-6
 
 
-class SingularSystemError(PimperError):
+class SingularSystemError(NumericalError):
     """Linear equations that do not determine their unknowns."""
 
 

@@ -1,19 +1,19 @@
 """Solution of sparse systems by Cholesky or multigrid, by their size."""
 
-from contextlib import suppress
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from pimper_torch.failures import reason_of, skipped
 from pimper_torch.linalg.aggregation import parts_of
 from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid, solve_by_cycles
 from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.sums import total
 from pimper_torch.parallel import over_rows
+from pimper_torch.records.failure import Failure
 
 # At this size a factor takes three times as long to make as a hierarchy, and a third as long to
 # use; it is exact, and the three coordinates of a surface make up for half a second.
@@ -91,9 +91,10 @@ def solutions(
     prepared = prepare(rows, cols, values, size, what, tolerance=tolerance)
     try:
         return tuple(prepared.solve(side) for side in sides)
-    except SingularSystemError:
+    except SingularSystemError as error:
         if isinstance(prepared, SparseCholesky):
             raise
+        _by_factor(what, error)
     factor = SparseCholesky(rows, cols, values, size, what)
     return tuple(factor.solve(side) for side in sides)
 
@@ -126,11 +127,20 @@ def solve_compressed(
         positive, total = (sum(part) for part in zip(*parts, strict=True))
         if positive <= _POSITIVE_FRACTION * total:
             refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
-            with suppress(SingularSystemError):
+            try:
                 return solve_by_cycles(matrix, diagonal, sides, tolerance, what, start).values
+            except SingularSystemError as error:
+                _by_factor(what, error)
     rows = np.repeat(np.arange(len(sides)), np.diff(matrix.indptr))
     index = torch.from_numpy(rows), torch.from_numpy(matrix.indices).long()
     return SparseCholesky(*index, torch.from_numpy(matrix.data), len(sides), what).solve(sides)
+
+
+def _by_factor(what: str, error: SingularSystemError) -> None:
+    """Note that multigrid did not converge."""
+    done = "It is solved by a Cholesky factor instead, which takes more time and memory"
+    failure = Failure(stage="linalg", what="solver", name=what, reason=reason_of(error), done=done)
+    skipped(failure, error=error)
 
 
 def _like_a_laplacian(

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from pimper_torch.records.failure import Failure
 from pimper_torch.records.patches import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
@@ -39,6 +40,7 @@ class Reconstruction(Record):
         coarse: The facets.
         patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
         report: One entry a stage, in the order they ran.
+        failures: What was left out, as it failed.
     """
 
     mesh: Mesh
@@ -47,6 +49,7 @@ class Reconstruction(Record):
     patches: DepthPatches | SweptPatches
     report: tuple[StageReport, ...]
     silhouettes: Silhouettes
+    failures: tuple[Failure, ...] = ()
 
     @property
     def cameras(self) -> Cameras:

@@ -4,8 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError, caution
-from pimper_torch.records import Silhouettes, SparseScene
+from pimper_torch.errors import InputError, PimperWarning, caution
+from pimper_torch.failures import skipped
+from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
 from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import cut_in_iterations
@@ -46,7 +47,8 @@ class FindSilhouettes(Stage):
             return Silhouettes.everything(scene.views)
         if masks is not None:
             reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
-            return Silhouettes(inside=masks.float(), reliable=reliable, source="masks")
+            found = Silhouettes(inside=masks.float(), reliable=reliable, source="masks")
+            return _believed(found, scene.views.names)
         if config.object == "masks":
             raise InputError(
                 "`silhouettes.object` is masks, but the photographs come without any. Give a "
@@ -62,7 +64,7 @@ class FindSilhouettes(Stage):
         if cuts is None or doubt:
             _warn(doubt, cues.plane is not None)
             return Silhouettes.everything(scene.views, self._top(cues))
-        return silhouettes_of(cuts, scene.views, self.details)
+        return _believed(silhouettes_of(cuts, scene.views, self.details), scene.views.names)
 
     def _top(self, cues: Cues) -> Float[Tensor, "4"] | None:
         """Give the upper side of the supporting plane, as thick as its points are rough."""
@@ -109,6 +111,26 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     if silhouettes.source != "found":
         return scene
     return scene.replace(views=scene.views.replace(masks=silhouettes.inside > _USED))
+
+
+def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
+    """Take empty silhouettes for unreliable: the hull of all views would be empty."""
+    empty = silhouettes.reliable & ~(silhouettes.inside > 0.5).flatten(1).any(dim=1)
+    if not bool(empty.any()):
+        return silhouettes
+    skipped(
+        *(
+            Failure(
+                stage="silhouettes",
+                what="view",
+                name=names[view],
+                reason="its silhouette is empty",
+                done="These silhouettes do not constrain the surface",
+            )
+            for view in empty.nonzero()[:, 0].tolist()
+        )
+    )
+    return silhouettes.replace(reliable=silhouettes.reliable & ~empty)
 
 
 def _warn(why: str, on_plane: bool) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.failures import solved_or
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.parallel import side_by_side
@@ -104,7 +105,13 @@ def contour_rays(
     config = config or RayConfig()
 
     def of_view(view: int) -> ContourRays:
-        return _of_view(silhouettes.inside[view], cameras, view, config)
+        return solved_or(
+            lambda: _of_view(silhouettes.inside[view], cameras, view, config),
+            lambda: _nothing(cameras),
+            stage="contours",
+            name=f"contours of view {view}",
+            done="The surface is found without these contours",
+        )
 
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
     found = [_nothing(cameras), *side_by_side(of_view, views)]

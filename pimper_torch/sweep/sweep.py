@@ -173,7 +173,8 @@ class Sweep(Stage):
             return Heights(offset=zero, information=zero, num_views=none)
 
         def work(some: slice) -> Heights:
-            part = tuple(each.take(some) for each in bucket)
+            templates, registered, photometry = bucket
+            part = templates.take(some), registered.take(some), photometry.take(some)
             return self._sweep(cameras, sources, coarse, part)
 
         found = over_patches(work, templates.facet, "sweep", lost, _NO_HEIGHTS)

@@ -1,0 +1,137 @@
+"""Which views of a scene can be used at all, and the scene without the others."""
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.failures import skipped
+from pimper_torch.geometry.projection import project
+from pimper_torch.radiometry import SATURATED
+from pimper_torch.records import Failure, SparseScene
+
+# A view must have this fraction of the points that it observed in front of it, and within its
+# frame enlarged by the margin on every side (a fraction of it): choices, far below what any camera
+# of a model has, whose points reproject within pixels.
+_MIN_IN_FRAME, _MARGIN = 0.5, 0.1
+
+# As many as a surface needs: the least that a sweep compares.
+_MIN_VIEWS = 3
+
+
+@torch.no_grad()
+def sound(scene: SparseScene) -> SparseScene:
+    """Leave out views that show nothing or stand nowhere, and points that are nowhere.
+
+    Args:
+        scene: Photographs, cameras and cloud. Where all can be used, it is returned as it is.
+
+    Raises:
+        ReconstructionError: Fewer than three views are left.
+    """
+    finite = scene.points_world.isfinite().all(dim=1)
+    if not bool(finite.all()):
+        lost = f"{int((~finite).sum())} of {len(finite)}"
+        skipped(_failure("points", lost, "their coordinates are not finite", "They are left out"))
+        scene = with_points(scene, finite)
+    reasons = dict(_unusable(scene))
+    if not reasons:
+        return scene
+    names = scene.views.names
+    if scene.views.num_views - len(reasons) < _MIN_VIEWS:
+        listed = "; ".join(f"{names[view]}: {reason}" for view, reason in reasons.items())
+        raise ReconstructionError(
+            f"{scene.views.num_views - len(reasons)} of {scene.views.num_views} views can be used; "
+            f"needed: {_MIN_VIEWS}. {listed}. Look at these photographs, masks and cameras."
+        )
+    done = "These views are left out, as if they had not been taken"
+    skipped(*(_failure("view", names[view], reason, done) for view, reason in reasons.items()))
+    kept = torch.ones(scene.views.num_views, dtype=torch.bool)
+    kept[list(reasons)] = False
+    return with_views(scene, kept)
+
+
+def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
+    """Keep some of the views, and what these observe; the others count as not registered."""
+    index = kept.nonzero()[:, 0].tolist()
+    observed = kept.to(scene.observation_view.device)[scene.observation_view]
+    number = kept.long().cumsum(dim=0).to(scene.observation_view.device) - 1
+    maps, names = scene.background_from_view, scene.views.names
+    left_out = tuple(name for name, keep in zip(names, kept.tolist(), strict=True) if not keep)
+    return scene.replace(
+        views=scene.views.take(index),
+        cameras=scene.cameras.take(index),
+        observation_point=scene.observation_point[observed],
+        observation_view=number[scene.observation_view[observed]],
+        observation_pixels=scene.observation_pixels[observed],
+        lenses=tuple(scene.lenses[view] for view in index) if scene.lenses else (),
+        unregistered=(*scene.unregistered, *left_out),
+        background_from_view=maps[kept.to(maps.device)] if len(maps) else maps,
+    )
+
+
+def with_points(scene: SparseScene, kept: Bool[Tensor, " point"]) -> SparseScene:
+    """Keep some of the points, and where they were observed."""
+    observed = kept[scene.observation_point]
+    number = kept.long().cumsum(dim=0) - 1
+    return scene.replace(
+        points_world=scene.points_world[kept],
+        reprojection_errors_px=scene.reprojection_errors_px[kept],
+        observation_point=number[scene.observation_point[observed]],
+        observation_view=scene.observation_view[observed],
+        observation_pixels=scene.observation_pixels[observed],
+    )
+
+
+def _failure(what: str, name: str, reason: str, done: str) -> Failure:
+    return Failure(stage="cameras", what=what, name=name, reason=reason, done=done)
+
+
+def _unusable(scene: SparseScene) -> Iterator[tuple[int, str]]:
+    """List the views that cannot be used, each with the reason."""
+    inside, masks = scene.views.inside, scene.views.masks
+    for view in range(scene.views.num_views):
+        shown = inside[view]
+        if masks is not None:
+            shown = shown & masks[view]
+        reason = _nowhere(scene, view)
+        if not reason and not bool(shown.any()):
+            reason = "its mask is empty"
+        reason = reason or _blank(scene.views.images[view], shown)
+        if reason:
+            yield view, reason
+
+
+def _blank(image: Tensor, shown: Bool[Tensor, "height width"]) -> str:
+    """Say why a photograph shows nothing, if so."""
+    low, high = image.aminmax()
+    if bool((low >= 0) & (low < SATURATED) & (high > 0) & (high < torch.inf)) and bool(shown.all()):
+        return ""
+    radiance = image[:, shown]
+    finite = radiance.isfinite()
+    if not bool(finite.any()):
+        return "no radiance is finite"
+    if not bool((radiance[finite] > 0).any()):
+        return "it is black all over"
+    if bool((radiance[finite] >= SATURATED).all()):
+        return "it is saturated all over"
+    return ""
+
+
+def _nowhere(scene: SparseScene, view: int) -> str:
+    """Say why a camera cannot be where it is said to be, if so."""
+    pose, intrinsics = scene.cameras.cam_from_world[view], scene.cameras.intrinsics[view]
+    if not bool(pose.isfinite().all() and intrinsics.isfinite().all()):
+        return "its camera has numbers that are not finite"
+    points = scene.points_world[scene.observation_point[scene.observation_view == view]]
+    if len(points) == 0:
+        return ""
+    pixels, depth = project(points, pose, intrinsics)
+    size = scene.cameras.sizes_px[view]
+    within = (pixels > -_MARGIN * size) & (pixels < (1 + _MARGIN) * size)
+    share = float((within.all(dim=1) & (depth > 0)).float().mean())
+    if share >= _MIN_IN_FRAME:
+        return ""
+    return f"its camera has {share:.0%} of the points that it observed in its frame"
