@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import groupby
+from traceback import clear_frames
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -193,7 +194,7 @@ def over_patches(
     except Exception as error:
         if not (by_data(error) or out_of_memory(error)) or len(facets) == 0:
             raise
-        first = error
+        first = released(error)
     failed: list[tuple[int, Exception]] = []
     parts = _divided(work, whole, first, failed)
     if len(failed) == len(facets) > 1:
@@ -209,6 +210,12 @@ def over_patches(
         parts.append((index, lost(slice(index, index + 1))))
     ordered = [record for _, record in sorted(parts, key=lambda part: part[0])]
     return type(ordered[0]).cat(ordered)
+
+
+def released(error: Exception) -> Exception:
+    """Let go of what an error's traceback holds, such as the tensors that there was no room for."""
+    clear_frames(error.__traceback__)
+    return error
 
 
 def halved(stage: str, name: str, error: BaseException) -> Failure:
@@ -237,11 +244,14 @@ def _divided(
     middle = (some.start + some.stop) // 2
     found = []
     for half in (slice(some.start, middle), slice(middle, some.stop)):
+        again = None
         try:
             found.append((half.start, work(half)))
-        except Exception as again:
-            if not (by_data(again) or out_of_memory(again)):
+        except Exception as caught:
+            if not (by_data(caught) or out_of_memory(caught)):
                 raise
+            again = released(caught)
+        if again is not None:
             found += _divided(work, half, again, failed)
     return found
 

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import torch
 
-from pimper_torch.failures import halved, out_of_memory, skipped
+from pimper_torch.failures import halved, out_of_memory, released, skipped
 from pimper_torch.progress import listening, report
 
 Item = TypeVar("Item")
@@ -128,7 +128,9 @@ def _result(waiting: deque[tuple[Item, Future[Result]]], one: Callable[[Item], R
         if not out_of_memory(error):
             raise
         wait([other for _, other in waiting])
-        skipped(halved("parallel", "batches side by side", error), error=error)
+        failure = halved("parallel", "batches side by side", released(error))
+        skipped(failure, error=error)
+    del future
     return copy_context().run(one, item)
 
 

@@ -1,0 +1,567 @@
+"""A patch, a view or a solver that fails is left out, and told; what remains is as without it."""
+
+import warnings
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+import pimper_torch as pt
+from pimper_torch.chains.streaming import photometry_and_heights
+from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
+from pimper_torch.evidence.bench.gradients import small_scene
+from pimper_torch.failures import (
+    by_data,
+    collecting,
+    distinct,
+    out_of_memory,
+    over_patches,
+    skipped,
+    solved_or,
+    warn_of,
+)
+from pimper_torch.fusion import estimate
+from pimper_torch.io.reports import summary_report
+from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.parallel import side_by_side
+from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.patches.warp import Warp
+from pimper_torch.photometry import factorize as factorization
+from pimper_torch.photometry.factorize import Factorize
+from pimper_torch.records import Failure, Heights, PatchStatus, Silhouettes
+from pimper_torch.sfm.sound_views import sound
+from pimper_torch.silhouettes.find import FindSilhouettes
+from pimper_torch.silhouettes.settings import SilhouetteConfig
+from pimper_torch.stage import Given
+from pimper_torch.sweep.sweep import Sweep
+
+# As torch words it on the CPU.
+NO_MEMORY = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 123456789 bytes."
+
+
+def heights(some):
+    count = len(range(some.start, some.stop))
+    offset = torch.arange(some.start, some.stop, dtype=torch.float32)[:, None, None]
+    return Heights(
+        offset=offset, information=torch.ones_like(offset), num_views=torch.ones(count).long()
+    )
+
+
+def nothing(some):
+    return heights(some).replace(offset=torch.full((1, 1, 1), -1.0))
+
+
+def divided(fails, count=8, lost=nothing):
+    """Work on patches of which a range fails with what ``fails`` gives for it."""
+
+    def work(some):
+        if error := fails(some):
+            raise error
+        return heights(some)
+
+    return over_patches(work, list(range(100, 100 + count)), "sweep", lost, "Kept")
+
+
+def holds(some, *bad):
+    return any(some.start <= one < some.stop for one in bad)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [RuntimeError("numbers"), np.linalg.LinAlgError("singular"), InputError("none")],
+    ids=lambda error: type(error).__name__,
+)
+def test_only_the_bad_patches_of_a_batch_are_lost(error):
+    with collecting() as failures:
+        found = divided(lambda some: error if holds(some, 2, 5) else None)
+    assert found.offset[:, 0, 0].tolist() == [0, 1, -1, 3, 4, -1, 6, 7]
+    assert [(each.what, each.name) for each in failures] == [("patch", "102"), ("patch", "105")]
+
+
+def test_a_failure_may_end_the_run_by_name():
+    with (
+        pytest.raises(ReconstructionError, match="sweep: patch 102 failed: RuntimeError: numbers"),
+        collecting("fail"),
+    ):
+        divided(lambda some: RuntimeError("numbers") if holds(some, 2) else None)
+
+
+@pytest.mark.parametrize("kind", [TypeError, KeyError, AssertionError, NotImplementedError])
+def test_mistakes_in_a_program_are_not_hidden(kind):
+    with pytest.raises(kind), collecting():
+        divided(lambda some: kind("wrong") if holds(some, 2) else None)
+
+
+def test_what_all_patches_fail_with_is_raised():
+    with pytest.raises(RuntimeError, match="size of tensor"), collecting():
+        divided(lambda _: RuntimeError("size of tensor a must match"))
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError(NO_MEMORY)], ids=["python", "torch"])
+def test_a_batch_is_halved_until_memory_suffices_and_nothing_is_lost(error):
+    assert out_of_memory(error)
+    sizes = []
+
+    def fails(some):
+        sizes.append(some.stop - some.start)
+        return error if sizes[-1] > 2 else None
+
+    with collecting() as failures:
+        found = divided(fails)
+    assert found.offset[:, 0, 0].tolist() == list(range(8))
+    assert sizes[:3] == [8, 4, 2]
+    (failure,) = failures
+    assert failure.what == "memory"
+    assert "nothing is missing" in failure.done
+
+
+def test_memory_that_does_not_suffice_for_one_patch_ends_the_run_and_says_what_was_needed():
+    with (
+        pytest.raises(ReconstructionError, match=r"123456789 bytes.*--max-size-px"),
+        collecting(),
+    ):
+        divided(lambda some: RuntimeError(NO_MEMORY) if holds(some, 3) else None)
+
+
+def test_what_failed_for_lack_of_memory_is_not_held_by_its_error():
+    class Large:
+        alive = 0
+
+        def __init__(self):
+            Large.alive += 1
+
+        def __del__(self):
+            Large.alive -= 1
+
+    seen = []
+
+    def work(some):
+        seen.append(Large.alive)
+        large = Large()
+        if some.stop - some.start > 1:
+            raise MemoryError
+        del large
+        return heights(some)
+
+    with collecting():
+        over_patches(work, [1, 2, 3, 4], "sweep", nothing, "Kept")
+    assert max(seen) == 0
+
+
+def test_a_worker_without_memory_is_repeated_alone():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    running, refused, alone = [], [], []
+
+    def work(item):
+        running.append(item)
+        try:
+            if item == 3 and not refused:
+                refused.append(item)
+                raise RuntimeError(NO_MEMORY)
+            if item == 3:
+                alone.append(len(running))
+            return item * item
+        finally:
+            running.remove(item)
+
+    with collecting() as failures:
+        found = list(side_by_side(work, range(8)))
+    torch.set_num_threads(before)
+    assert found == [item * item for item in range(8)]
+    assert alone == [1]
+    assert [each.what for each in failures] == ["memory"]
+
+
+def test_a_worker_that_raises_anything_else_ends_the_work():
+    def work(item):
+        if item == 3:
+            raise KeyError("wrong")
+
+    with pytest.raises(KeyError), collecting():
+        list(side_by_side(work, range(8)))
+
+
+def test_a_kind_of_failure_is_warned_of_once_with_its_count():
+    failures = [
+        Failure(stage="sweep", what="patch", name=str(name), reason="NaN", done="Kept")
+        for name in (11, 2, 2, *range(20, 27))
+    ]
+    with pytest.warns(PimperWarning) as caught:
+        warn_of(failures)
+    (warning,) = caught
+    assert "sweep: 9 failed (patch 2, 11, 20, 21, 22, ...): NaN. Kept." in str(warning.message)
+    assert [each.name for each in distinct(failures)][:3] == ["2", "11", "20"]
+
+
+def test_outside_of_a_chain_a_failure_is_warned_of_at_once():
+    with pytest.warns(PimperWarning, match="fuse: 1 failed"):
+        skipped(Failure(stage="fuse", what="solver", name="it", reason="NaN", done="Kept"))
+
+
+def test_an_error_that_ends_a_run_comes_after_what_had_failed_before():
+    def broken():
+        with collecting():
+            divided(lambda some: RuntimeError("numbers") if holds(some, 2) else None)
+            raise KeyError("wrong")
+
+    with pytest.warns(PimperWarning, match="sweep: 1 failed"), pytest.raises(KeyError):
+        broken()
+
+
+def test_something_stands_in_for_equations_without_a_solution():
+    def singular():
+        raise SingularSystemError("singular")
+
+    given = {"stage": "fuse", "name": "the fusion", "done": "Kept"}
+    with collecting() as failures:
+        assert solved_or(singular, lambda: 3, **given) == 3
+    assert failures[0].reason == "SingularSystemError: singular"
+    with pytest.raises(ReconstructionError, match="solver the fusion"), collecting("fail"):
+        solved_or(singular, lambda: 3, **given)
+    assert not by_data(ReconstructionError("the run is to end"))
+
+
+# --- views and points of a scene ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return small_scene(num_views=6, width=64)[0].to(torch.float32)
+
+
+def with_image(scene, view, value):
+    images = scene.views.images.clone()
+    images[view] = value
+    return scene.replace(views=scene.views.replace(images=images))
+
+
+def with_pose(scene, view, change):
+    frames = scene.cameras.cam_from_world.clone()
+    frames[view] = change(frames[view])
+    return scene.replace(cameras=scene.cameras.replace(cam_from_world=frames))
+
+
+def with_empty_mask(scene, view):
+    masks = scene.views.inside.clone()
+    masks[view] = False
+    return scene.replace(views=scene.views.replace(masks=masks))
+
+
+def moved(frame):
+    frame = frame.clone()
+    frame[:3, 3] += 1000
+    return frame
+
+
+def turned(frame):
+    return torch.diag(frame.new_tensor([-1.0, 1.0, -1.0, 1.0])) @ frame
+
+
+FAULTS = {
+    "no radiance is finite": partial(with_image, value=torch.nan),
+    "it is black": partial(with_image, value=0.0),
+    "it is saturated": partial(with_image, value=1.0),
+    "in its frame": partial(with_pose, change=moved),
+    "0% of the points": partial(with_pose, change=turned),
+    "not finite": partial(with_pose, change=lambda frame: frame * torch.nan),
+    "its mask is empty": with_empty_mask,
+}
+
+
+@pytest.mark.parametrize("reason", FAULTS)
+def test_a_view_that_cannot_be_used_is_left_out_and_the_others_are_as_they_were(scene, reason):
+    with collecting() as failures:
+        found = sound(FAULTS[reason](scene, 2))
+    others = [0, 1, 3, 4, 5]
+    assert found.views.names == tuple(scene.views.names[view] for view in others)
+    assert found.unregistered == (scene.views.names[2],)
+    assert torch.equal(found.views.images, scene.views.images[others])
+    assert torch.equal(found.cameras.cam_from_world, scene.cameras.cam_from_world[others])
+    assert torch.equal(found.observed, scene.observed[:, others])
+    assert len(found.lenses) == 5
+    found.check("test")
+    (failure,) = failures
+    assert (failure.what, failure.name) == ("view", scene.views.names[2])
+    assert reason in failure.reason
+    with pytest.raises(ReconstructionError, match=reason), collecting("fail"):
+        sound(FAULTS[reason](scene, 2))
+
+
+def test_a_scene_without_faults_stays_the_same(scene):
+    assert sound(scene) is scene
+
+
+def test_points_that_are_nowhere_are_left_out(scene):
+    points = scene.points_world.clone()
+    points[[3, 5]] = torch.nan
+    kept = torch.ones(len(points), dtype=torch.bool)
+    kept[[3, 5]] = False
+    with collecting() as failures:
+        found = sound(scene.replace(points_world=points))
+    assert torch.equal(found.points_world, scene.points_world[kept])
+    assert torch.equal(found.observed, scene.observed[kept])
+    assert [each.what for each in failures] == ["points"]
+
+
+def test_too_few_views_are_refused_with_the_reason_of_each(scene):
+    blank = scene
+    for view in range(4):
+        blank = with_image(blank, view, 0.0)
+    with pytest.raises(ReconstructionError, match=r"2 of 6 views.*needed: 3.*black all over"):
+        sound(blank)
+
+
+def test_an_empty_silhouette_does_not_constrain_the_surface(scene):
+    with collecting() as failures:
+        found = FindSilhouettes()(with_empty_mask(scene, 2))
+    assert found.reliable.tolist() == [True, True, False, True, True, True]
+    assert [each.name for each in failures] == [scene.views.names[2]]
+
+
+# --- patches -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def given():
+    """Photographs of a sphere, cameras, and facets in buckets of a few patches each."""
+    scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
+    patches = Decompose(DecomposeConfig(bucket_entries=12_000))(coarse, scene.cameras)
+    assert len(patches.buckets) > 1
+    assert max(len(each.facet) for each in patches.buckets) > 3
+    return scene.views, scene.cameras, patches
+
+
+def streamed(given):
+    warp = Warp()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PimperWarning)  # of patches under too little light
+        return photometry_and_heights(warp, Factorize(), Sweep(), *given, warp.prepare(given[0]))
+
+
+@pytest.fixture(scope="module")
+def expected(given):
+    return streamed(given)
+
+
+def by_bucket(swept):
+    for photometry, found in zip(swept.photometric.buckets, swept.buckets, strict=True):
+        yield (
+            *(photometry.normals_patch, photometry.albedo, photometry.lights_patch),
+            *(photometry.valid, photometry.information, found.offset, found.information),
+        )
+
+
+def determined_patch(swept):
+    """Give the bucket and the place of a patch that light determines, among several."""
+    for index, bucket in enumerate(swept.photometric.buckets):
+        rows = bucket.determined.nonzero()[:, 0]
+        if len(bucket.status) > 1 and len(rows):
+            return index, int(rows[-1])
+    raise AssertionError("no patch is determined")
+
+
+def status_of(swept, facet):
+    for templates, bucket in zip(swept.patches.buckets, swept.photometric.buckets, strict=True):
+        for one, status in zip(templates.facet.tolist(), bucket.status.tolist(), strict=True):
+            if one == facet:
+                return PatchStatus(status)
+    raise AssertionError(facet)
+
+
+def solver(monkeypatch, change):
+    """Put a solver in the place of the own one, which it is handed with the problem."""
+    name = "variable-projection"
+    solve = factorization.SOLVERS[name]
+    changed = {**factorization.SOLVERS, name: lambda *given: change(solve, *given)}
+    monkeypatch.setattr(factorization, "SOLVERS", changed)
+
+
+def broken_for(shading, error):
+    """A solver that fails on batches with the patch of that initial shading."""
+
+    def change(solve, problem, *limits):
+        if any(torch.equal(one, shading) for one in problem.shading):
+            raise error
+        return solve(problem, *limits)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "error", [torch.linalg.LinAlgError("singular"), RuntimeError("numbers")], ids=["linalg", "any"]
+)
+def test_a_patch_that_cannot_be_factorized_keeps_its_coarse_normals(
+    given, expected, monkeypatch, error
+):
+    bucket, row = determined_patch(expected)
+    facet = int(given[2].buckets[bucket].facet[row])
+    shadings = {}
+
+    def noting(solve, problem, *limits):
+        if len(problem.shading) == len(given[2].buckets[bucket].facet):
+            shadings.setdefault(problem.shading.shape, problem.shading)
+        return solve(problem, *limits)
+
+    # Which of the calls is of that bucket is known by its facets.
+    with monkeypatch.context() as noted:
+        part = given[2].replace(buckets=(given[2].buckets[bucket],))
+        solver(noted, noting)
+        seen = Warp()(given[0], given[1], part)
+        light = Factorize().light(Warp()(*given))
+        Factorize().solve(seen, light)
+    ((_, shading),) = shadings.items()
+    solver(monkeypatch, broken_for(shading[row], error))
+    with collecting() as failures:
+        found = Factorize().solve(seen, light)
+    assert [(each.stage, each.name) for each in failures] == [("factorize", str(facet))]
+    assert found.buckets[0].status[row] == int(PatchStatus.FAILED)
+    assert not found.buckets[0].valid[row].any()
+    with pytest.raises(ReconstructionError, match=f"patch {facet} "), collecting("fail"):
+        Factorize().solve(seen, light)
+
+
+def test_a_solution_that_is_not_finite_changes_no_other_patch(given, expected, monkeypatch):
+    def change(solve, problem, *limits):
+        found = solve(problem, *limits)
+        lights = found.lights.clone()
+        lights[-1] = torch.nan
+        residual = found.convergence.residual.clone()
+        residual[-1] = torch.nan
+        return found.replace(
+            lights=lights, convergence=found.convergence.replace(residual=residual)
+        )
+
+    solver(monkeypatch, change)
+    with collecting() as failures:
+        found = streamed(given)
+    lost = {int(each.name) for each in failures}
+    assert lost
+    assert all(each.stage == "factorize" for each in failures)
+    for index, (one, other) in enumerate(zip(by_bucket(found), by_bucket(expected), strict=True)):
+        kept = [int(facet) not in lost for facet in given[2].buckets[index].facet]
+        assert all(part.isfinite().all() for part in one)
+        rows = torch.tensor(kept).nonzero()[:, 0]
+        # Albedo's scale is that of all patches together.
+        for place in (0, 3, 4):
+            assert torch.equal(one[place][rows], other[place][rows])
+    assert {status_of(found, facet) for facet in lost} == {PatchStatus.FAILED}
+
+
+def test_heights_that_are_not_finite_are_none(given, expected, monkeypatch):
+    sweep = Sweep._sweep
+
+    def spoiled(self, *handed):
+        found = sweep(self, *handed)
+        offset = found.offset.clone()
+        offset[0] = torch.nan
+        return found.replace(offset=offset)
+
+    monkeypatch.setattr(Sweep, "_sweep", spoiled)
+    with collecting() as failures:
+        found = streamed(given)
+    assert {each.stage for each in failures} == {"sweep"}
+    for one, other in zip(found.buckets, expected.buckets, strict=True):
+        assert not one.offset[0].any()
+        assert not one.information[0].any()
+        assert torch.equal(one.offset[1:], other.offset[1:])
+
+
+LIMITED = {
+    "warp": (Warp, "_register", lambda args: args[-1]),
+    "factorize": (Factorize, "_prepare", lambda args: args[1].templates),
+    "sweep": (Sweep, "_sweep", lambda args: args[-1][0]),
+}
+
+
+@pytest.mark.parametrize("stage", LIMITED)
+def test_with_too_little_memory_for_a_batch_the_result_is_the_same(
+    given, expected, monkeypatch, stage
+):
+    owner, name, templates_of = LIMITED[stage]
+    work = getattr(owner, name)
+
+    def limited(*args):
+        if len(templates_of(args).facet) > 2:
+            raise RuntimeError(NO_MEMORY)
+        return work(*args)
+
+    monkeypatch.setattr(owner, name, limited)
+    with collecting() as failures:
+        found = streamed(given)
+    assert {(each.stage, each.what) for each in failures} == {(stage, "memory")}
+    for ones, others in zip(by_bucket(found), by_bucket(expected), strict=True):
+        for one, other in zip(ones, others, strict=True):
+            if one.dtype == torch.bool:
+                assert torch.equal(one, other)
+            else:  # rounding of batches
+                size = float(other.abs().max())
+                assert_close(one, other, rtol=0, atol=1e-4 * size)
+
+
+def test_soft_light_stands_in_where_a_point_light_cannot_be_fitted(given, monkeypatch):
+    fit = factorization.light_of_mesh
+
+    def broken(seen, coarse, min_views, model):
+        if model != "soft":
+            raise torch.linalg.LinAlgError("singular")
+        return fit(seen, coarse, min_views, model)
+
+    monkeypatch.setattr(factorization, "light_of_mesh", broken)
+    with collecting() as failures:
+        light = Factorize().light(Warp()(*given))
+    assert light.field.soft.abs().max() > 0
+    assert [each.name for each in failures] == ["fit of auto light"]
+
+
+# --- whole runs --------------------------------------------------------------------------------
+
+
+def chain_of(scene, coarse, on_failure="skip"):
+    chain = pt.load_chain("default", {"scales": [0.5], "on_failure": on_failure})
+    chain.reconstruct = Given(scene)
+    chain.silhouettes = Given(Silhouettes.everything(scene.views))
+    chain.coarse_surface = Given(coarse)
+    return chain
+
+
+@pytest.mark.filterwarnings("always::pimper_torch.errors.PimperWarning")
+def test_a_run_with_a_bad_view_ends_with_a_warning_and_a_line_in_the_summary(recwarn):
+    scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
+    name = scene.views.names[2]
+    bad = with_image(scene, 2, torch.nan)
+    chain = chain_of(bad, coarse)
+    chain.silhouettes = FindSilhouettes(SilhouetteConfig(object="everything"))
+    result = chain(bad.views)
+    told = [str(each.message) for each in recwarn.list if "cameras: 1 failed" in str(each.message)]
+    assert len(told) == 1
+    assert name in told[0]
+    (line,) = summary_report(result, {})["failures"]
+    assert (line["stage"], line["what"], line["names"]) == ("cameras", "view", [name])
+    assert name in result.scene.unregistered
+    chain = chain_of(bad, coarse, on_failure="fail")
+    with pytest.raises(ReconstructionError, match=f"view {name} failed"):
+        chain(bad.views)
+
+
+@pytest.mark.filterwarnings("always::pimper_torch.errors.PimperWarning")
+@pytest.mark.parametrize("broken", [1, 3])
+def test_a_fusion_without_a_solution_keeps_the_surface_before(monkeypatch, broken):
+    scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
+    solve, calls = estimate.solve_compressed, []
+
+    def singular(*args, **settings):
+        calls.append(1)
+        if len(calls) >= broken:
+            raise SingularSystemError("singular")
+        return solve(*args, **settings)
+
+    monkeypatch.setattr(estimate, "solve_compressed", singular)
+    result = chain_of(scene, coarse)(scene.views)
+    assert result.mesh.vertices_world.isfinite().all()
+    assert ("fuse", "the fusion") in {(each.stage, each.name) for each in result.failures}
+    calls.clear()
+    with pytest.raises(ReconstructionError, match="solver the fusion failed"):
+        chain_of(scene, coarse, on_failure="fail")(scene.views)
