@@ -28,6 +28,9 @@ _collected: ContextVar[list[Failure] | None] = ContextVar("collected", default=N
 # What torch says when an allocation fails on the CPU; CUDA's error has a class of its own.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
+# Torch's own name for it is not typed.
+_LinAlgError: type[Exception] = getattr(torch.linalg, "LinAlgError")  # noqa: B009
+
 # Names that a warning lists at most: a choice; `summary.json` has all.
 _LISTED = 5
 
@@ -155,7 +158,7 @@ def by_data(error: BaseException) -> bool:
     """
     numeric = (ArithmeticError, np.linalg.LinAlgError, InputError, NumericalError)
     # Torch's kernels raise RuntimeError itself; its subclasses but one are of other kinds.
-    return isinstance(error, numeric) or type(error) in (RuntimeError, torch._C._LinAlgError)
+    return isinstance(error, numeric) or type(error) in (RuntimeError, _LinAlgError)
 
 
 def reason_of(error: BaseException) -> str:
