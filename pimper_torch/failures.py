@@ -95,6 +95,20 @@ def skipped(*failures: Failure, error: BaseException | None = None) -> None:
         collected.extend(failures)
 
 
+@contextmanager
+def noted_failures() -> Iterator[list[Failure]]:
+    """Note what is skipped inside the ``with`` block; it is collected all the same.
+
+    Yields:
+        The list that holds it when the block has ended; empty outside of :func:`collecting`.
+    """
+    collected, noted = _collected.get(), list[Failure]()
+    before = 0 if collected is None else len(collected)
+    yield noted
+    if collected is not None:
+        noted += collected[before:]
+
+
 def distinct(failures: Sequence[Failure]) -> tuple[Failure, ...]:
     """List each failure once, in an order that threads do not change."""
     return tuple(sorted(set(failures), key=_order))

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from pimper_torch.errors import OutputError, caution, overheard
-from pimper_torch.records import Record, StageReport
+from pimper_torch.failures import noted_failures, skipped
+from pimper_torch.records import Failure, Record, StageReport
 from pimper_torch.reporting import noted, repeat
 from pimper_torch.store import Store, digest, settled
 from pimper_torch.store.code import code_of
@@ -27,9 +28,10 @@ def kept_call(
 ) -> R:
     """Call a stage, or give what it gave for the same inputs in an earlier run.
 
-    What the earlier run reported and warned of is reported and warned of again. A stage of
-    another package is called every time, as its code is not known, and so is one that gradients
-    are asked of. Where the record cannot be kept, a warning says so.
+    What the earlier run reported, skipped and warned of is told again. A stage of another package
+    is called every time, as its code is not known, and so is one that gradients are asked of. What
+    was found in smaller batches for lack of memory is not kept. Where the record cannot be kept, a
+    warning says so.
 
     Args:
         store: Where records are; without, it is called.
@@ -45,13 +47,20 @@ def kept_call(
         return call(*inputs, **derived)
     found = store.find(f"{name}-{key}", cls)
     if found is not None:
+        skipped(*(Failure(**failure) for failure in found.about["failures"]))
         repeat([StageReport(**report) for report in found.about["reports"]])
         for message in found.about["cautions"]:
             caution(message)
         return typing.cast(R, _beside(found.record, inputs))
-    with overheard() as cautions, noted() as reports:
+    with overheard() as cautions, noted() as reports, noted_failures() as failures:
         result = settled(typing.cast(Record, call(*inputs, **derived)))
-    about = {"reports": list(map(dataclasses.asdict, reports)), "cautions": cautions}
+    if any(failure.what == "memory" for failure in failures):
+        return typing.cast(R, result)  # smaller batches round otherwise
+    about = {
+        "reports": list(map(dataclasses.asdict, reports)),
+        "cautions": cautions,
+        "failures": list(map(dataclasses.asdict, failures)),
+    }
     try:
         store.keep(f"{name}-{key}", result, about)
     except OutputError as error:

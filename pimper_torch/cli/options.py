@@ -38,7 +38,7 @@ class CommonOptions:
             sample's spacing and 1.5 degrees.
         fresh: Ignore what an earlier run kept.
         cache: Folder that keeps what stages find, for the next run; OUT/.stages unless given.
-        max_kept: Size it may reach, such as 2GB; what was used longest ago is deleted.
+        max_kept: Size it may reach, such as 2GB.
     """
 
     preset: str = "default"

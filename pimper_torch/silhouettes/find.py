@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError, PimperWarning, caution
+from pimper_torch.errors import InputError, caution
 from pimper_torch.failures import skipped
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
