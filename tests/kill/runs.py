@@ -12,6 +12,7 @@ Runs are forked from a process that has everything loaded; they take a second or
 
 import argparse
 import contextlib
+import faulthandler
 import hashlib
 import json
 import os
@@ -34,6 +35,8 @@ ENDINGS = ("killed", "disk", "memory")
 TIMED = ("summary.json", "overview.png", ".pimper.json")
 SETTINGS = ("--preset", "fast")
 FORMER = (*SETTINGS, "--full-mesh", "--factorize.light-prior", "3")
+# Seconds after which a run hangs, and what stands for its exit code.
+LONGEST, HANGS = 300.0, 71
 DISK_MB = 24  # the kept stages of a run take 3 MB, a former result and a new one 1 MB each
 
 
@@ -97,7 +100,8 @@ def ended_runs(
                 copied(former, out)
             line = [*command, "-o", str(out), *SETTINGS, *(["--overwrite"] * over_former)]
             code = forked(line, disturbance(ending, moment, seconds, home))
-            faults = list(half_replaced(out, (whole, former) if over_former else (whole,)))
+            faults = ["it hangs"] * (code == HANGS)
+            faults += half_replaced(out, (whole, former) if over_former else (whole,))
             kept = len(list((out / ".stages").glob("*.safetensors")))
             relieve(home)
             again = forked([*command, "-o", str(out), *SETTINGS, "--overwrite"])
@@ -174,14 +178,24 @@ def forked(line: list[str], disturbed: Disturbance = ((lambda: None), None)) -> 
             os.dup2(quiet, stream)
         code = 70
         try:
+            if os.environ.get("PIMPER_KILL_DUMP"):
+                faulthandler.dump_traceback_later(
+                    60, file=open(os.environ["PIMPER_KILL_DUMP"], "w")
+                )
             prepare()
             code = main(line)
         finally:
             os._exit(code)
-    if seconds is not None:
-        time.sleep(seconds)
-        os.kill(child, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    began, limit = time.monotonic(), LONGEST if seconds is None else seconds
+    while True:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() - began > limit:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            return -signal.SIGKILL if seconds is not None else HANGS
+        time.sleep(0.01)
 
 
 def copied(source: Path, target: Path) -> None:
