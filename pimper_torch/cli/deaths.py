@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pimper_torch.cli.faults import write_report
+from pimper_torch.cli.faults import limit, write_report
 from pimper_torch.cli.output import Output
 from pimper_torch.io.marker import STAGES
 from pimper_torch.io.stages import kept
@@ -17,25 +17,32 @@ _LESS = (
 )
 
 
-def tell_death(number: int, said: str) -> int:
+def tell_death(ended: int, said: str) -> int:
     """Tell why the work ended, what to do, and what is kept.
 
     Args:
-        number: Of the signal that ended it.
+        ended: The exit code of a process that told nothing; less than 0, of which signal it died.
         said: What native libraries said before.
 
     Returns:
         The exit code.
     """
-    code = 128 + number
-    name = signal.Signals(number).name if number in {*signal.Signals} else f"signal {number}"
-    text = f"{_what(name)}{_limit()} {_LESS}{_kept(sys.argv[1:])}"
-    if name in _CRASHES:
+    code = 128 - ended if ended < 0 else ended
+    name = _name(ended)
+    text = f"{_what(name)}{limit()} {_LESS}{_kept(sys.argv[1:])}"
+    if name != "SIGKILL":
         report = write_report(f"{name}\n{said}")
         if report is not None:
             text += f" If memory was not the reason, please report {report}."
     Output(as_json="--json" in sys.argv).error("Killed", text, code)
     return code
+
+
+def _name(ended: int) -> str:
+    if ended > 0:
+        return f"exit code {ended}"
+    known = -ended in {*signal.Signals}
+    return signal.Signals(-ended).name if known else f"signal {-ended}"
 
 
 def _what(name: str) -> str:
@@ -44,22 +51,12 @@ def _what(name: str) -> str:
             "the run was killed by the system or by somebody (SIGKILL), most likely because memory "
             "ran out."
         )
-    if name in _CRASHES:
+    if name in _CRASHES or name.startswith("exit"):
         return (
             f"the run crashed in a native library ({name}), most likely because memory ran out "
             "there."
         )
     return f"the run was ended by {name}."
-
-
-def _limit() -> str:
-    """Name the limit of this process's memory, if there is one."""
-    try:
-        import resource
-    except ImportError:  # as on Windows
-        return ""
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return "" if limit == resource.RLIM_INFINITY else f" It may take {limit / 1e9:.1f} GB at most."
 
 
 def _kept(arguments: Sequence[str]) -> str:

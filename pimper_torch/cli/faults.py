@@ -30,3 +30,15 @@ def write_report(what: BaseException | str) -> Path | None:
     except OSError:
         return None
     return Path(file.name)
+
+
+def limit() -> str:
+    """Name the limit of this process's memory in a sentence, if there is one."""
+    try:
+        import resource
+    except ImportError:  # as on Windows
+        return ""
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if most == resource.RLIM_INFINITY:
+        return ""
+    return f" Its memory is limited to {most / 1e9:.1f} GB (`ulimit -v`)."

@@ -20,10 +20,11 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import TextIO
 
-from pimper_torch.cli.faults import write_report
+from pimper_torch.cli.faults import limit, write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import exit_code, stoppable
 from pimper_torch.errors import InputError, PimperError, PimperWarning
+from pimper_torch.io.names import require_name
 
 _HELP = """\
 usage: pimper reconstruct PHOTOS -o OUT [options]
@@ -147,7 +148,8 @@ def _run(command: str, arguments: list[str], output: Output, supervised: bool) -
 
     home = _COMMANDS[command]
     try:
-        _refuse_names(arguments)
+        for argument in arguments:
+            require_name(argument, InputError)
         _refuse_at_once(_READERS.get(home, home), command, arguments)
         if output.as_json:
             from pimper_torch.io.version import versions
@@ -184,7 +186,7 @@ def _failed(output: Output, error: BaseException) -> int:
         traceback.print_exception(error)
     text = (
         f"unexpected {kind}: {str(error).rstrip('.')}. This is a fault of pimper_torch; no result "
-        f"was written.{notes} {report or 'Above'} is what a report needs: please send it."
+        f"was written.{limit()}{notes} {report or 'Above'} is what a report needs: please send it."
     )
     output.error(kind, text, _UNEXPECTED)
     return _UNEXPECTED
@@ -202,20 +204,6 @@ def _of_the_world(error: BaseException) -> str | None:
         advice = " Make room." if error.errno in _FULL else ""
         return f"{place}the system refuses ({error.strerror}); no result was written.{advice}"
     return None
-
-
-def _refuse_names(arguments: Sequence[str]) -> None:
-    """Refuse, before any work, names that libraries cannot be told.
-
-    Raises:
-        InputError: One is not UTF-8.
-    """
-    for argument in arguments:
-        try:
-            argument.encode("utf-8")
-        except UnicodeEncodeError as error:
-            shown = argument.encode("utf-8", "backslashreplace").decode()
-            raise InputError(f"{shown}: the name is not UTF-8; needed: one that is.") from error
 
 
 def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:

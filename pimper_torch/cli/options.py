@@ -14,8 +14,9 @@ from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import require
+from pimper_torch.errors import InputError
 from pimper_torch.io.folders import prepare_output, require_apart
-from pimper_torch.io.marker import require_name
+from pimper_torch.io.names import require_name
 from pimper_torch.io.photographs import list_images
 from pimper_torch.memory import bytes_of
 
@@ -176,7 +177,7 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
     for folder in (job.photos, job.inputs.masks):
         if folder is not None:
             for path in list_images(folder):
-                require_name(path)
+                require_name(path, InputError)
     for name in _references(job.config):
         view_named(name, [path.name for path in list_images(job.photos)])
     return job

@@ -56,11 +56,8 @@ class Output:
         """Write an event, if events are asked for."""
         if self.as_json:
             elapsed = round(time.perf_counter() - self.began, 3)
-            line = json.dumps(
-                plain({"event": event, "elapsed": elapsed, **about}),
-                allow_nan=False,
-                ensure_ascii=False,
-            )
+            # ASCII, whatever the encoding of standard output is.
+            line = json.dumps(plain({"event": event, "elapsed": elapsed, **about}), allow_nan=False)
             sys.stdout.write(line + "\n")
             sys.stdout.flush()
 

@@ -37,26 +37,28 @@ def main() -> int:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - for good
     heed(leave_at_once)
     said = _hidden_file()
+    hears, tells = os.pipe()
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     watcher = os.getpid()
     worker = os.fork()
     if worker == 0:
-        return _work(watcher, said)
+        return _work(watcher, said, tells)
+    os.close(tells)
     watch = _Watch(worker=worker)
     heed(watch.heard)
     signal.signal(signal.SIGALRM, watch.waited)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     _, status = os.waitpid(worker, 0)  # signals are heard while this waits
-    if os.WIFEXITED(status):
-        return os.WEXITSTATUS(status)
-    number = os.WTERMSIG(status)
+    code = os.waitstatus_to_exitcode(status)
+    if code == 0 or code > 128 or os.read(hears, 1):
+        return code
     if watch.killed:
         code = 128 + watch.first
         say("ended at once; what is left beside the result is removed by the next run.", code)
         return code
     from pimper_torch.cli.deaths import tell_death
 
-    return tell_death(number, _tail(said))
+    return tell_death(code, _tail(said))
 
 
 class _Watch:
@@ -90,7 +92,7 @@ class _Watch:
             os.write(2, b"stopping after this step; Ctrl-C again ends it at once.\n")
 
 
-def _work(watcher: int, said: int | None) -> int:
+def _work(watcher: int, said: int | None, tells: int) -> int:
     """Carry out the command, and end when the watcher does."""
     _die_with(watcher)
     heed(leave_at_once)
@@ -100,6 +102,7 @@ def _work(watcher: int, said: int | None) -> int:
     from pimper_torch.cli.main import main as carry_out
 
     code = carry_out(supervised=True)
+    os.write(tells, b".")  # it has told how it ended
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)  # nothing is left to stop
     if code > 128:  # interrupted: whoever waits does not wait for libraries to tidy up

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pimper_torch.errors import OutputError
-from pimper_torch.io.marker import require_name
+from pimper_torch.io.names import require_name
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _HEAD = 4096  # bytes: what a PNG says of itself stands before its pixels
@@ -26,7 +26,7 @@ def prepare_file(path: Path, overwrite: bool, is_ours: Callable[[Path], bool]) -
     Raises:
         OutputError: Something is there, or the path lies in no folder.
     """
-    require_name(path.resolve())
+    require_name(path.resolve(), OutputError)
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; needed: the name of a file.")
     if not path.resolve().parent.is_dir():

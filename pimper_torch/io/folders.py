@@ -7,7 +7,8 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from pimper_torch.errors import InputError, OutputError
-from pimper_torch.io.marker import MARKER, STAGES, Kind, foreign, read_marker, require_name, seal
+from pimper_torch.io.marker import MARKER, STAGES, Kind, foreign, read_marker, seal
+from pimper_torch.io.names import require_name
 from pimper_torch.io.photographs import some
 from pimper_torch.io.stages import is_ours, kept, locked
 from pimper_torch.io.workspace import (
@@ -37,7 +38,7 @@ def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> N
         OutputError: The folder already holds something, is a file, or cannot be made.
     """
     folder = Path(folder)
-    require_name(folder.resolve())
+    require_name(folder.resolve(), OutputError)
     if folder.is_symlink() and not folder.exists():
         raise OutputError(f"{folder}: is a link to nothing. Remove it, or write elsewhere.")
     if folder.exists() and not folder.is_dir():

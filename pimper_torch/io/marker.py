@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, get_args
 
-from pimper_torch.errors import OutputError
-
 MARKER = ".pimper.json"
 STAGES = ".stages"
 """Folder in a folder of results for what a run keeps, to go on where it stopped."""
@@ -171,21 +169,6 @@ def flush_folder(folder: Path) -> None:
             os.fsync(opened)
         finally:
             os.close(opened)
-
-
-def require_name(path: Path) -> None:
-    """Refuse a path that libraries which write there cannot be told.
-
-    Raises:
-        OutputError: It is not UTF-8.
-    """
-    try:
-        str(path).encode("utf-8")
-    except UnicodeEncodeError as error:
-        shown = str(path).encode("utf-8", "backslashreplace").decode()
-        raise OutputError(
-            f"{shown}: the name is not UTF-8; needed: one that is. Rename it, or write elsewhere."
-        ) from error
 
 
 def _write(folder: Path, kind: Kind, files: Mapping[str, Written], folders: Sequence[str]) -> None:

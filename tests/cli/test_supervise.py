@@ -1,0 +1,247 @@
+"""The life of the process: whatever ends it, one message says so, and nothing is left running."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pimper_torch.cli import supervise
+from pimper_torch.cli.deaths import folder_of
+from pimper_torch.cli.main import main
+from pimper_torch.cli.stopping import Stopped, stoppable
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process alone")
+
+# The command line with `config` replaced by what a test wants to happen.
+PROGRAM = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started this may ignore it
+from pimper_torch.cli import main
+main._COMMANDS = {"config": "stand_in", "reconstruct": "stand_in"}
+main._LIGHT = ()
+main._READERS = {}
+from pimper_torch.cli.supervise import main as supervised
+sys.exit(supervised())
+"""
+READY = "os.write(int(os.environ['READY']), b'ready');"
+
+
+class Ran:
+    """A run of the program, from when it said that it was ready."""
+
+    def __init__(self, folder: Path, code: str, *arguments: str):
+        (folder / "stand_in.py").write_text(code)
+        hears, tells = os.pipe()
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, *(arguments or ("config",))],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=folder,
+            env=os.environ
+            | {"PYTHONPATH": os.pathsep.join([str(folder), *sys.path]), "READY": str(tells)},
+            pass_fds=(tells,),
+            start_new_session=True,
+        )
+        os.close(tells)
+        os.read(hears, 5)
+        os.close(hears)
+
+    @property
+    def worker(self) -> int:
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        return int(children.read_text().split()[0])
+
+    def end(self) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=30)
+        return self.process.returncode, out, err
+
+
+def at_run(code: str) -> str:
+    lines = "\n".join(f"    {line}" for line in code.strip().splitlines())
+    return f"import os, sys, time, ctypes\ndef run(command, arguments, output):\n{lines}\n"
+
+
+WAITS = f"{READY} time.sleep(60)"
+
+
+@pytest.mark.parametrize(
+    ("code", "ended", "told"),
+    [
+        ("os.kill(os.getpid(), 9)", 137, "killed by the system or by somebody (SIGKILL)"),
+        ("os.kill(os.getpid(), 11)", 139, "crashed in a native library (SIGSEGV)"),
+        ("ctypes.CDLL(None).abort()", 134, "crashed in a native library (SIGABRT)"),
+        ("os._exit(1)", 1, "(exit code 1), most likely because memory ran out"),
+    ],
+)
+@pytest.mark.parametrize("as_json", [False, True])
+def test_what_kills_the_work_is_told_in_one_paragraph(tmp_path, code, ended, told, as_json):
+    kept = tmp_path / "out" / ".stages"
+    kept.mkdir(parents=True)
+    (kept / "mesh.pt").touch()
+    code = at_run(f"os.write(2, b'F1125 glog.cc:9 chatter\\n')\n{READY}\n{code}")
+    given = ["reconstruct", "photos", "-o", "out", *(["--json"] if as_json else [])]
+    returned, out, err = Ran(tmp_path, code, *given).end()
+    assert returned == ended
+    (line,) = err.splitlines()  # and no chatter
+    assert line.startswith("error: ")
+    assert told in line
+    assert "--max-size-px" in line
+    assert "What was finished is kept in out/.stages: the same command goes on" in line
+    if as_json:
+        last = json.loads(out.splitlines()[-1])
+        assert (last["event"], last["kind"], last["exit_code"]) == ("error", "Killed", ended)
+        assert f"error: {last['message']}" == line
+    if ended != 137:
+        report = Path(line.split("please report ")[1].rstrip("."))
+        text = report.read_text()
+        report.unlink()
+        assert "chatter" in text
+        assert "reconstruct photos -o out" in text
+        assert "pimper_torch" in text
+        if ended != 1:
+            assert "stand_in.py" in text  # where it crashed
+
+
+def test_a_limit_of_memory_is_named(tmp_path):
+    code = at_run(f"import resource\n{READY}\nos.kill(os.getpid(), 11)")
+    limited = "import resource; resource.setrlimit(resource.RLIMIT_AS, (6 * 10**9,) * 2)\n"
+    (tmp_path / "sitecustomize.py").write_text(limited)
+    _, _, err = Ran(tmp_path, code).end()
+    assert "Its memory is limited to 6.0 GB (`ulimit -v`)" in err
+    Path(err.split("please report ")[1].strip().rstrip(".")).unlink()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("group", [True, False])
+@pytest.mark.parametrize("importing", [True, False])
+def test_a_signal_is_one_message(tmp_path, number, group, importing):
+    """Ctrl-C reaches both processes of a terminal; `kill` the first alone."""
+    code = f"import os, time; {WAITS}" if importing else at_run(WAITS)
+    ran = Ran(tmp_path, code, "config", "--json")
+    (os.killpg if group else os.kill)(ran.process.pid, number)
+    returned, out, err = ran.end()
+    assert returned == 128 + number
+    text = "nothing was begun." if importing else "no result was written."
+    assert err == f"error: interrupted; {text}\n"
+    last = json.loads(out.splitlines()[-1])
+    assert (last["event"], last["exit_code"]) == ("error", 128 + number)
+
+
+def test_a_second_press_ends_what_cannot_be_interrupted(tmp_path):
+    deaf = f"while True:\n try:\n  {READY} time.sleep(60)\n except BaseException: pass"
+    ran = Ran(tmp_path, at_run(deaf))
+    began = time.monotonic()
+    os.killpg(ran.process.pid, signal.SIGINT)
+    time.sleep(0.5)
+    os.killpg(ran.process.pid, signal.SIGINT)
+    returned, _, err = ran.end()
+    assert returned == 130
+    assert "ended at once" in err
+    assert time.monotonic() - began < 10
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others look once a second")
+def test_the_worker_dies_with_the_watcher(tmp_path):
+    ran = Ran(tmp_path, at_run(WAITS))
+    worker = ran.worker
+    ran.process.kill()
+    ran.process.wait()
+    for _ in range(100):
+        if not Path(f"/proc/{worker}").exists():
+            break
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
+
+
+def test_what_goes_well_goes_well(tmp_path):
+    code = at_run(f"{READY}\noutput.say('h\\u00e9')\nsys.stderr.write('shown\\n')")
+    returned, out, err = Ran(tmp_path, code).end()
+    assert (returned, out, err) == (0, "h\u00e9\n", "shown\n")
+    returned, _, err = Ran(tmp_path, at_run(f"{READY} 1 / 0")).end()
+    assert returned == 1
+    assert "unexpected ZeroDivisionError" in err
+    (report,) = (word for word in err.split() if word.endswith(".txt"))
+    Path(report).unlink()
+
+
+def test_a_character_that_cannot_be_printed_is_written_otherwise(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii:strict")
+    code = at_run(f"{READY}\noutput.say('h\\u00e9')\noutput.warning('\\udcff')\noutput.event('a')")
+    returned, out, err = Ran(tmp_path, code).end()
+    assert returned == 0
+    assert out == "h\\xe9\n"
+    assert "\\udcff" in err
+    code = at_run(f"{READY}\noutput.event('warning', message='h\\u00e9 \\udcff')")
+    _, out, _ = Ran(tmp_path, code, "config", "--json").end()
+    assert json.loads(out.splitlines()[-1])["message"] == "h\u00e9 \udcff"
+
+
+def test_in_a_process_of_ones_own_nothing_is_forked(monkeypatch, capsys):
+    monkeypatch.setattr(os, "fork", lambda: pytest.fail("forked"))
+    assert main(["--help"]) == 0
+    assert "137 killed" in capsys.readouterr().out
+
+
+def test_where_nothing_can_be_forked_one_process_does(monkeypatch, capsys):
+    monkeypatch.delattr(os, "fork")
+    monkeypatch.setattr(sys, "argv", ["pimper", "--help"])
+    assert supervise.main() == 0
+    assert "usage: pimper" in capsys.readouterr().out
+
+
+def test_the_module_is_the_command():
+    ran = subprocess.run(
+        [sys.executable, "-m", "pimper_torch", "clean", "nowhere"], capture_output=True, text=True
+    )
+    assert ran.returncode == 2
+    assert ran.stderr.startswith("error: nowhere: found nothing")
+
+
+class Falls:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)
+
+
+def interrupt_in_a_destructor():
+    with stoppable():
+        thing = Falls()
+        del thing
+        time.sleep(10)
+
+
+def test_a_signal_that_python_ignores_comes_again(capsys):
+    began = time.monotonic()
+    with pytest.raises(Stopped):
+        interrupt_in_a_destructor()
+    assert time.monotonic() - began < 5
+    assert "Exception ignored" not in capsys.readouterr().err
+
+
+def test_signals_that_are_ignored_stay_ignored():
+    former = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as by nohup
+    try:
+        with stoppable():
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, former)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "folder"),
+    [
+        (["reconstruct", "photos", "-o", "out"], "out"),
+        (["reconstruct", "photos", "--out=out"], "out"),
+        (["demo"], "pimper_demo"),
+        (["config"], None),
+        (["reconstruct", "-o"], None),
+    ],
+)
+def test_the_folder_of_the_result_is_found_in_a_command_line(arguments, folder):
+    assert folder_of(arguments) == (None if folder is None else Path(folder))
