@@ -1,7 +1,11 @@
+import errno
 import json
 import math
 import os
+import shlex
 import signal
+import subprocess
+import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -252,8 +256,75 @@ def test_what_is_unexpected_is_told_in_one_paragraph_and_kept(
     assert message.startswith("error: unexpected ZeroDivisionError: division by zero.")
     (kept,) = tmp_path.glob("pimper-*.txt")
     assert str(kept) in message
-    assert "Traceback" in kept.read_text()
+    text = kept.read_text()
+    assert "Traceback" in text
+    assert f"pimper_torch {installed_version()}" in text
+    assert f"torch {torch.__version__}" in text
+    assert shlex.join(sys.argv) in text  # the command line
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "/tmp/a.db"), "Make room."),
+        (PermissionError(errno.EACCES, "Permission denied", "/root/x"), "/root/x: the system"),
+        (MemoryError(), "memory ran out; no result was written."),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 99 bytes"), "memory ran out"),
+    ],
+)
+def test_what_the_machine_refuses_is_no_fault(
+    photos, chain, tmp_path, capsys, monkeypatch, error, told
+):
+    def refuse(_):
+        raise error
+
+    monkeypatch.setattr(chain, "work", refuse)
+    assert run("reconstruct", photos, "-o", tmp_path / "out") == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert told in message
+    assert "fault" not in message
+    assert held(tmp_path) == ["photos"]
+
+
+def test_a_report_that_cannot_be_written_is_told(photos, chain, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
+    monkeypatch.setattr(chain, "work", lambda self: 1 / 0)
+    assert run("reconstruct", photos, "-o", tmp_path / "out") == 1
+    told = capsys.readouterr().err
+    assert "Traceback" in told
+    assert "Above is what a report needs" in told
+
+
+@pytest.mark.parametrize("place", ["out", "photos", "photograph"])
+def test_names_that_are_not_utf_8_are_refused_before_any_work(
+    photos, chain, tmp_path, capsys, place
+):
+    strange = "caf\udce9"  # of another encoding
+    given = {"out": tmp_path / "out", "photos": photos}
+    if place == "photograph":
+        (photos / "0.png").rename(photos / f"{strange}.png")
+    else:
+        given[place] = tmp_path / strange
+    assert run("reconstruct", given["photos"], "-o", given["out"]) == 2
+    assert "caf\\udce9" in (told := capsys.readouterr().err)
+    assert "the name is not UTF-8" in told
+    assert chain.given is None
+
+
+def test_names_in_utf_8_are_written_whatever_the_locale(photos, tmp_path):
+    """In the locale C Python takes UTF-8 for names, and so does what it calls."""
+    folder = photos.rename(photos.with_name("h\u00e9"))
+    (folder / "0.png").rename(folder / "\u00fc \u96ea.png")
+    ran = subprocess.run(
+        [sys.executable, "-m", "pimper_torch", "doctor", str(folder)],
+        env=os.environ | {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode in (0, 2)
+    assert "unexpected" not in ran.stderr
+    assert "Traceback" not in ran.stderr
 
 
 def test_a_log_of_debug_tells_tracebacks(photos, chain, tmp_path, capsys, monkeypatch):
