@@ -20,12 +20,20 @@ def signed_distance(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height
     far = float(sum(drawn.shape))
     if drawn.all() or not drawn.any():
         return torch.full(mask.shape, far if drawn.all() else -far, device=mask.device)
-    inner, outer = (
-        cv2.distanceTransform(side, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        for side in (drawn, 1 - drawn)
-    )
+    inner, outer = (_exact_distance(side) for side in (drawn, 1 - drawn))
     signed = np.where(drawn > 0, inner - 0.5, 0.5 - outer)
     return torch.from_numpy(signed.astype(np.float32)).to(mask.device)
+
+
+def _exact_distance(drawn: np.ndarray) -> np.ndarray:
+    """Give each pixel's distance to the nearest zero.
+
+    The last bit of OpenCV's depends on where in memory the pixels lie. Squares of distances
+    between centres of pixels are whole numbers.
+    """
+    found = cv2.distanceTransform(drawn, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    exact: np.ndarray = np.sqrt(np.rint(np.square(found, dtype=np.float64)))
+    return exact
 
 
 def shrunk(
