@@ -565,3 +565,22 @@ def test_a_fusion_without_a_solution_keeps_the_surface_before(monkeypatch, broke
     calls.clear()
     with pytest.raises(ReconstructionError, match="solver the fusion failed"):
         chain_of(scene, coarse, on_failure="fail")(scene.views)
+
+
+@pytest.mark.filterwarnings("always::pimper_torch.errors.PimperWarning")
+def test_a_facet_without_area_is_left_out_and_the_others_are_as_they_were(given):
+    _, cameras, patches = given
+    coarse = patches.coarse
+    faces = coarse.mesh.faces
+    flat = torch.cat([faces[:7], faces[7:8, [0, 0, 1]], faces[7:]])
+    bad = coarse.replace(mesh=coarse.mesh.replace(faces=flat), points=None, support=None)
+    decompose = Decompose(DecomposeConfig(bucket_entries=12_000))
+    with collecting() as failures:
+        found = decompose(bad, cameras)
+    assert [(each.stage, each.name) for each in failures] == [("decompose", "7")]
+    assert torch.equal(found.coarse.mesh.faces, faces)
+    for one, other in zip(found.buckets, patches.buckets, strict=True):
+        assert torch.equal(one.facet, other.facet)
+        assert torch.equal(one.depth, other.depth)
+    with pytest.raises(ReconstructionError, match="patch 7 failed"), collecting("fail"):
+        decompose(bad, cameras)

@@ -9,12 +9,13 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.failures import skipped
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
 from pimper_torch.patches.transfer import transfer
-from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
+from pimper_torch.records import Cameras, CoarseMesh, Failure, PatchSet, Surface, Templates
 from pimper_torch.stage import Stage
 
 
@@ -79,6 +80,7 @@ class Decompose(Stage):
         Raises:
             ReconstructionError: A mesh without facets.
         """
+        coarse = with_area(coarse)
         vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
         if len(faces) == 0:
             raise ReconstructionError(
@@ -105,6 +107,34 @@ class Decompose(Stage):
         )
         patches = PatchSet(coarse=coarse, buckets=buckets)
         return patches if surface is None else transfer(patches, surface.mesh)
+
+
+def with_area(coarse: CoarseMesh) -> CoarseMesh:
+    """Leave out facets without area, on which no template can stand."""
+    mesh, points = coarse.mesh, coarse.points
+    kept = (face_normals(mesh.vertices_world.detach(), mesh.faces) != 0).any(dim=1)
+    if bool(kept.all()):
+        return coarse
+    skipped(
+        *(
+            Failure(
+                stage="decompose",
+                what="patch",
+                name=str(facet),
+                reason="its facet has no area",
+                done="These facets are left out of the coarse mesh",
+            )
+            for facet in (~kept).nonzero()[:, 0].tolist()
+        )
+    )
+    if points is not None:
+        points = points.take(kept[points.facet].nonzero()[:, 0])
+        points = points.replace(facet=(kept.long().cumsum(dim=0) - 1)[points.facet])
+    return coarse.replace(
+        mesh=mesh.replace(faces=mesh.faces[kept]),
+        points=points,
+        support=None if coarse.support is None else coarse.support[kept],
+    )
 
 
 def facet_frames(

@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.fusion.estimate import fuse_terms, noise_factor
 from pimper_torch.fusion.terms import Terms
@@ -160,7 +161,7 @@ def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch, kern
     monkeypatch.setattr("pimper_torch.linalg.systems._COMPILED_CHOLESKY_UNKNOWNS", 100)
     monkeypatch.setattr(Multigrid, "solve", refusing)
     monkeypatch.setattr("pimper_torch.linalg.systems.solve_by_cycles", refusing)
-    with using(kernels):
+    with using(kernels), pytest.warns(PimperWarning, match="solved by a Cholesky factor"):
         found = fused(kinds)
     assert stuck
     assert_close(found.heights, expected.heights)
