@@ -12,7 +12,6 @@ Runs are forked from a process that has everything loaded; they take a second or
 
 import argparse
 import contextlib
-import faulthandler
 import hashlib
 import json
 import os
@@ -80,6 +79,7 @@ def ended_runs(
     folder: Path, count: int, seed: int, endings: tuple[str, ...] = ENDINGS
 ) -> Iterator[Ended]:
     """Render a scene, run once undisturbed, then end runs at random moments."""
+    load()
     scene, random_moments = folder / "scene", random.Random(seed)
     small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1 --seed 1"
     assert forked(["render", "balls", "-o", str(scene), *small.split()]) == 0
@@ -110,6 +110,17 @@ def ended_runs(
             hidden = sorted(path.name for path in home.iterdir() if path != out)
             faults += [f"left beside it: {', '.join(hidden)}"] if hidden else []
         yield Ended(ending, over_former, moment, code, kept, tuple(faults))
+
+
+def load() -> None:
+    """Load what runs need, so that those that are forked have it."""
+    import pycolmap  # noqa: F401
+
+    import pimper_torch.cli.run
+    import pimper_torch.evidence.cli.render  # noqa: F401
+    from pimper_torch.kernels.switch import compile_all
+
+    compile_all()
 
 
 @contextlib.contextmanager
@@ -178,10 +189,6 @@ def forked(line: list[str], disturbed: Disturbance = ((lambda: None), None)) -> 
             os.dup2(quiet, stream)
         code = 70
         try:
-            if os.environ.get("PIMPER_KILL_DUMP"):
-                faulthandler.dump_traceback_later(
-                    60, file=open(os.environ["PIMPER_KILL_DUMP"], "w")
-                )
             prepare()
             code = main(line)
         finally:
