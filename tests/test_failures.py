@@ -335,10 +335,9 @@ def given():
 
 
 def streamed(given):
-    warp = Warp()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PimperWarning)  # of patches under too little light
-        return photometry_and_heights(warp, Factorize(), Sweep(), *given, warp.prepare(given[0]))
+        return photometry_and_heights(Warp(), Factorize(), Sweep(), *given)
 
 
 @pytest.fixture(scope="module")
