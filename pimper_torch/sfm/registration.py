@@ -182,7 +182,8 @@ def _mapped(
     settings: RegistrationSettings,
     mapping: MapSettings,
 ) -> Registration:
-    found = [drop_weak_views(model, mapping.min_inliers) for model in map_views(space, mapping)]
+    whole = [drop_weak_views(model, mapping.min_inliers) for model in map_views(space, mapping)]
+    found = [model for model in whole if model.num_views]
     counts = count_views_with_depth(found, mapping.min_inliers)
     counted = list(zip(counts, found, strict=True))
     counted.sort(key=lambda one: (-one[0], -one[1].num_views, -len(one[1].points_world)))

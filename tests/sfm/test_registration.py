@@ -1,11 +1,13 @@
 """Which pairs are matched again, and how often the mapper starts."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from pimper_torch.sfm import registration
+from pimper_torch.sfm.doubt import count_views_with_depth
 from pimper_torch.sfm.mapping import MapSettings
 from pimper_torch.sfm.matching import MatchSettings, VerifiedPair, all_pairs
 from pimper_torch.sfm.model import select_views
@@ -118,3 +120,11 @@ def test_without_starts_the_first_model_is_kept_as_it_is(told, space):
     settings = RegistrationSettings(matching=MATCHING, mapping=MAPPING, guided_pairs=0, starts=0)
     assert register(space, settings).missing == ("d.jpg", "ü.tif")
     assert answers.matched == [(False, all_pairs(5))]
+
+
+def test_a_model_whose_views_all_see_too_few_points_is_none(told, space, monkeypatch):
+    told(4 * [[0, 1]])
+    monkeypatch.setattr(registration, "count_views_with_depth", count_views_with_depth)
+    found = register(space, replace(SETTINGS, mapping=replace(MAPPING, min_inliers=1000)))
+    assert found.models == ()
+    assert found.missing == tuple(space.files)
