@@ -154,7 +154,7 @@ def disturbance(ending: str, moment: float, seconds: float, home: Path) -> Distu
     if ending == "memory":  # of what the stages take on top of what is loaded
         return (lambda: limit_memory(int(moment * 400e6))), None
     if home.is_mount():
-        (home / "ballast").write_bytes(bytes(int((DISK_MB - 1 - 4 * moment) * 2**20)))
+        (home / "ballast").write_bytes(bytes(int((DISK_MB - 2.5 * moment) * 2**20)))
         return (lambda: None), None
     return (lambda: limit_files(int(moment * 1e6))), None
 
