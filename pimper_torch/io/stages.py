@@ -18,7 +18,8 @@ from pimper_torch.io.marker import MARKER, STAGES, mark, read_marker, write_text
 
 LOCK = "lock"
 _HOLDER = "holder.json"
-_OWN = frozenset({MARKER, LOCK, _HOLDER})
+# The lock is the last that is removed. Files end in .new while they are written.
+_OWN = (_HOLDER, f"{_HOLDER}.new", f"{MARKER}.new", MARKER, LOCK)
 _TRIES = 5
 _MAX_HOLDER = 100_000  # characters: command lines are shorter as a rule
 _UNLOCKED = "{}: its disk knows no locks; see that no other run writes there."
@@ -129,7 +130,7 @@ def _tidy(target: Path) -> None:
     with suppress(OSError):
         (stages / _HOLDER).unlink(missing_ok=True)
         if not kept(target):
-            for name in (MARKER, LOCK):
+            for name in _OWN:
                 (stages / name).unlink(missing_ok=True)
             stages.rmdir()
 
