@@ -94,7 +94,7 @@ def _read_lights(path: Path, names: tuple[str, ...]) -> Float[Tensor, "view 4"] 
         known = {view["name"]: view["light"] for view in report["views"]}
         rows = [known.get(name) or [float("nan")] * 4 for name in names]
         lights = torch.tensor(rows, dtype=torch.float64).reshape(len(names), 4)
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError, OverflowError) as error:
         raise InputError(
             f"{path}: cannot be read as lights ({error}); needed: JSON with `views`, each with "
             "`name` and `light`, four numbers or null. Remove the file to do without lights."

@@ -12,6 +12,8 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import some
 
+_MAX_NAME = 255  # bytes, of most file systems
+
 
 def expect(ok: bool, path: Path, kind: str, needed: str, found: str | None = None) -> None:
     """Refuse a folder or file that does not have the layout of a data set.
@@ -56,6 +58,8 @@ def inside(folder: Path, name: str, kind: str) -> Path:
         InputError: The path is absolute, leads out by ``..`` or a link, or is no path.
     """
     path = folder / name
+    longest = max(len(part.encode("utf-8", "surrogatepass")) for part in (*path.parts, ""))
+    expect(longest <= _MAX_NAME, folder, kind, "names of files", f"{name!r}")
     try:
         stays = path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # a zero byte, a loop of links

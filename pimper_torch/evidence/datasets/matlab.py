@@ -1,22 +1,17 @@
 """Arrays from MATLAB files, and cameras as its calibration toolbox writes them."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import scipy.io
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.layout import expect
+from pimper_torch.io.matlab import read_variables
 from pimper_torch.io.photographs import some
-
-_BYTES = {"logical": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4}
-# zlib packs at most so much; and a choice: the largest array of these sets has 0.1 GB.
-_MAX_RATIO, _MAX_BYTES = 1100, 2**29
 
 
 def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.ndarray]:
@@ -31,24 +26,22 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
         InputError: No such file, not a MATLAB file, or a variable is absent or no array of
             numbers; lists what the file holds.
     """
-    present = variables(path, kind)
-    _refuse_bomb(path, names)
-    try:
-        found = scipy.io.loadmat(path, variable_names=list(names))
-    except Exception as error:  # scipy's readers raise whatever a damaged file leads to
-        raise _damaged(path, error) from error
+    found = _variables(path, kind, names)
     absent = [name for name in names if name not in found]
     expect(
         not absent,
         path,
         kind,
         f"the variables {some(absent)}",
-        f"variables {some(sorted(present), at_most=12)}" if present else "no variables",
+        f"variables {some(sorted(found), at_most=12)}" if found else "no variables",
     )
+    arrays = {}
     for name in names:
-        numeric = isinstance(found[name], np.ndarray) and found[name].dtype.kind in "fiub"
-        expect(numeric, path, kind, f"numbers in {name}", f"{type(found[name]).__name__}")
-    return {name: found[name] for name in names}
+        array = found[name]
+        expect(array is not None, path, kind, f"real numbers in {name}", "another class")
+        assert array is not None
+        arrays[name] = array
+    return arrays
 
 
 def variables(path: Path, kind: str) -> set[str]:
@@ -57,11 +50,18 @@ def variables(path: Path, kind: str) -> set[str]:
     Raises:
         InputError: No such file, or not a MATLAB file.
     """
+    return set(_variables(path, kind, ()))
+
+
+def _variables(path: Path, kind: str, names: Sequence[str]) -> dict[str, np.ndarray | None]:
     expect(path.is_file(), path.parent, kind, f"the MATLAB file {path.name}")
     try:
-        return {name for name, _, _ in scipy.io.whosmat(path)}
-    except Exception as error:  # scipy's readers raise whatever a damaged file leads to
-        raise _damaged(path, error) from error
+        return {one.name: one.array for one in read_variables(path, lambda name: name in names)}
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be read as a MATLAB file: {error}. Needed: version 5 to 7, not 7.3. "
+            "Unpack the data set again, or save the file with `-v7`."
+        ) from error
 
 
 def read_toolbox_projections(
@@ -107,31 +107,6 @@ def read_toolbox_projections(
         for number in numbers
     ]
     return torch.from_numpy(np.stack(projections))
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    why = "its version is 7.3" if isinstance(error, NotImplementedError) else "it seems damaged"
-    return InputError(
-        f"{path}: cannot be read as a MATLAB file, {why}; needed: version 7 or older, not 7.3. "
-        "Unpack the data set again, or save the file with `-v7`."
-    )
-
-
-def _refuse_bomb(path: Path, names: Sequence[str]) -> None:
-    """Refuse, by their headers, arrays that no file of this length can hold.
-
-    Raises:
-        InputError: Names the largest.
-    """
-    held = path.stat().st_size
-    for name, shape, kind in scipy.io.whosmat(path):
-        needed = math.prod(shape) * _BYTES.get(kind, 8)
-        if name in names and not 0 <= needed <= min(_MAX_BYTES, _MAX_RATIO * held):
-            raise InputError(
-                f"{path}: says that {name} is of shape {shape}, {needed} bytes, but has only "
-                f"{held}; needed: what the file can hold, at most {_MAX_BYTES}. Unpack the data "
-                "set again."
-            )
 
 
 def _shaped(

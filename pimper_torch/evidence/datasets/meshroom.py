@@ -7,7 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.evidence.datasets.layout import expect, first_of, numbers, objects, read_json
+from pimper_torch.evidence.datasets.layout import (
+    expect,
+    first_of,
+    inside,
+    numbers,
+    objects,
+    read_json,
+)
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
@@ -98,7 +105,7 @@ def read_meshroom(
             f"a pose of its own for {name}",
             "a pose in a rig, which cannot be read; export without rigs",
         )
-        image = picture_folder / name
+        image = inside(picture_folder, name, _KIND)
         photographs.append(
             PosedPhotograph(
                 name=name,
@@ -141,7 +148,8 @@ def _lens(entry: Mapping[str, object], version: tuple[int, ...], camera: int, pa
     size = torch.cat([value("width"), value("height")])
     width, height = (int(side) for side in size)
     focal = _focal(entry, version, width, path)
-    expect(bool((focal > 0).all()), path, _KIND, "a positive focal length", f"{focal.tolist()}")
+    positive = bool((focal > 0).all() & focal.isfinite().all())
+    expect(positive, path, _KIND, "a positive focal length", f"{focal.tolist()}")
     center = value("principalPoint", 2)
     center = pixels_from_indices(center if version < (1, 2, 1) else center + size / 2)
     pinhole = (float(focal[0]), float(focal[1]), float(center[0]), float(center[1]))

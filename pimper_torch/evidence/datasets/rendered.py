@@ -201,7 +201,7 @@ def _read_lights(
     try:
         point_lights = torch.tensor(report["positions_world"], dtype=torch.float64)
         lights = torch.tensor(report["harmonics_world"], dtype=torch.float64)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise InputError(
             f"{path}: has no numbers in `positions_world` or `harmonics_world` ({error}). Render "
             "the scene again."

@@ -33,6 +33,7 @@ from pimper_torch.single_view.factorization.encoded import (
     freedom,
     residual_spread,
 )
+from pimper_torch.single_view.factorization.still import camera_moved
 
 # Range of the search, a choice: it holds all curves in use; 1 is linear.
 MIN_GAMMA, MAX_GAMMA = 0.4, 4.0
@@ -188,7 +189,8 @@ def gamma_of_photographs(
         max_samples: More are subsampled evenly.
 
     Raises:
-        InputError: As :func:`estimate_gamma`, and for photographs or a mask of unlike sizes.
+        InputError: As :func:`estimate_gamma`, for photographs or a mask of unlike sizes, and where
+            the camera moved.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:
         raise InputError(
@@ -203,6 +205,12 @@ def gamma_of_photographs(
                 f"{where.shape[1]} x {where.shape[0]}; needed: a mask of the same size."
             )
         where = where & mask
+    if camera_moved(views.images, where):
+        raise InputError(
+            "the photographs show their details at other pixels each, so that the camera or "
+            "the object moved; needed: photographs of one fixed camera and object, under several "
+            "lights. Gamma cannot be found from these: take such a series."
+        )
     colour = views.images.shape[1] // 2 if channel is None else channel
     encoded = views.images[:, colour][:, where]
     return estimate_gamma(

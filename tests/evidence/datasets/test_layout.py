@@ -52,3 +52,9 @@ def test_a_file_that_is_no_text_is_refused(tmp_path):
 def test_anything_but_a_list_of_objects_is_refused(tmp_path, value):
     with pytest.raises(InputError, match="a list of objects as frames"):
         objects(value, "frames", tmp_path, "a toy")
+
+
+def test_a_name_longer_than_file_systems_have_is_refused_shortly(tmp_path):
+    with pytest.raises(InputError, match="names of files") as told:
+        inside(tmp_path, "x" * 9000, "a set")
+    assert len(str(told.value)) < 1000

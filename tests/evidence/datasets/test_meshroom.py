@@ -133,3 +133,9 @@ def test_another_file_is_refused(save, options, needed):
 def test_a_folder_without_the_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"cameras\.sfm"):
         read_meshroom(tmp_path)
+
+
+@pytest.mark.parametrize("intrinsic", [{"sensorWidth": "0"}, {"focalLength": "1e308"}])
+def test_a_focal_length_that_is_not_finite_is_refused(save, intrinsic):
+    with pytest.raises(InputError, match="a positive focal length"):
+        read_meshroom(save(intrinsic=NEW | intrinsic))

@@ -1,3 +1,5 @@
+from importlib.resources import files
+
 import numpy as np
 import pytest
 import torch
@@ -79,3 +81,11 @@ def test_the_curve_that_does_as_well_is_advised():
     assert advice(estimate(2.25, (0.005, 0.012, 0.0049))).endswith(" srgb")
     assert advice(estimate(1.81, (0.005, 0.012, 0.009))).endswith(" 1.81")
     assert advice(estimate(1.81, (0.005, 0.012, 0.009), determined=False)) == ""
+
+
+def test_a_moving_camera_is_the_reason_that_is_given(capsys):
+    photographs = files("pimper_torch") / "data" / "skull"
+    assert main(["gamma", str(photographs), "--max-size-px", "150"]) == 2
+    told = capsys.readouterr()
+    assert "the camera or the object moved" in told.err
+    assert "--photographs.response" not in told.out
