@@ -108,10 +108,14 @@ def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
         with safe_open(path, framework="pt") as file:
             structure, names = _structure(path, file.metadata()), file.keys()
             reader = _Reader(path, {name: file.get_tensor(name) for name in names})
-    except (SafetensorError, OSError) as error:
+    except OSError as error:
         raise InputError(
-            f"{path}: cannot be read as safetensors, it seems cut short or damaged ({error}); "
-            f"needed: a whole file. {_AGAIN}"
+            f"{path}: cannot be read ({error.strerror or 'the system refuses'}). {_AGAIN}"
+        ) from error
+    except SafetensorError as error:
+        raise InputError(
+            f"{path}: cannot be read as safetensors, it seems cut short or damaged; needed: a "
+            f"whole file. {_AGAIN}"
         ) from error
     record: AnyRecord = reader.value(structure, cls, cls.__name__)
     if reader.unused:

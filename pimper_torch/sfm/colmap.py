@@ -60,9 +60,10 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
             folder.mkdir(parents=True, exist_ok=True)
             reconstruction.write_binary(str(folder))
         except (ValueError, RuntimeError, OSError) as error:
+            why = f" ({error.strerror})" if isinstance(error, OSError) else ""
             raise OutputError(
-                f"The sparse model cannot be written to {folder}: {error}. "
-                "Choose a folder that exists and may be written."
+                f"The sparse model cannot be written to {folder}{why}. Choose a folder that exists "
+                "and may be written."
             ) from error
 
 

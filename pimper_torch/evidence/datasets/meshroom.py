@@ -32,6 +32,7 @@ _FILES = ("cameras.sfm", "sfm.json", "sfm.sfm", "cameras.json")
 # by how many parameters they have.
 _RADIAL = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
 _NONE = ("pinhole", "none")
+_MAX_FOCAL_PX = 1e9  # of no lens
 
 
 def read_meshroom(
@@ -148,7 +149,7 @@ def _lens(entry: Mapping[str, object], version: tuple[int, ...], camera: int, pa
     size = torch.cat([value("width"), value("height")])
     width, height = (int(side) for side in size)
     focal = _focal(entry, version, width, path)
-    positive = bool((focal > 0).all() & focal.isfinite().all())
+    positive = bool(((focal > 0) & (focal < _MAX_FOCAL_PX)).all())
     expect(positive, path, _KIND, "a positive focal length", f"{focal.tolist()}")
     center = value("principalPoint", 2)
     center = pixels_from_indices(center if version < (1, 2, 1) else center + size / 2)
