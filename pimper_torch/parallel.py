@@ -8,7 +8,7 @@ its batch alone: neither the number of workers nor who is first changes it.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar, copy_context
 from functools import cache
 from itertools import pairwise
@@ -132,6 +132,11 @@ def _result(waiting: deque[tuple[Item, Future[Result]]], one: Callable[[Item], R
         skipped(failure, error=error)
     del future
     return copy_context().run(one, item)
+
+
+def on_one_thread() -> AbstractContextManager[None]:
+    """Let torch and LAPACK use one thread, so that bits do not depend on how many there are."""
+    return _threads(1)
 
 
 @contextmanager

@@ -59,6 +59,7 @@ def first_difference(one, other):
     return None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_every_stage_gives_the_same_bits_again_and_on_any_number_of_threads(preset):
     first, *others = on_threads(lambda: of_every_stage(preset), 1, 2, 2)
@@ -67,6 +68,7 @@ def test_every_stage_gives_the_same_bits_again_and_on_any_number_of_threads(pres
         assert first_difference(first, other) is None
 
 
+@pytest.mark.slow
 def test_what_two_processes_give_has_the_same_bits():
     """As is shown for one process, of hashes of objects and addresses nothing may depend."""
     code = (

@@ -24,7 +24,7 @@ from pimper_torch.linalg.aggregation import (
     parts_of,
     prolongation,
 )
-from pimper_torch.parallel import over_rows
+from pimper_torch.parallel import on_one_thread, over_rows
 
 Product = Callable[[Tensor], Tensor]
 
@@ -252,7 +252,8 @@ class Hierarchy:
         level = self._levels[depth]
         if depth + 1 == len(self._levels):
             if self._coarsest is not None:
-                return self._coarsest.to(residual) @ residual
+                with on_one_thread():
+                    return self._coarsest.to(residual) @ residual
             return level.smoothed(residual)
         found = level.smoothed(residual)
         coarse = self._cycle(depth + 1, level.coarse_residual(residual, found))
@@ -329,8 +330,9 @@ def _columns(vectors: Float[Tensor, "unknown ..."]) -> np.ndarray:
 def _dense_inverse(matrix: csr_array) -> Float[Tensor, "unknown unknown"]:
     dense = torch.from_numpy(matrix.toarray())
     scale = dense.diagonal().rsqrt()
-    values, vectors = torch.linalg.eigh(scale[:, None] * dense * scale)
-    # Rounding may make small eigenvalues negative; the inverse must stay positive definite.
-    values = values.clamp_min(torch.finfo(torch.float64).eps)
-    half = scale[:, None] * vectors
-    return (half / values) @ half.mT
+    with on_one_thread():
+        values, vectors = torch.linalg.eigh(scale[:, None] * dense * scale)
+        # Rounding may make small eigenvalues negative; the inverse must stay positive definite.
+        values = values.clamp_min(torch.finfo(torch.float64).eps)
+        half = scale[:, None] * vectors
+        return (half / values) @ half.mT

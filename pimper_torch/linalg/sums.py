@@ -25,6 +25,11 @@ def total(values: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
     return flat.sum()
 
 
+def along_last(values: Float[Tensor, "*batch item"]) -> Float[Tensor, "*batch"]:
+    """Sum along the last dimension; a single row as by :func:`total`."""
+    return total(values) if values.dim() == 1 else values.sum(dim=-1)
+
+
 def average(values: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
     """Give the mean of all values, summed as by :func:`total`; NaN where there are none."""
     return total(values) / values.numel()

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.linalg.sums import along_last
 
 # Scale of Cauchy's loss in standard deviations, at which it is 95 % efficient on Gaussian noise
 # (Holland & Welsch, 1977).
@@ -126,8 +127,8 @@ def robust_variance(
     determined = (square.detach() > 0).sum(dim=-1) > half
     scale = _scale_of_squares(square.detach(), torch.where(determined, half, 1))[..., None]
     fraction = _fractions(square, scale)
-    slope = 2 * (fraction * (1 - fraction)).detach().sum(dim=-1)
-    correction = (fraction.sum(dim=-1) - half) / torch.where(slope > 0, slope, 1)
+    slope = 2 * along_last((fraction * (1 - fraction)).detach())
+    correction = (along_last(fraction) - half) / torch.where(slope > 0, slope, 1)
     # One more Newton step, of length about zero: its derivative is the implicit function's.
     variance = (scale[..., 0] * (1 + correction)).clamp_min(0)
     return torch.where(determined, variance / _GAUSSIAN_SCALE**2, 0)
@@ -138,13 +139,13 @@ def _scale_of_squares(
     square: Float[Tensor, "*batch item"], half: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
     """Find the squared scale by Newton's method for its logarithm, from the mean square down."""
-    scale = square.mean(dim=-1)
+    scale = along_last(square) / square.shape[-1]
     scale = torch.where(scale > 0, scale, 1)
     close = torch.finfo(square.dtype).eps ** 0.75
     for _ in range(_NEWTON_STEPS):
         fraction = _fractions(square, scale[..., None])
-        slope = 2 * (fraction.sum(dim=-1) - fraction.square().sum(dim=-1))
-        step = (fraction.sum(dim=-1) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
+        slope = 2 * (along_last(fraction) - along_last(fraction.square()))
+        step = (along_last(fraction) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
         scale = scale * step.clamp(-_MAX_STEP, _MAX_STEP).exp()
         if bool((step.abs() < close).all()):
             break

@@ -1,0 +1,61 @@
+"""What SECURITY.md says of the package's own code."""
+
+import ast
+from pathlib import Path
+
+import pimper_torch
+
+PACKAGE = Path(pimper_torch.__file__).parent
+UNPICKLE = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal"}
+NETWORK = {"socket", "urllib", "http", "ftplib", "requests", "httpx", "aiohttp", "ssl"}
+TREES = {
+    path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
+    for path in PACKAGE.rglob("*.py")
+}
+
+
+def imports():
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                yield from ((path, alias.name.partition(".")[0]) for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                yield path, node.module.partition(".")[0]
+
+
+def calls():
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                yield path, ast.unparse(node.func), node
+
+
+def test_nothing_is_unpickled():
+    # The renderer hands a scene to processes that it starts itself.
+    assert [found for found in imports() if found[1] in UNPICKLE] == [
+        ("evidence/scenes/write.py", "pickle")
+    ]
+    loads = [(path, node) for path, name, node in calls() if name in ("np.load", "numpy.load")]
+    assert loads
+    for path, node in loads:
+        refused = {each.arg: ast.unparse(each.value) for each in node.keywords}
+        assert refused.get("allow_pickle") == "False", path
+    assert not [path for path, name, _ in calls() if name == "torch.load"]
+
+
+def test_no_network_connection_is_opened():
+    assert not [found for found in imports() if found[1] in NETWORK]
+
+
+def test_no_text_is_evaluated_but_the_package_itself():
+    found = {(path, name) for path, name, _ in calls() if name in ("eval", "exec", "compile")}
+    assert {path for path, _ in found} <= {"cli/light.py"}  # its own sources
+    assert not [path for path, name, _ in calls() if name in ("os.system", "yaml.unsafe_load")]
+    loaders = {path for path, name, _ in calls() if name == "yaml.load"}
+    assert loaders == {"config.py"}  # by a subclass of SafeLoader
+
+
+def test_only_baselines_run_programs():
+    assert {path for path, name in imports() if name in ("subprocess", "pty")} == {
+        "evidence/baselines/external.py"
+    }
