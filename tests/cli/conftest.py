@@ -10,7 +10,7 @@ def photos(tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
     noise = np.random.default_rng(76).integers(0, 256, (48, 64, 3), dtype=np.uint8)
-    for number in range(3):
+    for number in range(4):
         Image.fromarray(noise).save(folder / f"{number}.png")
     return folder
 

@@ -42,7 +42,7 @@ def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys)
     assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - {"masks"})
     config, views, sparse = chain.given
     assert config == CoarseToFineConfig() == load_config("default")
-    assert views.names == ("0.png", "1.png", "2.png")
+    assert views.names == ("0.png", "1.png", "2.png", "3.png")
     assert sparse is None
     told = capsys.readouterr()
     assert f"{tmp_path}/out/mesh.ply" in told.out
@@ -102,7 +102,8 @@ def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, 
         pixels = (255 * image).byte().movedim(0, -1).expand(-1, -1, 3)
         Image.fromarray(pixels.numpy()).save(photos / name)
     masks = tmp_path / "first" / "masks"
-    assert run("reconstruct", photos, "-o", tmp_path / "second", "--masks", masks) == 0
+    few = ("--factorize.min-views", "3")
+    assert run("reconstruct", photos, "-o", tmp_path / "second", "--masks", masks, *few) == 0
     views = chain.given[1]
     assert views.names == scene.views.names
     silhouettes = FindSilhouettes()(scene.replace(views=views))
@@ -127,6 +128,7 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
         (["--reconstruct.starts", "-1"], "starts is -1; needed: 0 or more"),
         (["--max-size-px", "-3"], "max_size_px is -3; needed: 0, or 32 pixels at least"),
         (["--max-size-px", "1"], "max_size_px is 1; needed: 0, or 32 pixels at least"),
+        (["--factorize.min-views", "5"], "photos: the number of photographs is 4; needed: 5 at le"),
         (["--reference", "nosuch"], "0 photographs are named 'nosuch'; needed: one of 0.png, 1"),
         (["--preset", "paper", "--triangulate.reference", "9"], "0 photographs are named '9'"),
         (["--photographs.saturation", "x"], "is 'x'; needed: {auto}|FLOAT|FLOAT,FLOAT,FLOAT."),
@@ -377,7 +379,7 @@ def test_a_machine_reads_events_one_a_line(photos, chain, tmp_path, capsys, monk
         assert told[ended]["seconds"] >= 0
     (ended,) = [one for one in told if one == one | {"event": "stage-end", "stage": "warp"}]
     assert ended["figures"] == {"samples": 1200}
-    assert {"event": "progress", "stage": "read", "done": 3, "total": 3}.items() <= next(
+    assert {"event": "progress", "stage": "read", "done": 4, "total": 4}.items() <= next(
         one for one in told if one["event"] == "progress"
     ).items()
     assert "light hardly varies." in [one.get("message") for one in told]

@@ -1,0 +1,30 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.soak.soak import Held, grown
+
+
+@pytest.mark.slow
+def test_a_process_holds_no_more_after_six_runs_than_after_two():
+    root = Path(__file__).parents[2]
+    ran = subprocess.run(
+        [sys.executable, str(root / "tests" / "soak" / "soak.py"), "--runs", "6"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "nothing grew" in ran.stdout
+
+
+def test_whatever_grows_is_told():
+    settled = Held(megabytes=1000.0, threads=4, handles=9, temporary=0)
+    first = Held(megabytes=500.0, threads=1, handles=3, temporary=0)
+    assert not grown([first, settled, settled])
+    for change in ({"megabytes": 1031.0}, {"threads": 5}, {"handles": 10}, {"temporary": 1}):
+        fields = {name: getattr(settled, name) for name in Held.__slots__}
+        assert len(grown([first, settled, Held(**(fields | change))])) == 1
