@@ -1,0 +1,99 @@
+"""What must not change the surface: order of photographs, the world's frame, brightness."""
+
+import dataclasses
+import warnings
+
+import pytest
+import torch
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.records import Mesh, SparseScene
+from tests.test_chain import photographed, small_chain
+
+# Of the diagonal: a tenth of the coarsest sample's spacing (0.013 of a radius-1 sphere's cap that
+# is 1.1 across). Solvers stop by tolerances of 1e-3 to 1e-4 of a solution, float32 rounds points of
+# a shifted world, and ties between equal views go to the first: nothing else may differ.
+TOLERANCE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def scene():
+    rendered = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
+    return sparse_scene(rendered, 150, torch.Generator().manual_seed(17))
+
+
+def surface_of(preset: str, scene: SparseScene) -> Mesh:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PimperWarning)
+        return small_chain(preset, scene)(scene.views).mesh
+
+
+@pytest.fixture(scope="module", params=["paper", pytest.param("default", marks=pytest.mark.slow)])
+def preset(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def usual(preset, scene):
+    return surface_of(preset, scene)
+
+
+def reordered(scene: SparseScene, order: list[int]) -> SparseScene:
+    place = torch.empty(len(order), dtype=torch.long)
+    place[order] = torch.arange(len(order))
+    return scene.replace(
+        views=scene.views.take(order),
+        cameras=scene.cameras.take(order),
+        observation_view=place[scene.observation_view],
+        lenses=tuple(
+            dataclasses.replace(scene.lenses[view], camera=k) for k, view in enumerate(order)
+        ),
+    )
+
+
+def moved(scene: SparseScene, scale: float, rotation: torch.Tensor, shift: torch.Tensor):
+    """Apply a similarity to the world: x becomes ``scale * rotation @ x + shift``."""
+    pose = scene.cameras.cam_from_world.double()
+    turned = pose.clone()
+    turned[:, :3, :3] = pose[:, :3, :3] @ rotation.mT
+    turned[:, :3, 3] = scale * pose[:, :3, 3] - (turned[:, :3, :3] @ shift)
+    points = scale * scene.points_world.double() @ rotation.mT + shift
+    cameras = scene.cameras.replace(cam_from_world=turned.to(scene.cameras.cam_from_world))
+    return scene.replace(cameras=cameras, points_world=points.to(scene.points_world))
+
+
+def apart(one: torch.Tensor, other: torch.Tensor) -> float:
+    """Give the mean distance to the other's nearest vertex, both ways, over the diagonal."""
+    one, other = one.double(), other.double()
+    distance = torch.cdist(one, other)
+    diagonal = (one.amax(dim=0) - one.amin(dim=0)).norm()
+    return float((distance.amin(dim=0).mean() + distance.amin(dim=1).mean()) / 2 / diagonal)
+
+
+def test_the_order_of_photographs_does_not_matter(preset, scene, usual):
+    order = torch.randperm(9, generator=torch.Generator().manual_seed(3)).tolist()
+    found = surface_of(preset, reordered(scene, order))
+    assert apart(found.vertices_world, usual.vertices_world) < TOLERANCE
+
+
+def test_a_similarity_of_the_world_moves_the_surface_along(preset, scene, usual):
+    generator = torch.Generator().manual_seed(5)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+    rotation = rotation * torch.linalg.det(rotation)
+    shift = torch.tensor([30.0, -20.0, 10.0], dtype=torch.float64)
+    found = surface_of(preset, moved(scene, 40.0, rotation, shift)).vertices_world.double()
+    back = (found - shift) @ rotation / 40
+    assert apart(back, usual.vertices_world) < TOLERANCE
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.2])
+def test_brighter_photographs_give_the_same_surface_and_a_brighter_light(
+    preset, scene, usual, gain
+):
+    """Within what the sensor tells: nothing becomes darker than the dark level or saturates."""
+    views = scene.views.replace(images=scene.views.images * gain)
+    assert float(views.images.amax()) < 0.98
+    found = surface_of(preset, scene.replace(views=views))
+    assert apart(found.vertices_world, usual.vertices_world) < TOLERANCE

@@ -1,0 +1,53 @@
+"""Invariances of single stages, on many random inputs."""
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.linalg.sums import total
+from pimper_torch.photometry.cone import project_to_cone
+from pimper_torch.photometry.robust import robust_variance
+
+SEEDS = st.integers(0, 2**31 - 1)
+
+
+def drawn(seed: int, *shape: int) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=SEEDS)
+def test_normals_do_not_depend_on_the_order_of_facets(seed):
+    vertices, faces = icosphere(2)
+    vertices = vertices.double() + 0.05 * drawn(seed, *vertices.shape)
+    order = torch.randperm(len(faces), generator=torch.Generator().manual_seed(seed))
+    assert_close(vertex_normals(vertices, faces[order]), vertex_normals(vertices, faces))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=SEEDS, gain=st.floats(1e-6, 1e6))
+def test_the_scale_of_radiance_goes_through_the_cone(seed, gain):
+    shading = drawn(seed, 40, 4)
+    assert_close(project_to_cone(gain * shading), gain * project_to_cone(shading))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=SEEDS, gain=st.floats(1e-6, 1e6), size=st.integers(20, 9000))
+def test_a_robust_variance_follows_the_scale_and_no_order(seed, gain, size):
+    square = drawn(seed, size).square()
+    seen = torch.ones(size, dtype=torch.bool)
+    usual = robust_variance(square, seen)
+    order = torch.randperm(size, generator=torch.Generator().manual_seed(seed))
+    assert_close(robust_variance(square[order], seen), usual)
+    assert_close(robust_variance(gain * square, seen), gain * usual)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=SEEDS, size=st.integers(0, 30_000))
+def test_a_total_is_within_rounding_of_any_other_order(seed, size):
+    values = drawn(seed, size)
+    order = torch.randperm(size, generator=torch.Generator().manual_seed(seed))
+    assert_close(total(values[order]), total(values), rtol=0, atol=1e-15 * (1 + size))
