@@ -299,7 +299,7 @@ def _remove_bare(parent: Path) -> None:
             if (
                 _NAME.fullmatch(folder.name)
                 and time.time() - folder.lstat().st_mtime > _BARE_S
-                and {path.name for path in folder.iterdir()} <= {f"{_NOTE}.new"}
+                and {path.name for path in folder.iterdir()} <= {f"{_NOTE}.new", LOCK}
             ):
                 shutil.rmtree(folder)
 

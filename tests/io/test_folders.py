@@ -542,7 +542,7 @@ def test_what_a_run_left_that_was_killed_in_its_first_moment_is_ours(tmp_path):
     """Before it had marked the folder of stages, and before it had noted whose its folder is."""
     fill(tmp_path / "out" / STAGES, {"lock": "", f"{MARKER}.new": "{"})
     bare = tmp_path / ".pimper-0123abcd"
-    fill(bare, {"note.json.new": "{"})
+    fill(bare, {"note.json.new": "{", "lock": ""})
     os.utime(bare, (0, 0))
     write(tmp_path / "out", result("first"))
     assert held(tmp_path) == ["out"]
