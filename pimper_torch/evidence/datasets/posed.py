@@ -312,6 +312,11 @@ def _intrinsics(one: PosedPhotograph, lens: Lens) -> Float[Tensor, "3 3"]:
     assert one.skew_px == 0 or is_pinhole(lens), "skew and distortion together are undefined here"
     K = pinhole_for(lens).clone()
     K[0, 1] = one.skew_px * lens.width / one.lens.width
+    if not bool(K.isfinite().all() & (K.diagonal() > 0).all()):
+        raise InputError(
+            f"{one.image}: its lens ({lens.model}) leaves no pinhole when it is undistorted: "
+            f"{K.tolist()}; needed: distortion of a real lens. Export the cameras again."
+        )
     return K
 
 

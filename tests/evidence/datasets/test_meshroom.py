@@ -139,3 +139,9 @@ def test_a_folder_without_the_file_is_refused(tmp_path):
 def test_a_focal_length_that_is_not_finite_is_refused(save, intrinsic):
     with pytest.raises(InputError, match="a positive focal length"):
         read_meshroom(save(intrinsic=NEW | intrinsic))
+
+
+def test_a_distortion_that_leaves_no_pinhole_is_refused(save):
+    lens = {"type": "radial3", "distortionParams": ["0.01", "0", "0"], "pixelRatio": "1e-320"}
+    with pytest.raises(InputError, match="leaves no pinhole"):
+        read_meshroom(save(intrinsic=NEW | lens))
