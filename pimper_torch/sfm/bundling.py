@@ -15,19 +15,18 @@ _ITERATIONS = 100
 def bundle(
     model: SparseModel,
     scale_px: float,
-    threads: int,
     *,
     cameras: bool = True,
     tolerance: float = 1e-6,
 ) -> SparseModel:
     """Adjust poses, lenses and points to the observations, robustly.
 
-    Principal points stay; focal lengths and distortions are adjusted, one set a lens.
+    Principal points stay; focal lengths and distortions are adjusted, one set a lens. On one
+    thread, so that the same observations give the same bits.
 
     Args:
         model: Every point with two observations at least.
         scale_px: Residual at which Cauchy's weight is a half.
-        threads: -1 for all cores.
         cameras: Whether poses and lenses are adjusted, or points alone.
         tolerance: Relative fall of the cost that ends the iterations.
 
@@ -43,7 +42,7 @@ def bundle(
     options.ceres.loss_function_scale = scale_px
     options.ceres.solver_options.max_num_iterations = _ITERATIONS
     options.ceres.solver_options.function_tolerance = tolerance
-    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.num_threads = 1
     with quiet():
         reconstruction = reconstruction_of(model, _no_colors(model))
         config = _everything(reconstruction) if cameras else _points_alone(reconstruction)

@@ -25,17 +25,17 @@ class MapSettings:
         pairs_count: Points that only two views see take part, too: they tie views with
             little overlap, less exactly.
         seed: Of everything random.
-        threads: -1 for all cores.
     """
 
     min_inliers: int
     pairs_count: bool
     seed: int
-    threads: int
 
 
 def map_views(space: Workspace, settings: MapSettings) -> list[SparseModel]:
     """Grow models from the best pair of views on, until no view can be added.
+
+    On one thread, so that the same matches give the same bits.
 
     Returns:
         One model a component, the one with most views first. Names are files of ``space``.
@@ -45,7 +45,7 @@ def map_views(space: Workspace, settings: MapSettings) -> list[SparseModel]:
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 3
     options.extract_colors = False
-    options.num_threads = settings.threads
+    options.num_threads = 1
     options.random_seed = settings.seed
     options.mapper.abs_pose_min_num_inliers = settings.min_inliers
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH

@@ -57,7 +57,8 @@ class ReconstructConfig:
             model.
         track_iterations: Of finding the points again in every view, by aligning what photographs
             show round them, and adjusting cameras to that; 0 leaves the features' places.
-        threads: 0 for all cores. With 1 the result is the same bit for bit.
+        threads: Of features and matches; 0 for all cores. The model grows and is adjusted on one
+            thread: on several, Ceres adds in another order in every run.
         seed: Of everything random.
     """
 
@@ -131,7 +132,6 @@ class ReconstructConfig:
                 min_inliers=_MIN_POINTS,
                 pairs_count=False,
                 seed=self.seed,
-                threads=self.threads or -1,
             ),
             guided_pairs=self.guided_pairs,
             starts=self.starts,
@@ -143,7 +143,6 @@ class ReconstructConfig:
         return TrackSettings(
             iterations=self.track_iterations,
             fewest_points=_MIN_POINTS,
-            threads=self.threads or -1,
         )
 
 

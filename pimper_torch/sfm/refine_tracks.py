@@ -53,13 +53,11 @@ class TrackSettings:
     Attributes:
         iterations: Of finding points again and adjusting cameras.
         fewest_points: A view that shows fewer of the points that were found keeps its features.
-        threads: -1 for all cores.
         track_observations: When a point counts as found.
     """
 
     iterations: int
     fewest_points: int
-    threads: int
     track_observations: SightingSettings = field(default_factory=SightingSettings)
 
 
@@ -90,11 +88,9 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
             model if left else renewed
         )  # all points of the last round, with its track observations
         model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
-        model = bundle(
-            model, _FIRST_SCALE_PX, settings.threads, cameras=False, tolerance=_FIRST_TOLERANCE
-        )
+        model = bundle(model, _FIRST_SCALE_PX, cameras=False, tolerance=_FIRST_TOLERANCE)
     if settings.iterations:
-        model = bundle(model, scale, settings.threads, cameras=False)
+        model = bundle(model, scale, cameras=False)
         limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
         model = model.without(observation_errors(model) > limit)
     return model
@@ -162,10 +158,10 @@ def _cameras_adjusted(
 ) -> tuple[SparseModel, float]:
     """Adjust cameras to what was aligned; tell the scale of the residuals, too."""
     tied, leading = _leading(model, aligned, settings.fewest_points)
-    tied = bundle(tied, _FIRST_SCALE_PX, settings.threads, tolerance=_FIRST_TOLERANCE)
+    tied = bundle(tied, _FIRST_SCALE_PX, tolerance=_FIRST_TOLERANCE)
     spread = float(observation_errors(tied)[leading].median()) / _MEDIAN_LENGTH
     scale = min(max(spread, _SCALES_PX[0]), _SCALES_PX[1])
-    return bundle(tied, scale, settings.threads), scale
+    return bundle(tied, scale), scale
 
 
 def _leading(

@@ -19,9 +19,10 @@ from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Views
-from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig, structure_from_motion
 from pimper_torch.sfm.scene import write_model
 from pimper_torch.sfm.workspace import workspace
+from pimper_torch.store import digest
 
 
 def blank(sizes: list[tuple[int, int]]) -> Views:
@@ -234,6 +235,20 @@ def test_eight_photographs_of_the_skull_register_and_their_points_reproject():
     assert scene.cameras.intrinsics[0, 0, 0] == pytest.approx(2048, rel=0.05)
     assert len(scene.points_world) > 500
     assert scene.reprojection_errors_px.median() < 1
+
+
+@pytest.mark.slow
+def test_the_same_photographs_of_the_skull_give_the_same_bits_on_any_number_of_threads():
+    from pimper_torch.io.photographs import load_views
+
+    views = load_views(str(files("pimper_torch").joinpath("data/skull")), max_size_px=600)
+    some = views.take([views.names.index(f"{number}.jpg") for number in range(35, 42)])
+    found = {
+        digest(structure_from_motion(some, ReconstructConfig(threads=threads)))
+        for threads in (1, 2, 2, 2)
+    }
+    assert len(found) == 1
+    assert None not in found
 
 
 def test_photographs_with_pixels_that_are_no_numbers_are_refused_by_name(views, tmp_path):

@@ -12,7 +12,7 @@ from pimper_torch.sfm.track_observations import SightingSettings
 from tests.sfm import ball
 
 SETTINGS = TrackSettings(
-    iterations=1, fewest_points=30, threads=1, track_observations=SightingSettings(radius_px=8)
+    iterations=1, fewest_points=30, track_observations=SightingSettings(radius_px=8)
 )
 
 
@@ -32,7 +32,7 @@ def camera_error(model, points):
         observation_view=each[:, 1],
         observation_pixels=pixels[each[:, 1], each[:, 0]],
     )
-    return shape_error(bundle(exact, 0.5, 1, cameras=False).points_world, points)
+    return shape_error(bundle(exact, 0.5, cameras=False).points_world, points)
 
 
 def found_by_features(generator, noise_px=0.5, fraction=0.6):
@@ -40,7 +40,7 @@ def found_by_features(generator, noise_px=0.5, fraction=0.6):
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(200, generator)
     model = ball.model_of(cameras, points, generator, noise_px, fraction)
-    return cameras, points, bundle(model, 1.0, 1)
+    return cameras, points, bundle(model, 1.0)
 
 
 def test_cameras_come_five_times_nearer_to_the_truth_under_changing_light(generator):
@@ -106,7 +106,7 @@ def test_bundling_leads_exact_observations_back_to_the_truth(generator):
         cam_from_world=off @ exact.cam_from_world,
         points_world=points + 0.02 * torch.randn(points.shape, generator=generator).double(),
     )
-    found = bundle(moved, 0.5, 1)
+    found = bundle(moved, 0.5)
     assert observation_errors(found).max() < 1e-3
     assert shape_error(found.points_world, points) < 1e-4
 
@@ -116,7 +116,7 @@ def test_bundling_of_points_alone_leaves_cameras_where_they_are(generator):
     points = ball.points_on_the_ball(100, generator)
     exact = ball.model_of(cameras, points, generator, noise_px=0.0)
     moved = exact.replace(points_world=points + 0.02)
-    found = bundle(moved, 0.5, 1, cameras=False)
+    found = bundle(moved, 0.5, cameras=False)
     torch.testing.assert_close(found.cam_from_world, exact.cam_from_world, rtol=0, atol=1e-12)
     assert found.lenses == exact.lenses
     torch.testing.assert_close(found.points_world, points, rtol=0, atol=1e-5)

@@ -16,7 +16,7 @@ from pimper_torch.sfm.static_background import StaticBackground
 from pimper_torch.sfm.workspace import Workspace
 
 MATCHING = MatchSettings(max_ratio=0.8, max_error_px=2.0, min_inliers=15, seed=0, threads=1)
-MAPPING = MapSettings(min_inliers=6, pairs_count=False, seed=5, threads=1)
+MAPPING = MapSettings(min_inliers=6, pairs_count=False, seed=5)
 SETTINGS = RegistrationSettings(matching=MATCHING, mapping=MAPPING, guided_pairs=1, starts=2)
 
 
