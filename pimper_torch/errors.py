@@ -4,7 +4,7 @@ Every message says where, what was found, what was needed, and what to do.
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -95,3 +95,13 @@ def held() -> Iterator[list[str]]:
             caution(message)
         raise
     _held.reset(token)
+
+
+def some(names: Sequence[str], most: int = 8) -> str:
+    """List names for a message, the first few and how many more.
+
+    >>> some(["a", "b", "c"], most=2)
+    'a, b and 1 more'
+    """
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

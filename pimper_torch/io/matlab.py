@@ -40,7 +40,9 @@ class Variable:
     array: np.ndarray | None
 
 
-def read_variables(path: Path, wanted: Callable[[str], bool] = lambda name: True) -> list[Variable]:
+def read_variables(
+    path: Path | str, wanted: Callable[[str], bool] = lambda name: True
+) -> list[Variable]:
     """Read the arrays of numbers; other variables are named only.
 
     Args:
@@ -51,7 +53,7 @@ def read_variables(path: Path, wanted: Callable[[str], bool] = lambda name: True
         ValueError: It is no such file, is cut short, or unpacks to more than 512 MB: says which.
         OSError: Of the system.
     """
-    data = path.read_bytes()
+    data = Path(path).read_bytes()
     if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):
         raise ValueError("it is no MATLAB file of version 5 to 7")
     order = "<" if data[126:128] == b"IM" else ">"

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError, PimperWarning, some
 from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header, rotated
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.radiometry import SATURATED, SRGB, Encoding
@@ -154,16 +154,6 @@ def list_images(folder: Path | str) -> list[Path]:
                 "results go by the name without it. Rename or remove one."
             )
     return paths
-
-
-def some(names: Sequence[str], at_most: int = 5) -> str:
-    """List names for a message, the first few and how many more.
-
-    >>> some(["a", "b", "c"], at_most=2)
-    'a, b and 1 more'
-    """
-    rest = len(names) - at_most
-    return ", ".join(names[:at_most]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _tell_passed_over(folder: Path) -> None:

@@ -11,10 +11,10 @@ from PIL import Image
 from torch import Tensor
 
 from pimper_torch.config import to_yaml
-from pimper_torch.io.folders import written_whole
 from pimper_torch.io.meshes import write_glb, write_ply, written_channels
 from pimper_torch.io.reports import lights_report, summary_report
 from pimper_torch.meshing.simplify import simplify
+from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
@@ -74,7 +74,7 @@ def write_result(
     and expected error within :func:`~pimper_torch.io.meshes.written_channels` of what is blended
     there (``summary.json`` tells how far off they are). The pictures show what is written.
 
-    It is there whole or not at all; see :func:`pimper_torch.io.folders.written_whole`.
+    It is there whole or not at all; see :func:`pimper_torch.outputs.folders.written_whole`.
 
     Args:
         result: Of the run.

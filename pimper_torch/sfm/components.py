@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from pimper_torch.errors import ReconstructionError
+from pimper_torch.errors import ReconstructionError, some
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import triangulation_angles
-from pimper_torch.sfm.model import SparseModel, list_some
+from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.static_background import StaticBackground
 
 FEWEST_VIEWS = 3
@@ -89,7 +89,7 @@ def choose_component(
         missing = [name for name in names if name not in kept]
         raise ReconstructionError(
             f"Structure from motion registered {len(kept)} of {len(names)} photographs; at least "
-            f"{FEWEST_VIEWS} are needed. Not registered: {list_some(missing, most=20)}. {ADVICE}"
+            f"{FEWEST_VIEWS} are needed. Not registered: {some(missing, most=20)}. {ADVICE}"
         )
     if spread[largest] < FEWEST_VIEWS:
         raise ReconstructionError(
@@ -106,7 +106,7 @@ def choose_component(
     ]
     if rivals and len(kept) < min_fraction * len(names):
         parts = "; ".join(
-            f"{len(part)} photographs ({list_some(part, most=12)})" for part in (kept, *rivals)
+            f"{len(part)} photographs ({some(part, most=12)})" for part in (kept, *rivals)
         )
         raise ReconstructionError(
             f"Structure from motion split {len(names)} photographs into {1 + len(rivals)} models "

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, some
 from pimper_torch.records import Lens, Record, pairs_table
 from pimper_torch.records.scene import no_maps
 
@@ -148,16 +148,10 @@ def match_names(model: SparseModel, names: Sequence[str], folder: Path) -> Spars
     if not chosen:
         raise InputError(
             f"The COLMAP model in {folder} has none of the photographs. Its images are "
-            f"{list_some(model.names)}; the photographs are {list_some(names)}. Rename the "
+            f"{some(model.names)}; the photographs are {some(names)}. Rename the "
             "photographs to match, or leave the model out to run structure from motion."
         )
     renamed = select_views(model, chosen)
     return renamed.replace(
         names=tuple(name for name, index in zip(names, found, strict=True) if index is not None)
     )
-
-
-def list_some(names: Sequence[str], most: int = 8) -> str:
-    """Name a few of many."""
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

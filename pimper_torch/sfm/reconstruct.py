@@ -8,7 +8,14 @@ from pathlib import Path
 import torch
 
 from pimper_torch.config import require, require_at_most
-from pimper_torch.errors import InputError, OutputError, ReconstructionError, caution, overheard
+from pimper_torch.errors import (
+    InputError,
+    OutputError,
+    ReconstructionError,
+    caution,
+    overheard,
+    some,
+)
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.binding import thread_count
@@ -19,7 +26,7 @@ from pimper_torch.sfm.existing import existing_model
 from pimper_torch.sfm.features import FeatureSettings, find_features
 from pimper_torch.sfm.mapping import MapSettings
 from pimper_torch.sfm.matching import MatchSettings
-from pimper_torch.sfm.model import SparseModel, list_some, select_views
+from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
 from pimper_torch.sfm.scene import assemble_scene
@@ -289,7 +296,7 @@ def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> 
     if misplaced:
         caution(
             f"{len(misplaced)} of {model.num_views} photographs contradict most matches with those "
-            f"they share most with, and may be misplaced: {list_some(misplaced, most=20)}. Look "
+            f"they share most with, and may be misplaced: {some(misplaced, most=20)}. Look "
             "for sides that look alike; add photographs between these and their neighbours.",
             stacklevel=4,
         )
@@ -334,7 +341,7 @@ def _require_one_size(views: Views) -> None:
     }
     if len(groups) > 1:
         found = "; ".join(
-            f"{width}x{height}: {list_some(names)}" for (width, height), names in groups.items()
+            f"{width}x{height}: {some(names)}" for (width, height), names in groups.items()
         )
         raise InputError(
             f"One shared camera was asked for, but the photographs have {len(groups)} sizes "
@@ -348,6 +355,6 @@ def _require_features(counts: Sequence[int], names: Sequence[str]) -> None:
     if len(names) - len(bare) < 3:
         raise ReconstructionError(
             f"No features were found in {len(bare)} of {len(names)} photographs: "
-            f"{list_some(bare, most=20)}. At least 3 photographs with features are needed. Check "
+            f"{some(bare, most=20)}. At least 3 photographs with features are needed. Check "
             "that they are not black, blank or masked out entirely, and expose them brighter."
         )

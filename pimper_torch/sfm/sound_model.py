@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError, caution
+from pimper_torch.errors import InputError, caution, some
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.records import Lens
-from pimper_torch.sfm.model import SparseModel, list_some
+from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.model_files import FileCamera, FileImage, FileModel
 
 # Choices: a model of which more is broken is not believed; no photograph is wider or higher.
@@ -49,7 +49,7 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
     points, order = files.points, np.argsort(files.points.points, kind="stable")
     finite = (np.abs(points.xyz) < _MAX_COORDINATE).all(axis=1)
     dropped = [
-        f"{len(names)} of {len(files.images)} images ({list_some(names, 4)}), which {fault}"
+        f"{len(names)} of {len(files.images)} images ({some(names, 4)}), which {fault}"
         for fault, names in faults.items()
     ]
     nowhere = int((~finite).sum())

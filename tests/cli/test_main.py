@@ -20,10 +20,10 @@ from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
 from pimper_torch.cli.output import Output
 from pimper_torch.errors import PimperWarning, ReconstructionError
-from pimper_torch.io.marker import MARKER
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.io.version import installed_version
+from pimper_torch.outputs.marker import MARKER
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Mesh, Silhouettes
 from pimper_torch.silhouettes.find import FindSilhouettes

@@ -31,6 +31,11 @@ sys.exit(supervised())
 READY = "os.write(int(os.environ['READY']), b'ready');"
 
 
+def heard() -> None:
+    """Let the program hear of a terminal that is gone, also where `nohup` runs the tests."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 class Ran:
     """A run of the program, from when it said that it was ready."""
 
@@ -47,6 +52,7 @@ class Ran:
             | {"PYTHONPATH": os.pathsep.join([str(folder), *sys.path]), "READY": str(tells)},
             pass_fds=(tells,),
             start_new_session=True,
+            preexec_fn=heard,
         )
         os.close(tells)
         os.read(hears, 5)

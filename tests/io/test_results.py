@@ -16,11 +16,11 @@ from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io import results
-from pimper_torch.io.folders import prepare_output
-from pimper_torch.io.marker import MARKER
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply, written_channels
 from pimper_torch.io.reports import common_lights, lights_report, summary_report, world_lights
 from pimper_torch.io.results import RESULT_NAMES, write_result
+from pimper_torch.outputs.folders import prepare_output
+from pimper_torch.outputs.marker import MARKER
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Mesh, Silhouettes

@@ -24,8 +24,8 @@ from pimper_torch.evidence.bench.table import markdown
 from pimper_torch.evidence.metrics.alignment import transfer
 from pimper_torch.evidence.metrics.evaluate import Evaluation, evaluate
 from pimper_torch.evidence.metrics.in_view import meet_truth
-from pimper_torch.io.folders import written_whole
 from pimper_torch.io.meshes import write_ply
+from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import listening
 from pimper_torch.records import Record, StageReport
 from pimper_torch.reporting import Observer, Silent, peak_memory_mb

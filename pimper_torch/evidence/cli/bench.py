@@ -13,7 +13,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.evidence.bench.config import BenchConfig
 from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
 from pimper_torch.evidence.bench.table import terminal
-from pimper_torch.io.folders import prepare_output, require_apart
+from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.store.folders import user_cache
 
 _OUT, _QUICK = Path("pimper_bench"), BenchConfig()

@@ -33,7 +33,7 @@ from pimper_torch.evidence.datasets import (
     write_transforms,
 )
 from pimper_torch.evidence.datasets.posed import shrink
-from pimper_torch.io.folders import prepare_output, require_apart, written_whole
+from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
 from pimper_torch.records import Cameras, Capture, Truth, Views

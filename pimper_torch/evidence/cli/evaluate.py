@@ -29,9 +29,9 @@ from pimper_torch.evidence.metrics.evaluate import (
 from pimper_torch.evidence.metrics.icp import IcpConfig
 from pimper_torch.evidence.metrics.report import report, rows
 from pimper_torch.io.estimates import read_estimate
-from pimper_torch.io.files import file_written_whole, is_titled, prepare_file, says_of_itself
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
+from pimper_torch.outputs.files import file_written_whole, is_titled, prepare_file, says_of_itself
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
 from pimper_torch.viz.calibration import TITLE, draw_calibration
 
@@ -351,7 +351,7 @@ def _prepare_files(job: Job) -> None:
     """Refuse, before the work and before writing, files that are not ours to replace.
 
     Raises:
-        OutputError: As :func:`pimper_torch.io.files.prepare_file`.
+        OutputError: As :func:`pimper_torch.outputs.files.prepare_file`.
     """
     if job.out is not None:
         prepare_file(job.out, job.overwrite, lambda file: says_of_itself(file, "format", FORMAT))

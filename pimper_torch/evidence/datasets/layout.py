@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError
-from pimper_torch.io.photographs import some
+from pimper_torch.errors import InputError, some
 
 _MAX_NAME = 255  # bytes, of most file systems
 

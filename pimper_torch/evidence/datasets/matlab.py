@@ -8,10 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, some
 from pimper_torch.evidence.datasets.layout import expect
 from pimper_torch.io.matlab import read_variables
-from pimper_torch.io.photographs import some
 
 
 def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.ndarray]:
@@ -33,7 +32,7 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
         path,
         kind,
         f"the variables {some(absent)}",
-        f"variables {some(sorted(found), at_most=12)}" if found else "no variables",
+        f"variables {some(sorted(found), most=12)}" if found else "no variables",
     )
     arrays = {}
     for name in names:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.errors import some
 from pimper_torch.evidence.datasets.layout import (
     expect,
     first_of,
@@ -22,7 +23,6 @@ from pimper_torch.evidence.datasets.posed import (
     rigid_or_refuse,
 )
 from pimper_torch.geometry.pixels import pixels_from_indices
-from pimper_torch.io.photographs import some
 from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Capture, Lens
 

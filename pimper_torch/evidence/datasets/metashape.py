@@ -8,7 +8,7 @@ from xml.parsers import expat
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, some
 from pimper_torch.evidence.datasets.layout import expect, first_of, numbers
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
@@ -18,7 +18,6 @@ from pimper_torch.evidence.datasets.posed import (
     rigid_or_refuse,
 )
 from pimper_torch.geometry.frames import invert_rigid, rigid
-from pimper_torch.io.photographs import some
 from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Capture, Lens
 

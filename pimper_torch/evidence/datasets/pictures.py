@@ -7,8 +7,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-from pimper_torch.errors import InputError
-from pimper_torch.io.photographs import some
+from pimper_torch.errors import InputError, some
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Views
 

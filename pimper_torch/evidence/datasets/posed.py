@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, some
 from pimper_torch.evidence.datasets.layout import expect
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import SUFFIXES, decode, read_header
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import shrunk_size, some
+from pimper_torch.io.photographs import shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
 from pimper_torch.radiometry import SRGB, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Record, Truth, Views

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from pimper_torch.errors import some
 from pimper_torch.evidence.datasets.layout import expect
-from pimper_torch.io.photographs import some
 
 
 def one_light_per_position(
@@ -108,5 +108,5 @@ def _refuse_absent(
         path,
         kind,
         f"photographs of {what} {some([str(number) for number in absent])}",
-        f"{what} {some([str(number) for number in sorted(set(there))], at_most=25)}",
+        f"{what} {some([str(number) for number in sorted(set(there))], most=25)}",
     )

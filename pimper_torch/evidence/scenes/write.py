@@ -42,9 +42,9 @@ from pimper_torch.evidence.scenes.scene import Scene, build_scene
 from pimper_torch.evidence.scenes.stage import Stage
 from pimper_torch.evidence.scenes.tracks import true_model
 from pimper_torch.io.decode import write_deep_png
-from pimper_torch.io.folders import require_apart, written_whole
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.version import installed_version
+from pimper_torch.outputs.folders import require_apart, written_whole
 from pimper_torch.progress import report
 from pimper_torch.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.sfm.colmap import write_binary

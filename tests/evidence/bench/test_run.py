@@ -25,8 +25,8 @@ from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.geometry.frames import transform
-from pimper_torch.io.marker import MARKER
 from pimper_torch.io.meshes import read_mesh
+from pimper_torch.outputs.marker import MARKER
 from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
 
 RIGHT = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)

@@ -214,9 +214,11 @@ def test_a_name_that_is_no_scene_is_refused_with_those_there_are():
 
 
 def test_a_cloud_without_faces_is_refused(tmp_path):
-    (tmp_path / "cloud.xyz").write_text("0 0 0\n1 0 0\n0 1 1\n")
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+    points = "property float z\nend_header\n0 0 0\n1 0 0\n0 1 1\n"
+    (tmp_path / "cloud.ply").write_text(header + points)
     with pytest.raises(InputError, match="without faces"):
-        build_scene(tmp_path / "cloud.xyz", SMALL)
+        build_scene(tmp_path / "cloud.ply", SMALL)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from platform import node
 from typing import Any
 
 from pimper_torch.errors import OutputError, caution
-from pimper_torch.io.marker import MARKER, STAGES, mark, read_marker, write_text
+from pimper_torch.outputs.marker import MARKER, STAGES, mark, read_marker, write_text
 
 LOCK = "lock"
 _HOLDER = "holder.json"

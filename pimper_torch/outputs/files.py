@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pimper_torch.errors import OutputError
-from pimper_torch.io.names import require_name
+from pimper_torch.outputs.names import require_name
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _HEAD = 4096  # bytes: what a PNG says of itself stands before its pixels

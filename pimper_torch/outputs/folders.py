@@ -6,12 +6,11 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 
-from pimper_torch.errors import InputError, OutputError
-from pimper_torch.io.marker import MARKER, STAGES, Kind, foreign, read_marker, seal
-from pimper_torch.io.names import require_name
-from pimper_torch.io.photographs import some
-from pimper_torch.io.stages import is_ours, kept, locked
-from pimper_torch.io.workspace import (
+from pimper_torch.errors import InputError, OutputError, some
+from pimper_torch.outputs.marker import MARKER, STAGES, Kind, foreign, read_marker, seal
+from pimper_torch.outputs.names import require_name
+from pimper_torch.outputs.stages import is_ours, kept, locked
+from pimper_torch.outputs.workspace import (
     READY,
     finish,
     put_aside,
@@ -122,7 +121,7 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
 
     It lies beside ``folder``: a folder that is there is whole, and a former result is replaced
     only when the new one is complete and on the disk. What a run kept for the next one stays; see
-    :func:`pimper_torch.io.workspace.put_in_place`.
+    :func:`pimper_torch.outputs.workspace.put_in_place`.
 
     Args:
         folder: New, or empty but for what a former run kept; its parents are made.

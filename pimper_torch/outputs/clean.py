@@ -5,9 +5,9 @@ import stat
 from pathlib import Path
 
 from pimper_torch.errors import OutputError
-from pimper_torch.io.marker import STAGES, read_marker
-from pimper_torch.io.stages import is_ours, locked, remove_stages
-from pimper_torch.io.workspace import finish, leftovers, remove_leftovers, restore
+from pimper_torch.outputs.marker import STAGES, read_marker
+from pimper_torch.outputs.stages import is_ours, locked, remove_stages
+from pimper_torch.outputs.workspace import finish, leftovers, remove_leftovers, restore
 
 
 def require_cleanable(folder: Path | str) -> None:

@@ -20,8 +20,8 @@ from types import FrameType
 from typing import Any, Literal
 
 from pimper_torch.errors import caution
-from pimper_torch.io.exchange import exchange
-from pimper_torch.io.marker import (
+from pimper_torch.outputs.exchange import exchange
+from pimper_torch.outputs.marker import (
     MARKER,
     STAGES,
     flush_folder,
@@ -30,7 +30,7 @@ from pimper_torch.io.marker import (
     tops,
     write_text,
 )
-from pimper_torch.io.stages import LOCK, is_ours, kept, link_lock, move_kept
+from pimper_torch.outputs.stages import LOCK, is_ours, kept, link_lock, move_kept
 
 READY = "ready"
 """In the folder of kept stages: a whole result that waits to be moved to its place."""

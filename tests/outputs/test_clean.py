@@ -7,14 +7,14 @@ import pytest
 
 from pimper_torch.cli.main import main
 from pimper_torch.errors import OutputError
-from pimper_torch.io.clean import clean_output
-from pimper_torch.io.folders import held_output, written_whole
-from pimper_torch.io.marker import MARKER, STAGES
+from pimper_torch.outputs.clean import clean_output
+from pimper_torch.outputs.folders import held_output, written_whole
+from pimper_torch.outputs.marker import MARKER, STAGES
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from pimper_torch.io.folders import held_output, written_whole
+from pimper_torch.outputs.folders import held_output, written_whole
 folder = Path(sys.argv[1])
 with held_output(folder, "result", overwrite=True):
     (folder / ".stages" / "mesh.pt").write_bytes(bytes(3_000_000))

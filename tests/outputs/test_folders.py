@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from pimper_torch.errors import InputError, OutputError, PimperWarning
-from pimper_torch.io import exchange as exchange_module
-from pimper_torch.io import workspace as workspace_module
-from pimper_torch.io.exchange import exchange
-from pimper_torch.io.folders import held_output, prepare_output, require_apart, written_whole
-from pimper_torch.io.marker import MARKER, STAGES, foreign, read_marker, remove_written, seal
-from pimper_torch.io.workspace import READY, leftovers
+from pimper_torch.outputs import exchange as exchange_module
+from pimper_torch.outputs import workspace as workspace_module
+from pimper_torch.outputs.exchange import exchange
+from pimper_torch.outputs.folders import held_output, prepare_output, require_apart, written_whole
+from pimper_torch.outputs.marker import MARKER, STAGES, foreign, read_marker, remove_written, seal
+from pimper_torch.outputs.workspace import READY, leftovers
 
 
 def held(folder: Path) -> list[str]:
@@ -239,7 +239,7 @@ def test_a_disk_that_is_full_while_the_list_is_written_changes_nothing(out, monk
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("pimper_torch.io.folders.seal", full)
+    monkeypatch.setattr("pimper_torch.outputs.folders.seal", full)
     with pytest.raises(OutputError, match="No space left"):
         write(out, result("second"), overwrite=True)
     assert contents(out) == result("first", "masks/a.png")
@@ -333,7 +333,7 @@ def test_a_folder_that_may_be_written_though_the_one_above_may_not_is_filled(tmp
 HOLDS = """
 import sys, time
 from pathlib import Path
-from pimper_torch.io.folders import held_output, written_whole
+from pimper_torch.outputs.folders import held_output, written_whole
 folder, mode = Path(sys.argv[1]), sys.argv[2]
 with held_output(folder, "result", overwrite=True):
     (folder / ".stages" / "mesh.pt").write_text("kept")
