@@ -238,7 +238,7 @@ def test_eight_photographs_of_the_skull_register_and_their_points_reproject():
 
 
 @pytest.mark.slow
-def test_the_same_photographs_of_the_skull_give_the_same_bits_on_any_number_of_threads():
+def test_the_same_photographs_give_the_same_bits_on_any_number_of_threads():
     from pimper_torch.io.photographs import load_views
 
     views = load_views(str(files("pimper_torch").joinpath("data/skull")), max_size_px=600)
