@@ -20,8 +20,7 @@ from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.outputs.names import require_name
 
-# Of 30 photographs of 800x600, `default` keeps 1.3 GB, of 24 of 900x600 (the demo) 0.9. A choice:
-# a few runs' worth.
+# The demo keeps 0.5 GB. A choice: a few runs of twice as large photographs.
 MAX_KEPT = "8GB"
 
 

@@ -11,12 +11,13 @@ import math
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.topology import boundary_loops
-from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.conjugate_gradients import conjugate_gradients
 
 _REACH = 5.0  # lengths from the border: the kernel is 0.007 there
 # Of the smoothed distance on a straight border, below which the surface sticks out. A choice: a
@@ -24,6 +25,9 @@ _REACH = 5.0  # lengths from the border: the kernel is 0.007 there
 # the edge of its teeth, with 0.55 flaps stay.
 _STRAIGHT = 0.75
 _ITERATIONS = 12  # a skull's base that ends in flaps of four facets changes in 9
+# Of conjugate gradients, relative, and steps at most. Of a skull with 1.1 million faces 33,023 are
+# marked, in 14 CPU s; by sparse factors 33,427, of which 412 differ, in 33.
+_TOLERANCE, _MOST_STEPS = 3e-4, 1000
 _MIN_SHAPE = 0.01  # of a needle's longest edge squared is taken for its area at least
 
 
@@ -63,7 +67,7 @@ def _repeatedly(
     length: float,
 ) -> Bool[Tensor, " face"]:
     """Cut off what sticks out until nothing does; borders along inner vertices are none."""
-    out = torch.zeros(len(faces), dtype=torch.bool)
+    out, smooth = torch.zeros(len(faces), dtype=torch.bool), None
     for _ in range(_ITERATIONS):
         left = (~out).nonzero()[:, 0]
         border = _long_borders(vertices, faces[left], length)
@@ -71,7 +75,7 @@ def _repeatedly(
         if len(border) == 0:
             break
         distance = _distance(vertices, vertices[border], torch.inf)
-        smooth = _smoothed(vertices, faces[left], distance, length)
+        smooth = _smoothed(vertices, faces[left], distance, length, smooth)
         some = (smooth < _STRAIGHT * length)[faces[left]].any(dim=1)
         if not bool(some.any()):
             break
@@ -104,6 +108,7 @@ def _smoothed(
     faces: Int[Tensor, "face 3"],
     values: Float[Tensor, " vertex"],
     length: float,
+    start: Float[Tensor, " vertex"] | None,
 ) -> Float[Tensor, " vertex"]:
     """Smooth values on a surface, reflected at its borders: a step of implicit diffusion.
 
@@ -114,11 +119,15 @@ def _smoothed(
     rows, columns, entries = cotangent_laplacian(mesh, length**2 * one, _MIN_SHAPE)
     mass, index = lumped_mass(mesh, one), torch.arange(mesh.count)
     mass = torch.where(mass > 0, mass, mass.max())
-    system = SparseCholesky(
-        torch.cat([rows, index]),
-        torch.cat([columns, index]),
-        torch.cat([entries, mass]),
-        mesh.count,
-        what="the smoothing of borders",
+    cells = torch.cat([rows, index]).numpy(), torch.cat([columns, index]).numpy()
+    matrix = csr_array((torch.cat([entries, mass]).numpy(), cells), shape=(mesh.count, mesh.count))
+    diagonal = torch.from_numpy(matrix.diagonal())
+    found, _, _ = conjugate_gradients(
+        lambda some: torch.from_numpy(matrix @ some.numpy()),
+        lambda some: some / diagonal,
+        mass * values,
+        start=values if start is None else start,
+        tolerance=_TOLERANCE,
+        max_iterations=_MOST_STEPS,
     )
-    return system.solve(mass * values)
+    return found
