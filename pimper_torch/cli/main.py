@@ -8,6 +8,7 @@ the package. :mod:`pimper_torch.cli.supervise` gives 128 and the number of the s
 process was killed.
 """
 
+import ctypes
 import difflib
 import errno
 import io
@@ -16,7 +17,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import TextIO
 
@@ -73,6 +74,7 @@ _COMMANDS = {
 }
 _READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}
 _LIGHT = ("config",)  # carried out without torch, too
+_ARENAS = -8  # M_ARENA_MAX of malloc.h
 _UNEXPECTED, _BAD_INPUT = 1, 2
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 # What no program can help.
@@ -137,6 +139,16 @@ def _main(arguments: Sequence[str] | None, supervised: bool) -> int:
         return _run(given[0], rest, output, supervised)
 
 
+def _limit_arenas() -> None:
+    """Let threads share places that memory is taken from: one for each core.
+
+    The C library of Linux makes eight, and what runs leave in each adds up: from the second to the
+    fourth run in one process memory grew by 2.0 %, with two of them by 0.2.
+    """
+    with suppress(OSError, AttributeError):  # other systems have no such function
+        ctypes.CDLL("libc.so.6").mallopt(_ARENAS, os.cpu_count() or 1)
+
+
 def _run(command: str, arguments: list[str], output: Output, supervised: bool) -> int:
     # Read when torch is loaded. Threads that spin while they wait take the processor from
     # those they wait for when the machine is busy, and many small steps then take ten times
@@ -144,6 +156,7 @@ def _run(command: str, arguments: list[str], output: Output, supervised: bool) -
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Pages of 2 MB where the system has them: a fifth of the demo's time went into 4 kB ones.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+    _limit_arenas()
     from pimper_torch.cli.light import light
 
     home = _COMMANDS[command]

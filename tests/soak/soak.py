@@ -50,7 +50,7 @@ def soak(runs: int, command: list[str], folder: Path) -> list[Held]:
     """Run a command so many times, and look after each; its result is replaced every time."""
     found = []
     for run in range(runs):
-        if pimper([*command, "-o", str(folder / "out"), "--overwrite", "-q"]) != 0:
+        if pimper([*command, "-o", str(folder / "out"), "--overwrite", "--fresh", "-q"]) != 0:
             raise RuntimeError(f"run {run} failed")
         found.append(held())
         print(run, found[-1], f"{threading.active_count()} Python threads", flush=True)  # noqa: T201

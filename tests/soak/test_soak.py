@@ -9,7 +9,6 @@ from tests.soak.soak import Held, grown
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="memory grows: 780 MB after two runs, 910 MB after nine")
 def test_a_process_holds_no_more_after_six_runs_than_after_two():
     root = Path(__file__).parents[2]
     ran = subprocess.run(
