@@ -28,6 +28,10 @@ CAMERA_MODELS = (
 )
 """COLMAP's camera models for ordinary lenses, written out to check settings without COLMAP."""
 
+# A ray 40 degrees off the axis, where every fisheye is a tenth or more off a pinhole.
+_OBLIQUE = np.array([[0.7, 0.5, 1.0]])
+_SAME = 1e-9  # of a pixel's coordinate: rounding in double precision
+
 
 def read_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, text or binary.
@@ -73,8 +77,17 @@ def pinhole_of(lens: Lens) -> Float[Tensor, "3 3"]:
 
 
 def is_pinhole(lens: Lens) -> bool:
-    """Tell whether the lens has no distortion."""
-    return bool(_camera_of(lens).is_undistorted())
+    """Tell whether the lens images straight lines as straight lines.
+
+    COLMAP calls a lens undistorted whose coefficients are all zero. Of a fisheye that is the
+    equidistant one, ``r = f theta``: an oblique ray tells it from a pinhole.
+    """
+    camera = _camera_of(lens)
+    if not bool(camera.is_undistorted()):
+        return False
+    pixel = np.asarray(camera.img_from_cam(_OBLIQUE), dtype=np.float64).reshape(2)
+    straight = (camera.calibration_matrix() @ _OBLIQUE[0])[:2]
+    return bool(np.abs(pixel - straight).max() <= _SAME * np.abs(straight).max())
 
 
 def distort(lens: Lens, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 2"]:

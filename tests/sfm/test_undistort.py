@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.colmap import distort, undistort_pixels
+from pimper_torch.sfm.colmap import distort, is_pinhole, undistort_pixels
 from pimper_torch.sfm.undistort import photograph_pixels, pinhole_for, undistort
 
 
@@ -151,3 +151,66 @@ def test_what_touches_a_saturated_pixel_is_saturated():
     assert torch.equal(lit.images[:, 1], plain.images[:, 1])
     near = (lit.images != plain.images).sum()
     assert near <= touched.sum() + 5
+
+
+FISHEYES = {
+    "SIMPLE_FISHEYE": 0,
+    "SIMPLE_RADIAL_FISHEYE": 1,
+    "RADIAL_FISHEYE": 2,
+    "OPENCV_FISHEYE": 4,
+    "THIN_PRISM_FISHEYE": 8,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 12,
+    "FISHEYE": 0,
+}
+STRAIGHT = {
+    "SIMPLE_PINHOLE": 0,
+    "PINHOLE": 0,
+    "SIMPLE_RADIAL": 1,
+    "RADIAL": 2,
+    "OPENCV": 4,
+    "FULL_OPENCV": 8,
+    "FOV": 1,
+    "SIMPLE_DIVISION": 1,
+    "DIVISION": 1,
+}
+_ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_DIVISION")
+
+
+def without_coefficients(model: str, focal_px: float) -> Lens:
+    """Give a lens whose coefficients are all zero."""
+    one = model in _ONE_FOCAL or (model in FISHEYES and model.startswith(("SIMPLE", "RADIAL")))
+    focal = (focal_px,) * (1 if one else 2)
+    zeros = (0.0,) * {**FISHEYES, **STRAIGHT}[model]
+    return Lens(camera=1, model=model, params=(*focal, 25.0, 20.0, *zeros), width=50, height=40)
+
+
+@pytest.mark.parametrize("model", FISHEYES)
+def test_a_fisheye_without_coefficients_is_equidistant_and_undistorted(model):
+    lens = without_coefficients(model, 36.0)  # 40 degrees to the edge
+    assert not is_pinhole(lens)
+    views = ramp_views([(50, 40)])
+    undistorted, intrinsics = undistort(views, (lens,))
+    K = intrinsics[0]
+    rays = (pixel_centers(50, 40, like=K) - K[:2, 2]) / K[0, 0]
+    tangent = rays.norm(dim=-1, keepdim=True)
+    source = torch.tensor([25.0, 20.0]) + 36.0 * tangent.atan() * rays / tangent  # r = f theta
+    assert_close(photograph_pixels(lens), source)
+    assert_close(undistorted.images[0].permute(1, 2, 0) * 100, source)
+    assert float((source - pixel_centers(50, 40, like=K)).abs().max()) > 3
+
+
+@pytest.mark.parametrize("model", STRAIGHT)
+def test_a_perspective_lens_without_coefficients_stays_bit_for_bit(model):
+    lens = without_coefficients(model, 36.0)
+    views = ramp_views([(50, 40)])
+    undistorted, intrinsics = undistort(views, (lens,))
+    assert is_pinhole(lens)
+    assert torch.equal(undistorted.images, views.images)
+    assert undistorted.masks is None
+    assert_close(intrinsics[0], torch.tensor([[36.0, 0, 25], [0, 36, 20], [0, 0, 1]]).double())
+
+
+def test_the_last_coefficient_alone_makes_a_lens_bend():
+    for model in (name for name, count in (FISHEYES | STRAIGHT).items() if count):
+        plain = without_coefficients(model, 36.0)
+        assert not is_pinhole(plain.replace(params=(*plain.params[:-1], 0.05))), model
