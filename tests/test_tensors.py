@@ -11,6 +11,7 @@ import trimesh
 
 import pimper_torch as pt
 from pimper_torch.evidence.bench.gradients import small_scene
+from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.projection import project
 
 SCRIPT = Path(__file__).parent / "scripts" / "look_inside.py"
@@ -126,3 +127,31 @@ def test_a_researcher_looks_into_a_run(given, tmp_path, caplog):
     assert all(len(record.getMessage()) < 2000 for record in caplog.records)
     assert (tmp_path / "patch.png").stat().st_size > 5000
     assert sum(bool(line.strip()) for line in SCRIPT.read_text().splitlines()) <= 30
+
+
+@pytest.mark.parametrize("kind", ["tensors", "arrays", "lists"])
+def test_cameras_far_from_the_origin_give_the_scene_of_those_near_it(given, kind):
+    scene, _ = given
+    offset = torch.tensor([448231.25, 5411923.5, 312.125], dtype=torch.float64)
+    poses = from_local(scene.cameras.cam_from_world.double(), tuple(offset.tolist()))
+    points = scene.points_world.double() + offset
+    if kind == "arrays":
+        poses, points = poses.numpy(), points.numpy()
+    elif kind == "lists":
+        poses, points = poses.tolist(), points.tolist()
+    near = scene_of(scene, points_world=scene.points_world)
+    far = scene_of(scene, cam_from_world=poses, points_world=points)
+    shift = offset - torch.tensor(far.offset_world, dtype=torch.float64)
+    assert near.offset_world == (0.0, 0.0, 0.0)
+    assert float(shift.abs().max()) < 2
+    wanted = (near.points_world + shift).float()
+    torch.testing.assert_close(far.points_world, wanted, rtol=0, atol=1e-6)
+    assert torch.equal(far.observed, near.observed)
+    torch.testing.assert_close(far.observation_pixels, near.observation_pixels, rtol=0, atol=1e-3)
+
+
+def test_gradients_reach_cameras_far_from_the_origin(given):
+    scene, _ = given
+    poses = from_local(scene.cameras.cam_from_world.double(), (1e6, 0.0, 0.0)).requires_grad_()
+    scene_of(scene, cam_from_world=poses).cameras.cam_from_world.sum().backward()
+    assert torch.equal(poses.grad[:, :3, 3], torch.ones_like(poses[:, :3, 3]))

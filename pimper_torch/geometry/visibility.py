@@ -24,6 +24,10 @@ from pimper_torch.records import Cameras, Mesh, Record
 # How far above its face a ray starts, in fractions of the face's longest side.
 _CLEARANCE = 1e-3
 
+# Distance of a mesh from the origin, in its own diagonals, from which single precision moves it by
+# more than a millionth of its diagonal.
+_FAR = 16.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Hits(Record):
@@ -94,7 +98,8 @@ class RayCaster:
     """
 
     def __init__(self, vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> None:
-        triangles = vertices.detach()[faces].to("cpu", torch.float32)
+        self._origin = _origin(vertices.detach())
+        triangles = self._near(vertices.detach())[faces].to("cpu", torch.float32)
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles.numpy()))
         # The first ray builds the tree, and threads must not do so together.
@@ -114,7 +119,8 @@ class RayCaster:
             reach: How far each goes, in lengths of its direction; without, to infinity.
         """
         shape = directions.shape[:-1]
-        start, along = _as_rows(origins.expand_as(directions)), _as_rows(directions)
+        start = _as_rows(self._near(origins).expand_as(directions))
+        along = _as_rows(directions)
         far = None if reach is None else _reaches(reach, shape)
         found = self._scene.run(start, along, dists=far, output=1)
         face = torch.from_numpy(found["primID"].astype(np.int64))
@@ -128,6 +134,10 @@ class RayCaster:
             distance=distance.reshape(shape).to(like),
             barycentric=barycentric.reshape(*shape, 3).to(like),
         )
+
+    def _near(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Give points by the origin that the mesh is stored round."""
+        return points if self._origin is None else points - self._origin.to(points)
 
     def occluded(
         self,
@@ -162,7 +172,8 @@ class RayCaster:
             reach: How far each goes, in lengths of its direction; may be infinite.
         """
         shape = directions.shape[:-1]
-        start, along = _as_rows(origins.expand_as(directions)), _as_rows(directions)
+        start = _as_rows(self._near(origins).expand_as(directions))
+        along = _as_rows(directions)
         far = _reaches(reach, shape)
         found = self._scene.run(start, along, dists=far, query="OCCLUDED")
         return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
@@ -203,6 +214,15 @@ def ambient_occlusion(
     start = (corners.mean(dim=1) + clearance * normals)[:, None]
     infinite = torch.full_like(fan[..., 0], torch.inf)
     return RayCaster(vertices, faces).blocked(start, fan, infinite).to(vertices).mean(dim=1)
+
+
+def _origin(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "3"] | None:
+    """Choose an origin for a mesh that is too far from its own for single precision, if it is."""
+    if len(vertices) == 0:
+        return None
+    low, high = vertices.amin(dim=0), vertices.amax(dim=0)
+    middle = (low + high) / 2
+    return middle if bool(middle.norm() > _FAR * (high - low).norm()) else None
 
 
 def _reaches(

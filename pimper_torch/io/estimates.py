@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.reports import common_lights
@@ -16,17 +17,24 @@ from pimper_torch.sfm.colmap import pinhole_of, read_model
 
 
 def estimate_of(result: Reconstruction) -> Estimate:
-    """Take what a run of ours says about the object.
+    """Take what a run of ours says about the object, in the frame that it is written in.
 
     A view's light is that of the patches that determine it, taken together, NaN where none
     does; see :func:`pimper_torch.io.reports.common_lights`.
     """
     lights, counts = common_lights(result)
-    names = result.scene.views.names
+    names, offset = result.scene.views.names, result.scene.offset_world
+    mesh, cameras = result.mesh, result.cameras
+    if offset != NO_OFFSET:
+        vertices = mesh.vertices_world.double()
+        mesh = mesh.replace(vertices_world=vertices + vertices.new_tensor(offset))
+        poses = from_local(cameras.cam_from_world, offset)
+        intrinsics = cameras.intrinsics.double()
+        cameras = cameras.replace(cam_from_world=poses, intrinsics=intrinsics)
     return Estimate(
-        mesh=result.mesh,
+        mesh=mesh,
         names=names,
-        cameras=result.cameras,
+        cameras=cameras,
         lights_world=torch.where(counts[:, None] > 0, lights, torch.nan),
         reference=names[result.coarse.reference],
     )

@@ -1,6 +1,6 @@
 """Meshes as files that other programs open."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
@@ -15,7 +15,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate, transform
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
+from pimper_torch.geometry.surfaces import side_lengths, vertex_normals
 from pimper_torch.io.mesh_headers import impossible
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.records import Mesh
@@ -29,15 +30,27 @@ _NEEDED = "PLY, OBJ, STL, OFF or GLB"
 # Steps that the eye hardly sees on a rendered surface, and errors far below what these two
 # figures are known to.
 _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
+# Of a short edge (longer than a tenth of all): the most that rounding may move a vertex. A choice.
+# A cloud's spacing is taken for a thousandth of its radius.
+_MAX_ROUNDING, _CLOUD_SPACING = 1e-3, 1e-3
+_KINDS = {torch.uint8: ("uchar", "u1"), torch.float32: ("float", "<f4")}
+_KINDS |= {torch.float64: ("double", "<f8")}
 
 
-def write_ply(mesh: Mesh, path: Path | str) -> None:
+def write_ply(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
     """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, and what is known of errors.
 
     These are the properties ``confidence`` and ``expected_error``, the latter in scene units.
+    Positions are ``double`` where ``float`` would move one by more than a thousandth of an edge,
+    as it does far from the origin.
+
+    Args:
+        mesh: Any.
+        path: The file.
+        offset_world: Added to the vertices; see ``SparseScene.offset_world``.
     """
     path = Path(path)
-    columns = dict(zip("xyz", mesh.vertices_world.float().unbind(dim=1), strict=True))
+    columns = dict(zip("xyz", _positions(mesh, offset_world).unbind(dim=1), strict=True))
     columns |= dict(zip(("nx", "ny", "nz"), _normals(mesh).float().unbind(dim=1), strict=True))
     if mesh.albedo is not None:
         colors = to_bytes(_colors(mesh)).unbind(dim=1)
@@ -46,10 +59,7 @@ def write_ply(mesh: Mesh, path: Path | str) -> None:
         known = getattr(mesh, name)
         if known is not None:
             columns[name] = known.float()
-    kinds = [
-        ("uchar", "u1") if one.dtype == torch.uint8 else ("float", "<f4")
-        for one in columns.values()
-    ]
+    kinds = [_KINDS[one.dtype] for one in columns.values()]
     vertices = np.empty(
         len(mesh.vertices_world),
         [(name, kind) for name, (_, kind) in zip(columns, kinds, strict=True)],
@@ -71,6 +81,23 @@ def write_ply(mesh: Mesh, path: Path | str) -> None:
         file.write("".join(f"{line}\n" for line in header).encode("ascii"))
         vertices.tofile(file)
         faces.tofile(file)
+
+
+def _positions(mesh: Mesh, offset_world: Offset) -> Float[Tensor, "vertex 3"]:
+    """Give positions as they are written: float32 where that tells them, else float64."""
+    vertices = mesh.vertices_world.detach().double()
+    placed = vertices + vertices.new_tensor(offset_world)
+    single = placed.float()
+    if len(vertices) == 0:
+        return single
+    if len(mesh.faces):
+        lengths = side_lengths(vertices[mesh.faces.clamp(0, len(vertices) - 1)]).flatten()
+        short = float(lengths.kthvalue(max(1, len(lengths) // 10)).values)
+    else:
+        away = (vertices - vertices.median(dim=0).values).norm(dim=1)
+        short = _CLOUD_SPACING * float(away.median())
+    lost = float((placed - single).abs().max())
+    return single if lost <= _MAX_ROUNDING * short else placed
 
 
 def written_channels(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
@@ -157,17 +184,31 @@ def read_mesh(path: Path | str) -> Mesh:
     return mesh.replace(**dict.fromkeys(broken)) if broken else mesh
 
 
-def write_glb(mesh: Mesh, path: Path | str) -> None:
+def write_glb(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
     """Write a binary glTF of the same frame, normals and colours as the PLY.
+
+    glTF has no doubles in its buffers: vertices stay round the origin, and their node's
+    ``translation``, which is text, has the offset in full. Programs that follow it in single
+    precision, as Blender does, place the model to its rounding and keep its shape.
 
     glTF wants colours linear, so these are albedo itself; the material is matte and seen
     from both sides. glTF calls y up: viewers show the model as it lies in the world frame
     of structure from motion, whose up is arbitrary.
+
+    Args:
+        mesh: Any.
+        path: The file.
+        offset_world: Of the node; see ``SparseScene.offset_world``.
     """
     path = Path(path)
     colors = None if mesh.albedo is None else (255 * _colors(mesh)).round().cpu().numpy()
     scene = trimesh.Scene(_trimesh(mesh, None if colors is None else colors.astype(np.uint8)))
-    postprocess: Callable[[dict[str, Any]], None] = _make_matte
+
+    def postprocess(tree: dict[str, Any]) -> None:
+        _make_matte(tree)
+        if offset_world != NO_OFFSET:
+            _place(tree, offset_world)
+
     path.write_bytes(
         trimesh.exchange.gltf.export_glb(
             scene, include_normals=True, tree_postprocessor=postprocess
@@ -257,6 +298,14 @@ def _trimesh(mesh: Mesh, colors: np.ndarray | None) -> trimesh.Trimesh:
         vertex_colors=colors,
         process=False,  # keeps the order and number of vertices
     )
+
+
+def _place(tree: dict[str, Any], offset_world: Offset) -> None:
+    """Put the node of every mesh at the offset, in place."""
+    for node in tree["nodes"]:
+        if "mesh" in node:
+            node.pop("matrix", None)  # of nothing but zero translation
+            node["translation"] = list(offset_world)
 
 
 def _make_matte(tree: dict[str, Any]) -> None:

@@ -136,6 +136,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "registered": scene.views.num_views,
         "unregistered": list(scene.unregistered),
         "doubt": scene.doubt or None,
+        "offset_world": list(scene.offset_world),
         "failures": _failures(result.failures),
         "sparse_points": len(scene.points_world),
         "mesh_points": len(result.coarse.mesh.vertices_world),

@@ -11,6 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from pimper_torch.config import to_yaml
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.io.meshes import write_glb, write_ply, written_channels
 from pimper_torch.io.reports import lights_report, summary_report
 from pimper_torch.meshing.simplify import simplify
@@ -62,12 +63,17 @@ def write_result(
     `normals.png`    reference view: red right, green up, blue to the viewer
     `albedo.png`     reference view, sRGB, scaled into [0, 1]
     `depth.npz`      reference view: depth along z (NaN where the mesh is not seen),
-                     mask, confidence, expected_error if known, intrinsics, cam_from_world, name
+                     mask, confidence, expected_error if known, intrinsics, cam_from_world
+                     (float64 far from the origin), name
     `lights.json`    light of every view, averaged and for each patch, world frame
     `config.yaml`    every setting of the run
     `summary.json`   counts, times, memory, convergence
     `overview.png`   contact sheet, every photograph with its silhouette below
     ===============  ==============================================================
+
+    Everything is in the frame of the cameras that the photographs came with; ``summary.json`` tells
+    the ``offset_world`` that was added to the frame of the run, zero unless they stand far from
+    their origin. The PLY then has doubles, and the GLB the offset as its node's translation.
 
     The mesh is simplified, unless ``full_mesh``: every vertex of ``result.mesh`` is within a
     twentieth of a sample's spacing of it, its normal within 1.5 degrees, and its colour, confidence
@@ -109,8 +115,9 @@ def _write_all(
     result: Reconstruction, config: object, folder: Path, summary: Mapping[str, object]
 ) -> None:
     with part(1, _PARTS):
-        write_ply(result.mesh, folder / "mesh.ply")
-        write_glb(result.mesh, folder / "mesh.glb")
+        offset = result.scene.offset_world
+        write_ply(result.mesh, folder / "mesh.ply", offset)
+        write_glb(result.mesh, folder / "mesh.glb", offset)
         write_model(result.scene, folder / "sparse")
         if result.silhouettes.source != "everything":
             _write_masks(result.silhouettes, result.scene, folder / "masks")
@@ -143,6 +150,8 @@ def _write_maps(result: Reconstruction, folder: Path) -> None:
 def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
     reference, cameras = result.coarse.reference, result.cameras
     error = maps.expected_error
+    pose, offset = cameras.cam_from_world[reference], result.scene.offset_world
+    far = offset != NO_OFFSET
     np.savez_compressed(
         path,
         depth=_array(maps.depth),
@@ -150,7 +159,7 @@ def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
         confidence=_array(maps.confidence),
         **({} if error is None else {"expected_error": _array(error)}),
         intrinsics=_array(cameras.intrinsics[reference]),
-        cam_from_world=_array(cameras.cam_from_world[reference]),
+        cam_from_world=from_local(pose[None], offset)[0].detach().numpy() if far else _array(pose),
         name=np.array(result.scene.views.names[reference]),
         allow_pickle=False,
     )

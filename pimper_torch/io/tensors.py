@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.geometry.local_frame import NO_OFFSET, local_origin, to_local
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm.colmap import pinhole_lenses
@@ -43,7 +44,8 @@ def scene_of(
         names: Of the views; numbers unless given.
 
     Returns:
-        A scene of the images' floating-point type and device.
+        A scene of the images' floating-point type and device. Where cameras stand far from the
+        origin it is shifted there, see ``SparseScene.offset_world``: give them in float64.
 
     Raises:
         InputError: A shape or a value that means nothing, or cameras that look the wrong way.
@@ -63,15 +65,22 @@ def scene_of(
         focals_px=torch.full_like(pictures[:, 0, 0, 0], torch.nan),
     )
     matrices = _floats(intrinsics, "intrinsics", "K in pixels").to(pictures)
-    poses = _floats(cam_from_world, "cam_from_world", "rigid matrices").to(pictures)
+    poses = _squared(_floats(_digits(cam_from_world), "cam_from_world", "rigid matrices"))
+    points = poses.new_zeros(0, 3)
+    if points_world is not None:
+        points = _floats(_digits(points_world), "points_world", "a cloud, point 3")
+    offset = NO_OFFSET
+    if poses.shape[1:] == (4, 4) and points.shape[1:] == (3,):
+        offset = local_origin(poses, points)
+    if offset != NO_OFFSET:
+        poses = to_local(poses.double(), offset)
+        points = points.double() - points.new_tensor(offset, dtype=torch.float64)
+    poses, points = poses.to(pictures), points.to(pictures)
     cameras = Cameras(
         intrinsics=matrices.expand(count, 3, 3) if matrices.shape == (3, 3) else matrices,
-        cam_from_world=_squared(poses),
+        cam_from_world=poses,
         sizes_px=sizes,
     )
-    points = pictures.new_zeros(0, 3)
-    if points_world is not None:
-        points = _floats(points_world, "points_world", "a cloud, point 3").to(pictures)
     pixels, seen = _observations(points, cameras, views)
     if observed is not None:
         given = torch.as_tensor(observed).to(pictures.device).bool()
@@ -91,6 +100,7 @@ def scene_of(
         observation_view=view,
         observation_pixels=pixels[view, point],
         lenses=pinhole_lenses(cameras),
+        offset_world=offset,
     )
     scene.check("scene_of")
     return scene
@@ -104,6 +114,11 @@ def _floats(values: Array, name: str, what: str) -> Tensor:
             "point. Photographs as bytes are decoded by `load_views`."
         )
     return tensor
+
+
+def _digits(values: Array) -> Tensor | np.ndarray:
+    """Keep all digits of numbers in lists, of which torch keeps those of single precision."""
+    return values if isinstance(values, Tensor) else np.asarray(values)
 
 
 def _squared(poses: Tensor) -> Tensor:

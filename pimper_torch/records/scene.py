@@ -56,6 +56,9 @@ class SparseScene(Record):
         background_from_view: Maps from homogeneous pixels of each undistorted photograph to those
             where the background is at rest before which the object turns; NaN where a view shows
             too little of it. Empty without such a background.
+        offset_world: Added to this scene's coordinates, gives those of the model it was read from.
+            Scenes far from that model's origin have one of their own, see
+            :func:`~pimper_torch.geometry.local_frame.local_origin`.
     """
 
     views: Views
@@ -69,6 +72,7 @@ class SparseScene(Record):
     unregistered: tuple[str, ...] = ()
     doubt: str = ""
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
+    offset_world: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List what does not belong together."""

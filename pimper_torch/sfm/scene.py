@@ -7,6 +7,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local, local_origin, to_local
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import to_bytes
@@ -28,8 +29,15 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         model: Its names are among theirs, and its lenses have their sizes.
 
     Returns:
-        Views in the model's order. Device and dtype are those of the photographs.
+        Views in the model's order. Device and dtype are those of the photographs. A model far from
+        its origin, such as a georeferenced one, is shifted, see ``SparseScene.offset_world``.
     """
+    offset = local_origin(model.cam_from_world, model.points_world)
+    if offset != NO_OFFSET:
+        model = model.replace(
+            cam_from_world=to_local(model.cam_from_world, offset),
+            points_world=model.points_world - model.points_world.new_tensor(offset),
+        )
     number = {name: index for index, name in enumerate(views.names)}
     undistorted, intrinsics = undistort(
         views.take([number[name] for name in model.names]), model.lenses
@@ -50,6 +58,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         lenses=model.lenses,
         unregistered=tuple(name for name in views.names if name not in model.names),
         background_from_view=_undistorted_maps(model, intrinsics).to(like),
+        offset_world=offset,
     )
 
 
@@ -86,7 +95,7 @@ def _undistorted_map(
 
 
 def write_model(scene: SparseScene, folder: Path) -> None:
-    """Write the scene as a COLMAP model in the same frame.
+    """Write the scene as a COLMAP model in the frame of the model that it came from.
 
     The cameras are the photographs' own lenses, not the pinholes, and the observations are
     where they were made: the model belongs to the photographs as they were loaded, and
@@ -103,8 +112,9 @@ def write_model(scene: SparseScene, folder: Path) -> None:
     model = SparseModel(
         names=scene.views.names,
         lenses=scene.lenses,
-        cam_from_world=scene.cameras.cam_from_world.detach().cpu().double(),
-        points_world=scene.points_world.detach().cpu().double(),
+        cam_from_world=from_local(scene.cameras.cam_from_world.detach().cpu(), scene.offset_world),
+        points_world=scene.points_world.detach().cpu().double()
+        + torch.tensor(scene.offset_world, dtype=torch.float64),
         observation_point=scene.observation_point.cpu(),
         observation_view=scene.observation_view.cpu(),
         observation_pixels=scene.observation_pixels.detach().cpu().double(),

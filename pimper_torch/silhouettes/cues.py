@@ -117,9 +117,10 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
         max_below=details.max_below_plane,
         generator=torch.Generator().manual_seed(details.seed),
     )
-    region = (
-        torch.tensor(config.region, dtype=torch.float32).reshape(2, 3) if config.region else None
-    )
+    region = None
+    if config.region:
+        corners = torch.tensor(config.region, dtype=torch.float64).reshape(2, 3)
+        region = (corners - corners.new_tensor(scene.offset_world)).float()
     cloud = split_cloud(scene, focus, plane, tolerance, region)
     half, centre = _BOX * focus.distance, focus.fixation_world
     turns = plane is None and len(scene.background_from_view) > 0

@@ -131,3 +131,25 @@ def test_ambient_occlusion_of_an_open_sphere_is_the_share_that_is_there():
         found = ambient_occlusion(vertices, faces[bowl].flip(1), num_rays=512)
         assert (found - fraction).abs().max() < 0.03  # the fan's rays, and edges of the opening
         assert (found - fraction).mean().abs() < 0.005
+
+
+def test_rays_meet_a_mesh_far_from_the_origin_as_one_near_it(generator):
+    vertices, faces = icosphere(3)
+    directions = torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    starts = 3 * torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    directions = 0.4 * directions - starts
+    near = RayCaster(vertices, faces)
+    shift = torch.tensor([448231.0, 5411923.0, 312.0], dtype=torch.float64)
+    far = RayCaster(vertices + shift, faces)
+    one, other = near.cast(starts, directions), far.cast(starts + shift, directions)
+    assert float((one.face == other.face).double().mean()) > 0.99  # but for rays along edges
+    assert_close(one.distance, other.distance, rtol=0, atol=1e-5)
+    outside = starts.norm(dim=1) > 1.1
+    args = directions, torch.full((500,), torch.inf, dtype=torch.float64)
+    assert torch.equal(
+        near.blocked(starts, *args)[outside], far.blocked(starts + shift, *args)[outside]
+    )
+    center = torch.tensor([0.0, 0, 5], dtype=torch.float64)
+    assert torch.equal(
+        near.occluded(vertices, center, 1e-3), far.occluded(vertices + shift, center + shift, 1e-3)
+    )

@@ -9,6 +9,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.io import mesh_headers
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.records import Mesh
@@ -181,3 +182,64 @@ def test_another_kind_of_file_is_refused_by_its_ending(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"PK")
     with pytest.raises(InputError, match=r"ends in \.zip; needed: PLY, OBJ, STL, OFF or GLB"):
         read_mesh(tmp_path / "a.zip")
+
+
+UTM = (448231.25, 5411923.5, 312.125)
+
+
+def header_of(path):
+    return path.read_bytes().partition(b"end_header")[0].decode().splitlines()
+
+
+def fine_mesh(offset=(0.0, 0.0, 0.0), scale=1.0):
+    vertices, faces = icosphere(4)
+    return Mesh(
+        vertices_world=scale * (vertices + torch.tensor(offset, dtype=torch.float64)), faces=faces
+    )
+
+
+@pytest.mark.parametrize("offset", [UTM, (1e5, 0.0, 0.0), (4.2e6, 1.7e5, -4.78e6)])
+@pytest.mark.parametrize(("write", "suffix"), [(write_ply, ".ply"), (write_glb, ".glb")])
+def test_a_mesh_is_written_far_from_the_origin_without_losing_a_digit(
+    write, suffix, offset, tmp_path
+):
+    mesh = fine_mesh()
+    local = mesh.replace(vertices_world=mesh.vertices_world.float())
+    write(local, tmp_path / f"a{suffix}", offset)
+    read = read_mesh(tmp_path / f"a{suffix}")
+    wanted = local.vertices_world.double() + torch.tensor(offset, dtype=torch.float64)
+    assert_close(read.vertices_world, wanted, rtol=0, atol=2e-9)  # double precision at 5e6
+    assert torch.equal(read.faces, local.faces)
+
+
+def test_positions_are_doubles_only_where_singles_would_move_them(tmp_path):
+    cases = [
+        (fine_mesh(), (0.0, 0.0, 0.0), "float"),
+        (fine_mesh(scale=1e-6), (0.0, 0.0, 0.0), "float"),
+        (fine_mesh(scale=1e6), (0.0, 0.0, 0.0), "float"),
+        (fine_mesh((20.0, 0, 0)), (0.0, 0.0, 0.0), "float"),
+        (fine_mesh(UTM), (0.0, 0.0, 0.0), "double"),
+        (fine_mesh(), UTM, "double"),
+        (fine_mesh().replace(faces=torch.zeros(0, 3).long()), (0.0, 0.0, 0.0), "float"),
+        (fine_mesh(UTM).replace(faces=torch.zeros(0, 3).long()), (0.0, 0.0, 0.0), "double"),
+    ]
+    for number, (mesh, offset, kind) in enumerate(cases):
+        write_ply(mesh, tmp_path / "a.ply", offset)
+        written = [line for line in header_of(tmp_path / "a.ply") if line.split()[-1] in "xyz"]
+        assert written == [f"property {kind} {axis}" for axis in "xyz"], number
+        read = read_mesh(tmp_path / "a.ply").vertices_world
+        placed = mesh.vertices_world + torch.tensor(offset, dtype=torch.float64)
+        extent = float((placed.amax(dim=0) - placed.amin(dim=0)).norm())
+        assert float((read - placed).abs().max()) < 1e-6 * extent, number
+
+
+def test_a_glb_has_its_offset_in_its_node_and_nothing_there_without_one(tmp_path):
+    for offset, placed in ((UTM, [{"mesh": 0, "translation": list(UTM)}]), ((0.0,) * 3, None)):
+        write_glb(fine_mesh(), tmp_path / "a.glb", offset)
+        data = (tmp_path / "a.glb").read_bytes()
+        (size,) = struct.unpack_from("<I", data, 12)
+        tree = json.loads(data[20 : 20 + size])
+        nodes = [{key: node[key] for key in node if key != "name"} for node in tree["nodes"]]
+        assert [node for node in nodes if "translation" in node] == (placed or [])
+        positions = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+        assert max(map(abs, positions["max"])) <= 1  # round the origin, as viewers want it

@@ -16,6 +16,7 @@ from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io import results
+from pimper_torch.io.estimates import estimate_of, read_estimate
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply, written_channels
 from pimper_torch.io.reports import common_lights, lights_report, summary_report, world_lights
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -24,6 +25,7 @@ from pimper_torch.outputs.marker import MARKER
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Mesh, Silhouettes
+from pimper_torch.sfm.colmap import read_model
 from pimper_torch.viz.maps import albedo_scale
 
 
@@ -385,3 +387,35 @@ def test_channels_are_in_units_of_what_they_may_be_off(reconstruction):
     assert_close(8 * channels[:, :3], encoded)
     bare = mesh.replace(albedo=None, confidence=None, expected_error=None)
     assert written_channels(bare).shape == (225, 0)
+
+
+def test_a_result_far_from_the_origin_is_written_in_the_frame_of_its_cameras(
+    reconstruction, tmp_path
+):
+    offset = (448231.0, 5411923.0, 312.0)
+    shift = torch.tensor(offset, dtype=torch.float64)
+    far = reconstruction.replace(scene=reconstruction.scene.replace(offset_world=offset))
+    for name, result in (("near", reconstruction), ("far", far)):
+        write_result(result, Config(), tmp_path / name, full_mesh=True)
+    near, placed = read_estimate(tmp_path / "near"), read_estimate(tmp_path / "far")
+    vertices = near.mesh.vertices_world
+    assert_close(placed.mesh.vertices_world, vertices + shift, rtol=0, atol=2e-7)
+    glb = read_mesh(tmp_path / "far" / "mesh.glb")
+    assert_close(glb.vertices_world, placed.mesh.vertices_world, rtol=0, atol=2e-7)
+    centers = near.cameras.centers_world + shift
+    assert_close(placed.cameras.centers_world, centers, rtol=0, atol=2e-6)
+    cloud = read_model(tmp_path / "far" / "sparse").points_world
+    assert_close(cloud, reconstruction.scene.points_world.double() + shift, rtol=0, atol=1e-8)
+    summary = json.loads((tmp_path / "far" / "summary.json").read_text())
+    assert summary["offset_world"] == list(offset)
+    arrays = [np.load(tmp_path / name / "depth.npz") for name in ("near", "far")]
+    assert arrays[1]["cam_from_world"].dtype == np.float64
+    assert arrays[0]["cam_from_world"].dtype == np.float32
+    index = placed.names.index(str(arrays[1]["name"]))
+    pose = placed.cameras.cam_from_world[index].numpy()
+    np.testing.assert_allclose(arrays[1]["cam_from_world"], pose, rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(arrays[0]["depth"], arrays[1]["depth"])
+    # What a run says of itself is in the same frame.
+    own = estimate_of(far)
+    assert_close(own.mesh.vertices_world, placed.mesh.vertices_world, rtol=0, atol=2e-7)
+    assert_close(own.cameras.centers_world, placed.cameras.centers_world, rtol=0, atol=1e-7)

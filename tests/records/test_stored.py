@@ -55,7 +55,9 @@ def example(hint, generator, full=True):
     if typing.get_origin(hint) in (tuple, dict):
         if typing.get_origin(hint) is dict:
             return {"whole": 3, "half": 0.5, "open": math.inf}
-        return tuple(example(choices[0], generator, full) for _ in range(2))
+        whole = typing.get_args(hint)
+        items = choices[:1] * 2 if whole[-1] is Ellipsis else whole
+        return tuple(example(item, generator, full) for item in items)
     if typing.get_origin(hint) is typing.Literal:
         return choices[-1]
     if choices:

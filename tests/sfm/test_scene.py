@@ -1,12 +1,16 @@
+import pytest
 import torch
 from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.camera_in_place import mapped
 from pimper_torch.sfm.colmap import read_model
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.scene import assemble_scene, point_colors, reprojection_errors, write_model
+from pimper_torch.silhouettes.cues import cues_of
+from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 
 
 def test_writing_a_model_and_reading_it_gives_the_same_scene(scene, views, tmp_path):
@@ -88,3 +92,62 @@ def test_maps_to_a_static_background_are_those_of_undistorted_pictures(scene, vi
 def test_as_many_maps_as_views_are_needed(scene):
     (fault,) = scene.replace(background_from_view=torch.eye(3).repeat(2, 1, 1).double()).faults()
     assert fault == ("background_from_view", "are 2", "none, or one for each of 5 views")
+
+
+UTM = (448231.25, 5411923.5, 312.125)
+FAR = [UTM, (1e5, -1e5, 0.0), (4.2e6, 1.7e5, 4.78e6), (-3e7, 0.0, 2.0)]
+
+
+def moved(model, offset):
+    return model.replace(
+        cam_from_world=from_local(model.cam_from_world, offset),
+        points_world=model.points_world + model.points_world.new_tensor(offset),
+    )
+
+
+@pytest.mark.parametrize("offset", FAR)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_model_far_from_its_origin_gives_the_scene_of_the_plain_one(views, model, offset, dtype):
+    views = views.to(dtype)
+    plain, far = assemble_scene(views, model), assemble_scene(views, moved(model, offset))
+    assert plain.offset_world == NO_OFFSET
+    shift = torch.tensor(offset, dtype=torch.float64) - torch.tensor(far.offset_world).double()
+    assert float(shift.abs().max()) < 1.5
+    assert_close(far.points_world, (plain.points_world + shift).to(dtype), rtol=0, atol=1e-6)
+    centers = plain.cameras.centers_world + shift
+    assert_close(far.cameras.centers_world, centers.to(dtype), rtol=0, atol=4e-6)
+    assert_close(
+        far.reprojection_errors_px, plain.reprojection_errors_px, rtol=0, atol=1e-4
+    )  # 3e7 in double precision, 20 px a unit
+    assert torch.equal(far.views.images, plain.views.images)
+
+
+@pytest.mark.parametrize("offset", FAR)
+def test_a_far_scene_is_written_where_its_model_was(views, model, offset, tmp_path):
+    far = moved(model, offset)
+    write_model(assemble_scene(views.to(torch.float32), far), tmp_path)
+    read = read_model(tmp_path)
+    # The scene is in single precision, its model in the person's frame is not.
+    assert_close(read.points_world, far.points_world, rtol=0, atol=1e-6)
+    centers = [
+        -(one.cam_from_world[:, :3, :3].mT @ one.cam_from_world[:, :3, 3:])[..., 0]
+        for one in (read, far)
+    ]
+    assert_close(*centers, rtol=0, atol=4e-6)
+    assert float(reprojection_errors(read).median()) < 1.2 * float(
+        reprojection_errors(far).median()
+    )
+
+
+def test_a_region_is_a_box_in_the_frame_of_the_model(views, model):
+    region = (-0.5, -0.4, -0.3, 0.5, 0.6, 0.7)
+    corners = torch.tensor(region, dtype=torch.float64).reshape(2, 3)
+    settings = SilhouetteConfig(
+        region=tuple((corners + torch.tensor(UTM, dtype=torch.float64)).flatten().tolist())
+    )
+    scene = assemble_scene(views, moved(model, UTM))
+    box = cues_of(scene, settings, SilhouetteDetails()).box_world
+    local = (
+        corners + torch.tensor(UTM, dtype=torch.float64) - corners.new_tensor(scene.offset_world)
+    )
+    assert_close(box.double(), local, rtol=0, atol=1e-6)
