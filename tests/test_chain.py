@@ -27,7 +27,9 @@ from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Plane, Shape, Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.io.estimates import estimate_of
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.records import (
     CoarseMesh,
@@ -37,6 +39,7 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
 )
+from pimper_torch.sfm.scene import write_model
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Given
 from tests.coarse import ball
@@ -338,3 +341,44 @@ def test_a_potato_is_reconstructed_from_files_better_than_published(preset, pota
         # alone decide where the surface is: 1.92 against 1.92 per cent.
         assert fine.relative_error < 0.75 * coarse.relative_error
         assert shape.mean_angle_deg < 0.6 * coarse.mean_angle_deg
+
+
+@pytest.fixture(scope="module")
+def small_set(tmp_path_factory):
+    """Photographs of potatoes on a table, their model, and the same model in UTM coordinates."""
+    folder = tmp_path_factory.mktemp("small")
+    truth = potato_on_table(num_views=8, width=240, height=180)
+    save_photographs(truth.views, folder / "photos")
+    save_masks(truth.foreground, truth.views.names, folder / "masks")
+    views = pt.load_views(folder / "photos", masks=folder / "masks")
+    # Errors of reprojection that are rounding's alone would order the points by chance.
+    generator = torch.Generator().manual_seed(17)
+    scene = sparse_scene(truth, 1500, generator, noise_px=0.3).replace(views=views)
+    write_model(scene.replace(offset_world=UTM), folder / "far")
+    write_model(scene, folder / "near")
+    return SimpleNamespace(folder=folder, views=views, truth=truth.mesh)
+
+
+UTM = (448231.25, 5411923.5, 312.125)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
+@pytest.mark.parametrize("with_mesh", [False, True])
+def test_a_georeferenced_model_gives_the_figures_of_the_plain_one(small_set, with_mesh):
+    results, errors = [], []
+    for name, offset in (("near", (0.0, 0.0, 0.0)), ("far", UTM)):
+        vertices = small_set.truth.vertices_world.double()
+        truth = small_set.truth.replace(vertices_world=vertices + vertices.new_tensor(offset))
+        rough = truth if with_mesh else None
+        result = pt.load_chain("fast")(small_set.views, small_set.folder / name, rough)
+        found = estimate_of(result).mesh  # in the frame of the model
+        errors.append(float(NearestSurface(truth).query(found.vertices_world).distance.mean()))
+        results.append(result)
+    log.info("distances from the truth, plain and georeferenced: %s", errors)
+    assert results[0].scene.offset_world == (0.0, 0.0, 0.0)
+    assert max(results[1].scene.offset_world) > 5e6
+    assert abs(errors[1] / errors[0] - 1) < 0.01
+    assert errors[0] < (0.003 if with_mesh else 0.005)
+    near, far = (len(result.mesh.vertices_world) for result in results)
+    assert abs(far / near - 1) < 0.01

@@ -9,6 +9,7 @@ from typing import TypeVar
 from torch import nn
 
 from pimper_torch.chains.kept import kept_call
+from pimper_torch.coarse.given_mesh import prepared
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
@@ -142,6 +143,35 @@ class Chain(Stage):
             )
         return sound(views)
 
+    def given_mesh(
+        self,
+        mesh: Mesh | None,
+        views: Views | SparseScene,
+        scene: SparseScene,
+        silhouettes: Silhouettes,
+    ) -> Mesh | None:
+        """Prepare a mesh that came with the photographs, see :func:`prepared`.
+
+        Args:
+            mesh: If any. With photographs, in the frame of their cameras' model, with a scene in
+                that of the scene.
+            views: What the chain was called with.
+            scene: What it became.
+            silhouettes: Of it.
+
+        Raises:
+            InputError: The mesh is no surface, or in another frame.
+        """
+        if mesh is None:
+            return None
+        if isinstance(views, Views):
+            placed = mesh.vertices_world.double()
+            mesh = mesh.replace(vertices_world=placed - placed.new_tensor(scene.offset_world))
+        with stage("given_mesh") as told:
+            mesh, figures = prepared(mesh, scene, silhouettes)
+            told |= figures
+        return mesh
+
     def steps(
         self,
         views: Views | SparseScene,
@@ -187,8 +217,8 @@ class Chain(Stage):
                 :func:`~pimper_torch.io.tensors.scene_of`.
             sparse_model: Folder of a COLMAP model of these photographs, used instead of
                 running structure from motion.
-            mesh: A rough surface in that model's frame, of any floating-point type, used
-                instead of the photographs' own.
+            mesh: A rough surface in that model's frame, or in the scene's, of any floating-point
+                type, used instead of the photographs' own.
 
         Raises:
             PimperError: What was found at which stage, what was needed, what to do.

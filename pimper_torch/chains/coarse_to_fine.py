@@ -136,7 +136,9 @@ class CoarseToFine(Chain):
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
         placed = self.placed(views, sparse_model)
-        silhouettes = self.corrected(placed, self.kept(self.silhouettes, placed), mesh)
+        silhouettes = self.kept(self.silhouettes, placed)
+        mesh = self.given_mesh(mesh, views, placed, silhouettes)
+        silhouettes = self.corrected(placed, silhouettes, mesh)
         scene = masked(placed, silhouettes)
         cameras = scene.cameras
         contours = self.contours(silhouettes, cameras)

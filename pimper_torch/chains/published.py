@@ -107,6 +107,7 @@ class Published(Chain):
         """Run once through the stages."""
         scene = self.placed(views, sparse_model)
         silhouettes = self.kept(self.silhouettes, scene)
+        mesh = self.given_mesh(mesh, views, scene, silhouettes)
         scene = masked(scene, silhouettes)
         if mesh is None:
             coarse = self.kept(self.triangulate, scene)

@@ -1,4 +1,4 @@
-"""A mesh that the user gives, oriented for the chain."""
+"""A mesh that the user gives, prepared for the chain."""
 
 import numpy as np
 import torch
@@ -6,17 +6,82 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.coarse.mesh_frame import compare_with_scene
+from pimper_torch.errors import InputError, caution
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
-from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.geometry.topology import face_components
+from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.topology import face_components, first_of_each
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.records import Cameras, Mesh
+from pimper_torch.geometry.welding import welded
+from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
 
 # Rays cast along each photograph's longer side. A choice: some 20,000 rays a photograph see every
 # component that is not smaller than a hundredth of it, in milliseconds.
 _RAYS = 160
+
+# Of a face's longest side: a height below which single precision does not tell its normal.
+_MIN_HEIGHT = 1e-6
+
+
+def prepared(
+    mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes
+) -> tuple[Mesh, dict[str, int | float]]:
+    """Weld a mesh, drop faces that are none, and compare it with the scene.
+
+    Args:
+        mesh: In the scene's frame.
+        scene: Cameras and cloud.
+        silhouettes: Of all views.
+
+    Returns:
+        The mesh, of the scene's floating-point type and device, and figures of how far off it is.
+        Warns of what was dropped, and of a mesh that is off.
+
+    Raises:
+        InputError: Nothing of the mesh is a surface, or it is in another frame.
+    """
+    found, dropped = cleaned(mesh.to(scene.points_world.device))
+    if dropped:
+        caution(f"Of the given mesh's {len(mesh.faces)} faces {dropped} were left out.")
+    figures = compare_with_scene(found, scene, silhouettes)  # in the precision that it came in
+    found = found.replace(vertices_world=found.vertices_world.to(scene.cameras.cam_from_world))
+    return found, {"faces": len(found.faces), **figures}
+
+
+def cleaned(mesh: Mesh) -> tuple[Mesh, str]:
+    """Weld vertices at the same place; drop faces without area and those that stand twice.
+
+    Args:
+        mesh: In any frame.
+
+    Returns:
+        Its surface, and how many of which faces were dropped, in words.
+
+    Raises:
+        InputError: No face is left.
+    """
+    vertices, faces = welded(mesh.vertices_world.detach(), mesh.faces)
+    if len(faces) == 0:
+        raise InputError(
+            f"coarse mesh: the given mesh has {len(mesh.vertices_world)} vertices and no faces; "
+            "needed: triangles. Make a mesh of the cloud first, or leave it out."
+        )
+    longest = side_lengths(vertices[faces]).amax(dim=1)
+    area = face_normals(vertices, faces).norm(dim=-1)
+    flat = ~(area > _MIN_HEIGHT * longest.square())
+    if bool(flat.all()):
+        raise InputError(
+            f"coarse mesh: none of the given mesh's {len(faces)} faces has an area; needed: a "
+            "surface. Look at the file, and export it again."
+        )
+    faces = faces[~flat]
+    first = first_of_each(faces.sort(dim=1).values)
+    twice = len(faces) - len(first)
+    counts = ((int(flat.sum()), "without area"), (twice, "that stand twice"))
+    used, faces = torch.unique(faces[first], return_inverse=True)
+    dropped = " and ".join(f"{count} {what}" for count, what in counts if count)
+    return Mesh(vertices_world=vertices[used], faces=faces), dropped
 
 
 def oriented_outward(
@@ -24,7 +89,7 @@ def oriented_outward(
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """Wind the faces of a mesh consistently, with the front of each component to the cameras.
 
-    Faces without area and vertices without faces are dropped.
+    Vertices at the same place become one first, see :func:`cleaned`.
 
     Args:
         mesh: World frame; files give it in double precision.
@@ -33,17 +98,9 @@ def oriented_outward(
     Raises:
         InputError: The mesh has no faces, or no camera sees it.
     """
-    vertices = mesh.vertices_world.detach().to(cameras.cam_from_world)
-    faces = mesh.faces.to(vertices.device)
-    if len(faces) == 0:
-        raise InputError(
-            f"coarse mesh: the given mesh has {len(vertices)} vertices and no faces; needed: "
-            "triangles. Make a mesh of the cloud first, or leave it out."
-        )
-    used, faces = torch.unique(
-        faces[face_normals(vertices, faces).norm(dim=-1) > 0], return_inverse=True
-    )
-    vertices = vertices[used]
+    like = cameras.cam_from_world
+    found, _ = cleaned(mesh.to(like.device, like.dtype))
+    vertices, faces = found.vertices_world, found.faces
     plain = trimesh.Trimesh(
         vertices.cpu().double().numpy(), faces.cpu().numpy(), process=False, validate=False
     )

@@ -47,6 +47,18 @@ def face_pairs(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "pair 2"], Int
     return torch.stack([order[first], order[first + 1]], dim=1) // 3, edges[counts == 2]
 
 
+def first_of_each(rows: Int[Tensor, "row column"]) -> Int[Tensor, " kept"]:
+    """Index the first of equal rows, ascending.
+
+    >>> first_of_each(torch.tensor([[3, 4], [1, 2], [3, 4]]))
+    tensor([0, 1])
+    """
+    _, label = torch.unique(rows, dim=0, return_inverse=True)
+    order = torch.arange(len(label), device=label.device)
+    first = torch.full_like(label, len(label)).scatter_reduce(0, label, order, "amin")
+    return first[: int(label.max()) + 1 if len(label) else 0].sort().values
+
+
 def face_counts(face_edge: Int[Tensor, "face 3"]) -> Int[Tensor, " edge"]:
     """Count the faces at every edge, from the edges of every face of :func:`face_edges`."""
     return torch.bincount(face_edge.flatten())

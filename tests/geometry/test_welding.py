@@ -1,0 +1,60 @@
+import pytest
+import torch
+
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.geometry.topology import boundary_loops
+from pimper_torch.geometry.welding import TOLERANCE, welded
+
+
+def soup(vertices, faces):
+    """Give every face corners of its own, as STL has them."""
+    return vertices[faces].reshape(-1, 3), torch.arange(3 * len(faces)).reshape(-1, 3)
+
+
+def triangles(vertices, faces):
+    return sorted(vertices[faces].flatten(1).tolist())
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.0, 5e6])
+def test_a_soup_of_triangles_becomes_the_surface_that_it_was(offset):
+    vertices, faces = icosphere(3)
+    vertices = vertices + offset
+    found, joined = welded(*soup(vertices, faces))
+    assert len(found) == len(vertices)
+    assert triangles(found, joined) == triangles(vertices, faces)
+    assert len(boundary_loops(joined)[0]) == 0
+
+
+@pytest.mark.parametrize(("gap", "seams"), [(0.4 * TOLERANCE, False), (10 * TOLERANCE, True)])
+def test_rounding_is_welded_and_narrow_gaps_are_not(gap, seams):
+    """The seam runs through cells of any grid: wherever it cuts, both of its sides are one."""
+    vertices, faces = icosphere(3)
+    vertices = vertices.float().double()
+    apart, single = soup(vertices, faces)
+    diagonal = float((vertices.amax(dim=0) - vertices.amin(dim=0)).norm())
+    generator = torch.Generator().manual_seed(8)
+    noise = torch.rand(apart.shape, generator=generator, dtype=torch.float64) / 3**0.5
+    found, joined = welded(apart + gap * diagonal * noise, single)
+    assert (len(found) > len(vertices)) == seams
+    assert (len(boundary_loops(joined)[0]) > 0) == seams
+
+
+def test_a_mesh_with_nothing_to_merge_stays_as_it_is_but_for_loose_vertices():
+    vertices, faces = icosphere(2)
+    found, joined = welded(torch.cat([vertices, vertices[:1] + 9]), faces)
+    assert torch.equal(found, vertices)
+    assert torch.equal(joined, faces)
+
+
+def test_surfaces_that_touch_in_a_vertex_share_it():
+    vertices, faces = icosphere(1)
+    top = vertices[:, 2].argmax()
+    other = -vertices + 2 * vertices[top]
+    found, _ = welded(torch.cat([vertices, other]), torch.cat([faces, faces + len(vertices)]))
+    assert len(found) == 2 * len(vertices) - 1
+
+
+def test_a_mesh_that_is_a_point_has_one_vertex():
+    found, joined = welded(torch.ones(6, 3), torch.arange(6).reshape(2, 3))
+    assert len(found) == 1
+    assert (joined == 0).all()
