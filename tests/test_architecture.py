@@ -23,6 +23,7 @@ ROOMS = [
     "errors",
     "config",
     "progress",
+    "file_names",
     "kernels",
     "radiometry",
     "records",

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError, some
+from pimper_torch.file_names import match_files
 from pimper_torch.records import Lens, Record, pairs_table
 from pimper_torch.records.scene import no_maps
 
@@ -127,27 +128,29 @@ def longest_tracks(model: SparseModel, most: int) -> SparseModel:
     return model.without(~wanted[model.observation_point])
 
 
-def match_names(model: SparseModel, names: Sequence[str], folder: Path) -> SparseModel:
+def match_names(
+    model: SparseModel, names: Sequence[str], folder: Path, photographs: str = ""
+) -> SparseModel:
     """Find the photographs in a model by file name and put it in their order.
 
-    A model's image may lie in a subfolder: where no image has the photograph's name as it
-    is, the last part of the image's path counts.
+    A model's image may lie in a subfolder, and its name may have been rewritten by another program:
+    see :func:`~pimper_torch.file_names.match_files`.
 
     Args:
         model: Any.
         names: Of the photographs.
         folder: Where the model came from, for the message.
+        photographs: Path of the folder that they lie in.
 
     Raises:
-        InputError: No photograph is in the model.
+        InputError: No photograph is in the model, or a name may be any of several.
     """
-    exact = {name: index for index, name in enumerate(model.names)}
-    by_file = {PurePosixPath(name).name: index for index, name in enumerate(model.names)}
-    found = [exact.get(name, by_file.get(PurePosixPath(name).name)) for name in names]
+    where = f"The COLMAP model in {folder}"
+    found = match_files(names, model.names, folder=photographs, where=where, what="image")
     chosen = [index for index in found if index is not None]
     if not chosen:
         raise InputError(
-            f"The COLMAP model in {folder} has none of the photographs. Its images are "
+            f"{where} has none of the photographs. Its images are "
             f"{some(model.names)}; the photographs are {some(names)}. Rename the "
             "photographs to match, or leave the model out to run structure from motion."
         )

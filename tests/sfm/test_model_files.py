@@ -98,6 +98,23 @@ def test_a_name_with_spaces_is_read_from_text(model, tmp_path):
     assert read_model(tmp_path).names == model.names
 
 
+def test_a_name_with_whatever_unicode_takes_for_spaces_and_line_ends_is_read_from_text(
+    model, tmp_path
+):
+    names = ("a  b.png", "c\u2028d.png", "e\u00a0f.png", "g\x85h\x1ci.png")
+    reconstruction_of(model.replace(names=names), COLORS).write_text(str(tmp_path))
+    read = read_model(tmp_path)
+    assert read.names == names
+    assert len(read.observation_point) == len(model.observation_point)
+
+
+def test_lines_that_end_as_windows_ends_them_are_read(model, tmp_path):
+    reconstruction_of(model, COLORS).write_text(str(tmp_path))
+    for path in tmp_path.glob("*.txt"):
+        path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    assert read_model(tmp_path).names == model.names
+
+
 def test_camera_models_are_colmaps():
     pycolmap = loaded()
     known = {

@@ -1,0 +1,106 @@
+import unicodedata
+
+import pytest
+
+from pimper_torch.errors import InputError
+from pimper_torch.file_names import match_files
+
+
+def matched(wanted, present, folder=""):
+    return match_files(wanted, present, folder=folder, where="model", what="image")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "present"),
+    [
+        ("IMG 1.jpg", "IMG 1.jpg"),
+        ("IMG 1.jpg", "IMG_1.jpg"),
+        ("IMG  1.jpg", "IMG 1.jpg"),
+        ("IMG 1.jpg", "IMG%201.jpg"),
+        ("IMG 1.jpg", '"IMG 1.jpg"'),
+        ("IMG_1.JPG", "img_1.jpg"),
+        ("a.jpg", "images\\a.jpg"),
+        ("a.jpg", "C:\\shots\\a.jpg"),
+        ("a.jpg", "./a.jpg"),
+        (
+            unicodedata.normalize("NFC", "Häuschen.jpg"),
+            unicodedata.normalize("NFD", "Häuschen.jpg"),
+        ),
+        (unicodedata.normalize("NFD", "éÅ.jpg"), unicodedata.normalize("NFC", "éÅ.jpg")),
+        ("STRASSE.jpg", "straße.jpg"),
+        ("a.jpg", "a.png"),
+        ("a.tif", "a"),
+        ("a.png", "A.JPG.png"),
+        ("a.v2.jpg", "a.v2.tiff"),
+    ],
+)
+def test_a_name_that_a_program_rewrote_is_found(wanted, present):
+    assert matched([wanted], ["other.jpg", present]) == [1]
+    assert matched([present.rpartition("/")[2]], ["x/y.jpg", wanted]) == [1]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "present"),
+    [
+        ("a.jpg", "b.jpg"),
+        ("1.jpg", "01.jpg"),
+        ("a.v2.jpg", "a.jpg"),
+        ("a.jpg", "a-1.jpg"),
+        ("ab.jpg", "a b.jpg"),
+    ],
+)
+def test_a_name_that_is_another_is_not_found(wanted, present):
+    assert matched([wanted], [present]) == [None]
+
+
+def test_names_that_are_the_same_byte_for_byte_come_first():
+    present = ["a b.jpg", "a_b.jpg", "A_B.jpg", "a_b.png"]
+    assert matched(["a_b.jpg", "a b.jpg", "a_b.png", "A_B.jpg"], present) == [1, 0, 3, 2]
+
+
+def test_among_images_of_one_name_those_of_the_photographs_folder_count():
+    present = ["cam1/000.png", "cam2/000.png", "cam1/001.png", "cam2/001.png"]
+    names = ["000.png", "001.png"]
+    assert matched(names, present, "/data/cam1") == [0, 2]
+    assert matched(names, present, "/data/cam2") == [1, 3]
+    assert matched(names, present, "C:\\data\\CAM2") == [1, 3]
+    assert matched(["cam2/001.png", "cam1/001.png"], present, "/data/photos") == [3, 2]
+
+
+def test_folders_agree_from_the_end_of_the_path_on():
+    present = ["left/cam1/0.png", "right/cam1/0.png"]
+    assert matched(["0.png"], present, "/left/right/cam1") == [1]
+
+
+def test_an_image_without_a_folder_comes_before_those_of_folders_that_nothing_names():
+    assert matched(["0.png"], ["cam1/0.png", "0.png"], "/data/photos") == [1]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "present"),
+    [
+        (["000.png"], ["cam1/000.png", "cam2/000.png"]),
+        (["a.jpg"], ["A.jpg", "a.JPG"]),
+        (["A.jpg"], ["a.png", "a.tif"]),
+        (["a b.jpg"], ["a_b.jpg", "a%20b.jpg"]),
+    ],
+)
+def test_a_name_that_fits_several_is_refused_with_all_of_them(wanted, present):
+    with pytest.raises(InputError, match=rf"^model: {wanted[0]} may be any of ") as caught:
+        matched(wanted, present, "/data/photos")
+    assert all(name in str(caught.value) for name in present)
+
+
+def test_two_photographs_that_fit_one_image_are_refused_with_both():
+    with pytest.raises(InputError, match=r"A\.jpg may be any of a\.jpg, a\.JPG"):
+        matched(["a.jpg", "a.JPG"], ["A.jpg"])
+
+
+def test_an_image_that_is_taken_exactly_is_no_other_photograph_s():
+    assert matched(["a.jpg", "A.jpg"], ["a.jpg"]) == [0, None]
+
+
+def test_images_of_another_folder_are_left_where_some_are_of_the_photographs_own():
+    present = ["cam1/000.png", "cam2/000.png", "cam2/001.png"]
+    assert matched(["000.png", "001.png"], present, "/data/cam1") == [0, None]
+    assert matched(["001.png"], present, "/data/photos") == [2]
