@@ -1,5 +1,6 @@
 """Photographs from a folder, as linear radiance."""
 
+import os
 import re
 import warnings
 from collections import Counter
@@ -12,8 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning, some
-from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header, rotated
+from pimper_torch.file_names import match_files
+from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
+from pimper_torch.io.turned_masks import choose_ways, mask_ways
 from pimper_torch.radiometry import SATURATED, SRGB, Encoding
 from pimper_torch.records import Views
 
@@ -25,6 +28,8 @@ _LIT_FRACTION = 1e-3  # more than hot pixels
 _MIN_USABLE = 0.1
 # Masks are turned round where more than the rest of it is bright at the border, and less inside.
 _TELLING = 0.25
+# What programs add to the name of a mask.
+_MASK = re.compile(r"[ _.-]?mask((\.[A-Za-z]+)+)$", re.IGNORECASE)
 # What people take for photographs, and is none of SUFFIXES: images, camera raw, video.
 _PICTURES = re.compile(
     r"\.(gif|hei[cf]|avif|webp|bmp|jp2|jxl|psd|exr|hdr|p[pg]m"
@@ -60,7 +65,9 @@ def load_views(
     Args:
         folder: With the photographs.
         masks: Folder with one mask for each photograph, of the same name whatever the
-            suffix (``17.jpg``: ``17.png``, COLMAP's ``17.jpg.png``, or ``17_mask.png``).
+            suffix (``17.jpg``: ``17.png``, COLMAP's ``17.jpg.png``, or ``17_mask.png``), or of
+            one that differs in case, spaces or Unicode form. They lie as their photographs are
+            turned by EXIF, or as the files store them; where sizes do not tell, outlines do.
         mask_object: How masks show the object; ``auto`` looks at them.
         encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer, in linear light and
@@ -88,11 +95,10 @@ def load_views(
     images = pictures.images
     has_masks = mask_paths is not None or any(one is not None for one in pictures.opaque)
     drawn = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
-    opacities = (
-        [_read_mask(*one) for one in zip(mask_paths, paths, headers, strict=True)]
-        if mask_paths is not None
-        else []
-    )
+    opacities = []
+    if mask_paths is not None:
+        ways = [_read_mask(*one) for one in zip(mask_paths, paths, headers, strict=True)]
+        opacities = _laid(ways, images, sizes, Path(str(masks)))
     if opacities and _is_dark(opacities, mask_object, Path(str(masks))):
         opacities = [1 - opacity for opacity in opacities]
     for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
@@ -120,7 +126,14 @@ def load_views(
             ],
             dtype=torch.float32,
         ),
+        orientations=torch.tensor([header.orientation for header in headers]),
+        folder=_named_path(folder),
     )
+
+
+def _named_path(folder: Path | str) -> str:
+    """Give the whole path under the name that was given: links are not followed."""
+    return Path(os.path.abspath(folder)).as_posix()  # noqa: PTH100 - `resolve` follows links
 
 
 def list_images(folder: Path | str) -> list[Path]:
@@ -232,12 +245,24 @@ def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
 
 
 def _match_masks(paths: list[Path], folder: Path) -> list[Path]:
-    """Find the mask of each photograph by its stem, its whole name (COLMAP), or with ``_mask``."""
+    """Find the mask of each photograph by its stem, its whole name (COLMAP), or with ``_mask``.
+
+    Those not found so are looked for as another program may have written the name.
+    """
     by_stem = {path.stem: path for path in list_images(folder)}
     found = [
         by_stem.get(path.stem) or by_stem.get(path.name) or by_stem.get(f"{path.stem}_mask")
         for path in paths
     ]
+    lost = [path.name for path, mask in zip(paths, found, strict=True) if mask is None]
+    if lost:
+        free = {_MASK.sub(r"\1", mask.name): mask for mask in by_stem.values() if mask not in found}
+        others = match_files(lost, list(free), where=str(folder), what="mask")
+        names = dict(zip(lost, others, strict=True))
+        found = [
+            mask if mask or (at := names[path.name]) is None else list(free.values())[at]
+            for path, mask in zip(paths, found, strict=True)
+        ]
     missing = [path.name for path, mask in zip(paths, found, strict=True) if mask is None]
     if missing:
         raise InputError(
@@ -289,28 +314,31 @@ def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height wi
     return resized_mask(drawn.float(), *shrunk_size(read_header(path), max_size_px))
 
 
-def _read_mask(path: Path, photograph: Path, header: Header) -> Float[Tensor, "height width"]:
-    """Give 1 on the object, 0 off it, the way the photograph is turned."""
+def _read_mask(path: Path, photograph: Path, header: Header) -> list[Float[Tensor, "_ _"]]:
+    """Give 1 on the object, 0 off it, in the ways in which it may lie on the photograph."""
     found = read_header(path)
-    upright = (header.width, header.height)
-    if upright not in ((found.width, found.height), (found.height, found.width)):
-        raise _other_size(path, (found.width, found.height), photograph, header)
-    drawn = _on_object(decode(path))
-    lying = drawn.shape == (header.width, header.height)
-    if header.orientation >= 5 and lying and header.width != header.height:
-        # Drawn on the file's pixels by a program that does not know EXIF.
-        drawn = torch.from_numpy(rotated(drawn.numpy(), header.orientation))
-    size = (drawn.shape[1], drawn.shape[0])
-    if size != upright:
-        raise _other_size(path, size, photograph, header)
-    return drawn
+    sides = sorted((found.width, found.height)) == sorted((header.width, header.height))
+    # One of another size is refused without decoding it.
+    drawn = _on_object(decode(path)) if sides else torch.zeros(found.height, found.width)
+    return mask_ways(drawn, path, found, photograph, header)
 
 
-def _other_size(path: Path, size: tuple[int, int], photograph: Path, header: Header) -> InputError:
-    return InputError(
-        f"{path}: is {size[0]} x {size[1]}, but the photograph {photograph.name} is "
-        f"{header.width} x {header.height}; needed: a mask of the same size."
-    )
+def _laid(
+    ways: Sequence[list[Float[Tensor, "_ _"]]],
+    images: Float[Tensor, "view channel height width"],
+    sizes: Sequence[tuple[int, int]],
+    folder: Path,
+) -> list[Float[Tensor, "_ _"]]:
+    """Lay masks on their photographs, those of stored pixels turned."""
+    if all(len(several) == 1 for several in ways):
+        return [several[0] for several in ways]
+    drawn = [
+        tuple(resized_mask(way, *size) for way in several) if len(several) > 1 else ()
+        for several, size in zip(ways, sizes, strict=True)
+    ]
+    pictures = [image[:, :high, :wide] for image, (wide, high) in zip(images, sizes, strict=True)]
+    stored = choose_ways(drawn, pictures, str(folder))
+    return [several[-1 if stored else 0] for several in ways]
 
 
 def _on_object(decoded: Decoded, lossless: float | None = None) -> Float[Tensor, "height width"]:

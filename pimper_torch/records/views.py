@@ -24,6 +24,9 @@ class Views(Record):
         names: File names, unique, in the order of the views.
         masks: True on the object; ``None`` where there are none.
         focals_px: Focal length from EXIF in pixels; NaN where the file does not say.
+        orientations: EXIF's number of the orientation that was applied to each file's pixels;
+            ``None`` where none was.
+        folder: Path that the files lie in, by which a model's images of one name are told apart.
     """
 
     images: Float[Tensor, "view channel height width"]
@@ -31,6 +34,8 @@ class Views(Record):
     names: tuple[str, ...]
     masks: Bool[Tensor, "view height width"] | None = None
     focals_px: Float[Tensor, " view"]
+    orientations: Int[Tensor, " view"] | None = None
+    folder: str = ""
 
     @property
     def num_views(self) -> int:

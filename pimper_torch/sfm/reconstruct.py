@@ -225,7 +225,8 @@ def find_model(
     Returns:
         The model, and the seconds of wall clock in which it was found.
     """
-    key = f"reconstruct-{digest(code_of(__name__), views, replace(config, threads=0))}"
+    known = views.replace(folder="")  # the model is the same from another folder
+    key = f"reconstruct-{digest(code_of(__name__), known, replace(config, threads=0))}"
     kept = store.find(key, SparseModel) if store else None
     if kept is not None:
         for message in kept.about["cautions"]:

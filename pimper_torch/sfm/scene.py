@@ -44,7 +44,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
     )
     like = views.images
     return SparseScene(
-        views=undistorted,
+        views=undistorted.replace(folder=""),  # the scene is the same from another folder
         cameras=Cameras(
             intrinsics=intrinsics,
             cam_from_world=model.cam_from_world.to(like),

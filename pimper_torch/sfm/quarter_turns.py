@@ -1,0 +1,85 @@
+"""Photographs that stand turned by quarters: their pixels, lenses and poses follow.
+
+A picture that is turned clockwise by a quarter has the pixel :math:`(u, v)` at
+:math:`(height - v, u)`. Its camera is turned about its axis by as much, the other way round in
+space: :math:`(x, y, z)` of a point becomes :math:`(-y, x, z)`.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.records import Lens
+
+QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
+"""Clockwise quarters by which EXIF's orientations turn a file's pixels; the others mirror, too."""
+
+# Where a model's focal lengths are two, its principal point stands behind them, else behind one.
+_ONE_FOCAL = ("SIMPLE_", "RADIAL")
+# Positions of pairs of parameters that turn as vectors: decentering and thin prisms.
+_VECTORS = {
+    "OPENCV": ((7, 6),),
+    "FULL_OPENCV": ((7, 6),),
+    "THIN_PRISM_FISHEYE": ((7, 6), (10, 11)),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ((10, 11), (12, 14), (13, 15)),
+}
+
+
+def turned_size(width: int, height: int, quarters: int) -> tuple[int, int]:
+    """Exchange width and height where a picture is turned by an odd number of quarters."""
+    return (height, width) if quarters % 2 else (width, height)
+
+
+def turned_pixels(
+    pixels: Float[Tensor, "*batch 2"], width: int, height: int, quarters: int
+) -> Float[Tensor, "*batch 2"]:
+    """Give where pixels are after clockwise quarter turns of their picture.
+
+    Args:
+        pixels: In the picture before.
+        width: Of the picture before.
+        height: Of the picture before.
+        quarters: Any whole number.
+
+    >>> turned_pixels(torch.tensor([3.0, 1.0]), width=8, height=6, quarters=1)
+    tensor([5., 3.])
+    """
+    for _ in range(quarters % 4):
+        pixels = torch.stack([height - pixels[..., 1], pixels[..., 0]], dim=-1)
+        width, height = height, width
+    return pixels
+
+
+def turned_vectors(vectors: Float[Tensor, "*batch 2"], quarters: int) -> Float[Tensor, "*batch 2"]:
+    """Give what differences of pixels are after clockwise quarter turns."""
+    return turned_pixels(vectors, 0, 0, quarters)
+
+
+def turned_pose(
+    cam_from_world: Float[Tensor, "*batch 4 4"], quarters: int
+) -> Float[Tensor, "*batch 4 4"]:
+    """Turn a camera with its picture; exact."""
+    x, y, *rest = cam_from_world.unbind(dim=-2)
+    for _ in range(quarters % 4):
+        x, y = -y, x
+    return torch.stack([x, y, *rest], dim=-2)
+
+
+def turned_lens(lens: Lens, quarters: int) -> Lens:
+    """Turn a lens with its picture, of whatever model of COLMAP's: it images turned directions so.
+
+    Focal lengths are exchanged by a quarter, the principal point moves, and parameters that are
+    vectors in the picture are turned: ``p2, p1`` and ``sx1, sy1``.
+    """
+    size = lens.width, lens.height
+    values = list(lens.params)
+    focals = 1 if lens.model.startswith(_ONE_FOCAL) else 2
+    if focals == 2 and quarters % 2:
+        values[0], values[1] = values[1], values[0]
+    center = torch.tensor(values[focals : focals + 2], dtype=torch.float64)
+    values[focals : focals + 2] = turned_pixels(center, *size, quarters).tolist()
+    for first, second in _VECTORS.get(lens.model, ()):
+        vector = torch.tensor([values[first], values[second]], dtype=torch.float64)
+        values[first], values[second] = turned_vectors(vector, quarters).tolist()
+    width, height = turned_size(*size, quarters)
+    return lens.replace(params=tuple(values), width=width, height=height)
