@@ -68,7 +68,7 @@ def _read(job: Job) -> Views:
 def _examine(job: Job, views: Views) -> None:
     """Warn of what `pimper doctor` finds without comparing what photographs show."""
     config, own = job.config, set()
-    if job.inputs.sparse is not None or not config.reconstruct.shared_camera:
+    if job.inputs.sparse is not None or config.reconstruct.shared_camera:
         own.add("lenses")
     if not isinstance(config, CoarseToFineConfig):
         own.add("cost")  # which is that of `default`

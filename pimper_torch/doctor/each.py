@@ -8,6 +8,7 @@ from statistics import median
 from pimper_torch.doctor.findings import Finding, listed
 from pimper_torch.doctor.photograph import Photograph
 from pimper_torch.io.photographs import MIN_PHOTOGRAPHS
+from pimper_torch.sfm.lenses import group_lenses
 
 # Choices, all of them; 24 photographs of the demo and rendered scenes are within.
 _FEW = 8  # with fewer, hardly a facet is lit in enough views
@@ -15,7 +16,7 @@ _BLUR_PX, _BLUR_RATIO = 1.5, 1.6  # absolute, and beside the median of the folde
 _SHARP_PX = 0.5  # as sharp as pixels are
 _SATURATED = 0.05
 _DARK = 0.05  # of saturation: in 8 bits of sRGB 63 levels are left
-_LENS = 0.02  # relative difference of focal lengths that EXIF rounds
+_FEW_OF_A_LENS = 3  # with fewer, its focal length is hardly told from its distance
 
 
 def each_alone(photographs: Sequence[Photograph]) -> list[Finding]:
@@ -126,45 +127,41 @@ def exposure(photographs: Sequence[Photograph]) -> Iterator[Finding]:
 
 
 def lenses(photographs: Sequence[Photograph]) -> Iterator[Finding]:
-    """Group photographs by size and focal length, as one camera is taken for all."""
-    groups: list[list[Photograph]] = []
-    for one in sorted(photographs, key=_lens):
-        if groups and _alike(groups[-1][-1], one):
-            groups[-1].append(one)
-        else:
-            groups.append([one])
+    """Group photographs by size and focal length, as each lens is found for itself."""
+    numbers = group_lenses(
+        [(one.width, one.height) for one in photographs], [one.focal_px for one in photographs]
+    )
+    groups = [
+        [one for one, number in zip(photographs, numbers, strict=True) if number == lens]
+        for lens in range(len(set(numbers)))
+    ]
     told = "; ".join(
         f"{len(group)} of {group[0].width}x{group[0].height}{_focal(group[0])}" for group in groups
     )
-    if len(groups) > 1:
+    guessed = any(math.isnan(one.focal_px) for one in photographs)
+    few = [group for group in groups if len(group) < _FEW_OF_A_LENS]
+    if len(groups) > 1 and few:
         yield Finding(
             check="lenses",
             severity="warning",
             found=f"{len(groups)} lenses, focal lengths or formats: {told}",
-            needed="one, as one camera is taken for all photographs",
-            advice="Give `--reconstruct.no-shared-camera`, or crop and zoom no more.",
+            needed=f"{_FEW_OF_A_LENS} photographs or more of each, as each is found for itself",
+            advice="Crop and zoom no more, or give `--reconstruct.shared-camera` if it is one "
+            "lens whatever EXIF says.",
         )
     elif groups:
-        guessed = math.isnan(photographs[0].focal_px)
+        several = (
+            f"{len(groups)} lenses, focal lengths or formats" if len(groups) > 1 else "one lens"
+        )
         yield Finding(
             check="lenses",
-            severity="note" if guessed else "ok",
-            found=f"one lens: {told}",
+            severity="note" if guessed or len(groups) > 1 else "ok",
+            found=f"{several}: {told}",
             needed="EXIF with the focal length" if guessed else "",
             advice="It is found from the photographs then; keep EXIF where you can."
             if guessed
             else "",
         )
-
-
-def _lens(one: Photograph) -> tuple[int, int, float]:
-    short, long = sorted((one.width, one.height))
-    return long, short, -1.0 if math.isnan(one.focal_px) else one.focal_px
-
-
-def _alike(one: Photograph, other: Photograph) -> bool:
-    (*size, focal), (*size_too, focal_too) = _lens(one), _lens(other)
-    return size == size_too and abs(focal - focal_too) <= _LENS * max(abs(focal), abs(focal_too))
 
 
 def _focal(one: Photograph) -> str:

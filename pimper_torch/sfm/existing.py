@@ -6,11 +6,18 @@ from pathlib import Path
 import torch
 
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.orientation import find_turns
-from pimper_torch.sfm.quarter_turns import turned_lens, turned_pixels, turned_pose, turned_size
+from pimper_torch.sfm.quarter_turns import (
+    turned_lens,
+    turned_pixels,
+    turned_pose,
+    turned_size,
+    turning,
+)
 
 
 def existing_model(views: Views, folder: Path) -> SparseModel:
@@ -40,6 +47,8 @@ def existing_model(views: Views, folder: Path) -> SparseModel:
 def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:
     """Put a model's cameras and observations into photographs that were resized and turned.
 
+    Maps to a static background begin in the photographs then, and end where they ended.
+
     Args:
         model: Its pictures have the photographs' shapes once they are turned.
         views: The photographs, in the model's order.
@@ -50,6 +59,7 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
     fresh = 1 + max(lens.camera for lens in model.lenses)
     pixels = torch.empty_like(model.observation_pixels)
     poses = torch.empty_like(model.cam_from_world)
+    maps = model.background_from_view.clone()
     for view, (lens, quarters) in enumerate(zip(model.lenses, turns, strict=True)):
         width, height = views.sizes_px[view].tolist()
         size = turned_size(width, height, quarters)
@@ -65,4 +75,7 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
         here = model.observation_view == view
         pixels[here] = turned_pixels(model.observation_pixels[here] * scale, *size, quarters)
         poses[view] = turned_pose(model.cam_from_world[view], quarters)
+        if len(maps):
+            shown_from_model = turning(*size, quarters) @ torch.diag(homogeneous(scale))
+            maps[view] = torch.linalg.solve(shown_from_model.to(maps), maps[view], left=False)
     return model.replace(lenses=tuple(lenses), cam_from_world=poses, observation_pixels=pixels)

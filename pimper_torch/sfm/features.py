@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,6 @@ class FeatureSettings:
 
     Attributes:
         camera_model: COLMAP's name.
-        shared_camera: One camera for all photographs instead of one each.
         peak_threshold: Contrast.
         edge_threshold: Ratio of curvatures.
         max_features: In a photograph.
@@ -29,7 +30,6 @@ class FeatureSettings:
     """
 
     camera_model: str
-    shared_camera: bool
     peak_threshold: float
     edge_threshold: float
     max_features: int
@@ -38,9 +38,12 @@ class FeatureSettings:
 
 
 def find_features(
-    space: Workspace, settings: FeatureSettings, focals_px: Sequence[float | None]
+    space: Workspace,
+    settings: FeatureSettings,
+    focals_px: Sequence[float | None],
+    lenses: Sequence[int],
 ) -> list[int]:
-    """Find features and put them in the database, with one camera or one a photograph.
+    """Find features and put them in the database, with one camera a lens.
 
     Args:
         space: Without a database, which is made. Where it has masks, features lie where they
@@ -48,6 +51,7 @@ def find_features(
         settings: What counts as a feature.
         focals_px: Focal length of each photograph where it is known before. A camera shared by
             several photographs gets their median.
+        lenses: Number of each photograph's lens; those of one lens have one size.
 
     Returns:
         How many features each photograph has.
@@ -65,10 +69,11 @@ def find_features(
     reader.camera_model = settings.camera_model
     if space.masked:
         reader.mask_path = str(space.masks)
-    shared = pycolmap.CameraMode.SINGLE if settings.shared_camera else pycolmap.CameraMode.PER_IMAGE
+    one = len(set(lenses)) == 1
+    mode = pycolmap.CameraMode.SINGLE if one else pycolmap.CameraMode.PER_IMAGE
     with quiet():
         pycolmap.Database.open(space.database).close()
-        pycolmap.import_images(space.database, space.images, shared, list(space.files), reader)
+        _import(space, reader, lenses)
         with pycolmap.Database.open(space.database) as stored:
             _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
         step = _PER_THREAD * thread_count(settings.threads)
@@ -78,7 +83,7 @@ def find_features(
                 space.database,
                 space.images,
                 list(space.files[start : start + step]),
-                camera_mode=shared,
+                camera_mode=mode,
                 reader_options=reader,
                 extraction_options=options,
                 device=pycolmap.Device.cpu,
@@ -86,6 +91,21 @@ def find_features(
         with pycolmap.Database.open(space.database) as stored:
             image_ids = {image.name: image.image_id for image in stored.read_all_images()}
             return [stored.num_keypoints_for_image(image_ids[file]) for file in space.files]
+
+
+def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # noqa: ANN401 - no types
+    """Put photographs in the database in their order, each with the camera of its lens."""
+    pycolmap = loaded()
+    cameras: dict[int, int] = {}
+    for lens, run in groupby(zip(lenses, space.files, strict=True), key=itemgetter(0)):
+        files = [file for _, file in run]
+        reader.existing_camera_id = cameras.get(lens, -1)
+        shared = pycolmap.CameraMode.SINGLE
+        pycolmap.import_images(space.database, space.images, shared, files, reader)
+        if lens not in cameras:
+            with pycolmap.Database.open(space.database) as stored:
+                cameras[lens] = stored.read_image_with_name(files[0]).camera_id
+    reader.existing_camera_id = -1
 
 
 def _set_focals(stored: Any, focals_px: dict[str, float | None]) -> None:  # noqa: ANN401 - no types

@@ -5,11 +5,13 @@ A picture that is turned clockwise by a quarter has the pixel :math:`(u, v)` at
 space: :math:`(x, y, z)` of a point becomes :math:`(-y, x, z)`.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.records import Lens
+from pimper_torch.records import Lens, Views
 
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
 """Clockwise quarters by which EXIF's orientations turn a file's pixels; the others mirror, too."""
@@ -83,3 +85,41 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
         values[first], values[second] = turned_vectors(vector, quarters).tolist()
     width, height = turned_size(*size, quarters)
     return lens.replace(params=tuple(values), width=width, height=height)
+
+
+def turning(width: int, height: int, quarters: int) -> Float[Tensor, "3 3"]:
+    """Give :func:`turned_pixels` as a matrix on homogeneous pixels; float64."""
+    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
+    origin, right, down = turned_pixels(corners, width, height, quarters)
+    matrix = torch.eye(3, dtype=torch.float64)
+    matrix[:2] = torch.stack([right - origin, down - origin, origin], dim=1)
+    return matrix
+
+
+def turned_views(views: Views, quarters: Sequence[int]) -> Views:
+    """Turn photographs clockwise by quarters, each by its own number; none are not copied.
+
+    The raster is as large as the turned photographs need.
+    """
+    if not any(turns % 4 for turns in quarters):
+        return views
+    sizes = [
+        turned_size(width, height, turns)
+        for (width, height), turns in zip(views.sizes_px.tolist(), quarters, strict=True)
+    ]
+    wide, high = (max(sides) for sides in zip(*sizes, strict=True))
+    images = views.images.new_zeros(*views.images.shape[:2], high, wide)
+    masks = None if views.masks is None else views.masks.new_zeros(len(sizes), high, wide)
+    for view, ((width, height), turns) in enumerate(zip(sizes, quarters, strict=True)):
+        before = turned_size(width, height, turns)
+        picture = views.images[view, :, : before[1], : before[0]]
+        images[view, :, :height, :width] = torch.rot90(picture, -turns, dims=(1, 2))
+        if views.masks is not None and masks is not None:
+            mask = views.masks[view, : before[1], : before[0]]
+            masks[view, :height, :width] = torch.rot90(mask, -turns)
+    return views.replace(
+        images=images,
+        masks=masks,
+        sizes_px=torch.tensor(sizes).to(views.sizes_px),
+        orientations=None,
+    )

@@ -22,11 +22,14 @@ from pimper_torch.sfm.binding import thread_count
 from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
 from pimper_torch.sfm.doubt import doubt
-from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.existing import existing_model, follow_pictures
 from pimper_torch.sfm.features import FeatureSettings, find_features
+from pimper_torch.sfm.lenses import choose_lenses, sensor_turns
 from pimper_torch.sfm.mapping import MapSettings
 from pimper_torch.sfm.matching import MatchSettings
 from pimper_torch.sfm.model import SparseModel, select_views
+from pimper_torch.sfm.one_lens import doubt_one_lens
+from pimper_torch.sfm.quarter_turns import turned_views
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
 from pimper_torch.sfm.scene import assemble_scene
@@ -47,7 +50,10 @@ class ReconstructConfig:
 
     Attributes:
         camera_model: COLMAP's name of the lens model.
-        shared_camera: One camera took all photographs, with one lens at one focal length.
+        shared_camera: One camera took all photographs, with one lens at one focal length, whatever
+            EXIF says. By default lenses are told apart by EXIF's focal length and by size; a
+            camera that was held upright is the same.
+        own_cameras: Each photograph has a lens of its own.
         peak_threshold: Contrast below which a feature is dropped; in COLMAP's units, where
             its own default is 0.0067. Lower finds the faint marks of smooth surfaces.
         edge_threshold: Ratio of curvatures above which a feature counts as an edge.
@@ -70,7 +76,8 @@ class ReconstructConfig:
     """
 
     camera_model: str = "SIMPLE_RADIAL"
-    shared_camera: bool = True
+    shared_camera: bool = False
+    own_cameras: bool = False
     peak_threshold: float = 0.002
     edge_threshold: float = 10.0
     max_features: int = 4096
@@ -89,6 +96,12 @@ class ReconstructConfig:
             "camera_model",
             self.camera_model,
             "one of " + ", ".join(CAMERA_MODELS),
+        )
+        require(
+            not (self.shared_camera and self.own_cameras),
+            "own_cameras",
+            self.own_cameras,
+            "false where shared_camera is true",
         )
         require(self.peak_threshold > 0, "peak_threshold", self.peak_threshold, "more than 0")
         require(self.edge_threshold > 0, "edge_threshold", self.edge_threshold, "more than 0")
@@ -116,7 +129,6 @@ class ReconstructConfig:
         """What counts as a feature."""
         return FeatureSettings(
             camera_model=self.camera_model,
-            shared_camera=self.shared_camera,
             peak_threshold=self.peak_threshold,
             edge_threshold=self.edge_threshold,
             max_features=self.max_features,
@@ -264,11 +276,12 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
             f"Structure from motion was given {views.num_views} photographs; at least 3 are "
             "needed, and 10 to 50 are usual. Add photographs from other viewpoints."
         )
-    if config.shared_camera:
-        _require_one_size(views)
+    turns = (0,) * views.num_views if config.own_cameras else sensor_turns(views)
+    lying = turned_views(views, [-quarters for quarters in turns])
+    lenses = choose_lenses(lying, shared=config.shared_camera, own=config.own_cameras)
     release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
-    with workspace(views, thread_count(config.threads or -1)) as space:
-        counts = find_features(space, config.features, _known_focals(views))
+    with workspace(lying, thread_count(config.threads or -1)) as space:
+        counts = find_features(space, config.features, _known_focals(views), lenses)
         _require_features(counts, views.names)
         release_memory()
         found = register(space, config.registration)
@@ -276,9 +289,15 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     names = dict(zip(space.files, views.names, strict=True))
     model = _chosen(found, names, _MIN_FRACTION)
     numbers = [views.names.index(name) for name in model.names]
-    model = refine_tracks(views.take(numbers), model, config.tracks)
+    model = refine_tracks(lying.take(numbers), model, config.tracks)
     release_memory()
-    return with_background(model, found, names)
+    reason = doubt_one_lens(model)
+    if reason:
+        caution(reason, stacklevel=3)
+    model = with_background(model, found, names)
+    if not any(turns):
+        return model
+    return follow_pictures(model, views.take(numbers), [turns[number] for number in numbers])
 
 
 def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> SparseModel:
@@ -331,23 +350,6 @@ def _require_finite(views: Views) -> None:
         raise InputError(
             f"NaN or infinity in the photographs {', '.join(odd)}; needed: radiance in numbers. "
             "Set these pixels to 0 and leave them out by `masks`, or to 1 if they are saturated."
-        )
-
-
-def _require_one_size(views: Views) -> None:
-    sizes = [(width, height) for width, height in views.sizes_px.tolist()]
-    groups = {
-        size: [name for name, its in zip(views.names, sizes, strict=True) if its == size]
-        for size in dict.fromkeys(sizes)
-    }
-    if len(groups) > 1:
-        found = "; ".join(
-            f"{width}x{height}: {some(names)}" for (width, height), names in groups.items()
-        )
-        raise InputError(
-            f"One shared camera was asked for, but the photographs have {len(groups)} sizes "
-            f"({found}). Give each its own camera with `--reconstruct.no-shared-camera` "
-            "(`shared_camera: false` in YAML), or photographs of one size."
         )
 
 

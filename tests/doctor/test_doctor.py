@@ -109,9 +109,12 @@ def test_lenses_are_told_apart_by_size_and_focal_length():
     assert severities(lenses([photograph(), upright, photograph(focal_px=1010.0)])) == ["ok"]
     for other in (photograph(focal_px=1500.0), photograph(width=800)):
         (found,) = lenses([photograph(), other, photograph()])
-        assert found.severity == "warning"
+        assert found.severity == "warning"  # a lens of one photograph
         assert found.found.startswith("2 lenses")
-        assert "--reconstruct.no-shared-camera" in found.advice
+        assert "--reconstruct.shared-camera" in found.advice
+        (found,) = lenses([photograph(), other] * 3)
+        assert found.severity == "note"
+        assert "2 lenses, focal lengths or formats: 3 of 900x600" in found.found
     assert severities(lenses([photograph(focal_px=math.nan)])) == ["note"]
 
 

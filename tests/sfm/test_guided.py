@@ -133,7 +133,7 @@ def matched():
         return {tuple(row) for row in np.array(geometry.inlier_matches).tolist()}
 
     with workspace(views, 1) as space:
-        find_features(space, CONFIG.features, [None, None])
+        find_features(space, CONFIG.features, [None, None], [0, 0])
         match_pairs(space, [(0, 1)], matching)
         options = pycolmap.FeatureMatchingOptions()
         options.use_gpu, options.num_threads, options.guided_matching = False, 1, True

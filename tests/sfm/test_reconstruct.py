@@ -138,13 +138,19 @@ def test_a_model_with_two_of_the_photographs_is_refused(scene, views, tmp_path):
 
 
 def test_unlike_sizes_with_one_shared_camera_are_refused_naming_files_and_the_way_out():
-    views = blank([(40, 30), (40, 30), (30, 40)])
+    views = blank([(40, 30), (40, 30), (30, 40), (60, 45)])
     with pytest.raises(InputError) as caught:
-        Reconstruct()(views)
+        Reconstruct(ReconstructConfig(shared_camera=True))(views)
     message = str(caught.value)
-    assert "40x30: 0.jpg, 1.jpg" in message
-    assert "30x40: 2.jpg" in message
-    assert "--reconstruct.no-shared-camera" in message
+    assert "2 sizes (40x30: 0.jpg, 1.jpg, 2.jpg; 60x45: 3.jpg)" in message
+    assert "Leave out `--reconstruct.shared-camera`" in message
+    with pytest.raises(ReconstructionError, match="No features"):  # it goes on
+        Reconstruct()(views)
+
+
+def test_one_camera_and_one_each_are_not_both_asked_for():
+    with pytest.raises(ConfigError, match="own_cameras"):
+        ReconstructConfig(shared_camera=True, own_cameras=True)
 
 
 def test_black_photographs_are_refused_naming_those_without_features():
