@@ -190,3 +190,21 @@ def test_a_point_alone_leaves_open_which_way_and_a_warning_says_so(stored, tmp_p
     with pytest.warns(PimperWarning, match="neither sizes nor points tell whether"):
         found = existing_model(views, folder)
     assert torch.equal(found.cam_from_world, existing_model(stored, folder).cam_from_world)
+
+
+def test_of_a_model_of_two_cameras_the_photographs_folder_takes_its_own(stored, tmp_path):
+    generator = torch.Generator().manual_seed(13)
+    own = model_of(cameras_on_an_arc(), points_on_the_ball(50, generator), generator, 0.2)
+    both = own.replace(
+        names=tuple(f"{folder}/{name}" for folder in ("cam2", "cam1") for name in own.names),
+        lenses=own.lenses * 2,
+        cam_from_world=torch.cat([own.cam_from_world.flip(0), own.cam_from_world]),
+        observation_point=own.observation_point.repeat(2),
+        observation_view=torch.cat([5 - own.observation_view, 6 + own.observation_view]),
+        observation_pixels=own.observation_pixels.repeat(2, 1),
+    )
+    write_binary(both, to_bytes(torch.ones(len(own.points_world), 3)), tmp_path)
+    found = existing_model(stored.replace(folder="/data/cam1"), tmp_path)
+    assert_close(found.cam_from_world, own.cam_from_world, rtol=0, atol=1e-12)  # by quaternions
+    with pytest.raises(InputError, match=r"0\.png may be any of cam2/0\.png, cam1/0\.png"):
+        existing_model(stored.replace(folder="/data/photos"), tmp_path)
