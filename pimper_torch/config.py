@@ -35,7 +35,7 @@ def require(ok: bool, field: str, value: object, needed: str) -> None:
         raise ConfigError(f"{field} is {value!r}; needed: {needed}.")
 
 
-def require_at_most(config: object, section: str = "", /, **most: float) -> None:
+def require_at_most(config: object, section: str = "", /, **most: int | float) -> None:
     """Refuse values above the bounds of their fields: slips that no memory or time suffices for.
 
     Args:
