@@ -17,10 +17,11 @@ import torch
 
 from pimper_torch.errors import InputError, NumericalError, ReconstructionError, caution
 from pimper_torch.records.failure import Failure
-from pimper_torch.records.record import AnyRecord
+from pimper_torch.records.record import Record
 
 OnFailure = Literal["skip", "fail"]
 Result = TypeVar("Result")
+AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 _on_failure: ContextVar[OnFailure] = ContextVar("on_failure", default="skip")
 _collected: ContextVar[list[Failure] | None] = ContextVar("collected", default=None)

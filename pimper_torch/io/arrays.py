@@ -66,7 +66,7 @@ def read_npz(
         raise ValueError("its list of contents is damaged") from error
 
 
-def _array(file: IO[bytes], size: int) -> np.ndarray:
+def _array(file: IO[bytes] | zipfile.ZipExtFile, size: int) -> np.ndarray:
     head = file.read(min(size, 2**16 + 12))  # the longest header of version 1
     buffer = io.BytesIO(head)
     try:

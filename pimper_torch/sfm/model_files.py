@@ -53,7 +53,7 @@ class FileCamera:
     model: str
     width: int
     height: int
-    params: tuple[float, ...]
+    params: tuple[int | float, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,8 +71,8 @@ class FileImage:
     """
 
     image: int
-    quaternion: tuple[float, ...]
-    translation: tuple[float, ...]
+    quaternion: tuple[int | float, ...]
+    translation: tuple[int | float, ...]
     camera: int
     name: str
     pixels: np.ndarray
@@ -151,7 +151,7 @@ class _Bytes:
         self.data = data
         self.at = 0
 
-    def take(self, layout: str) -> tuple[float, ...]:
+    def take(self, layout: str) -> tuple[int | float, ...]:
         size = struct.calcsize(layout)
         self.require(size)
         values = struct.unpack_from(layout, self.data, self.at)
