@@ -23,7 +23,7 @@ Mask = Float[Tensor, "_ _"]
 
 
 def mask_ways(
-    drawn: Mask, path: Path, found: Header, photograph: Path, header: Header
+    drawn: Mask, path: Path | str, found: Header, photograph: Path | str, header: Header
 ) -> list[Mask]:
     """Give the ways in which a mask may lie on its photograph: as it is, or turned by EXIF.
 
@@ -44,8 +44,9 @@ def mask_ways(
     if fitting:
         return fitting
     raise InputError(
-        f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph {photograph.name} is "
-        f"{header.width} x {header.height}; needed: a mask of the same size."
+        f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph "
+        f"{Path(photograph).name} is {header.width} x {header.height}; needed: a mask of the same "
+        "size."
     )
 
 
