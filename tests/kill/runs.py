@@ -17,6 +17,7 @@ import json
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -154,7 +155,8 @@ def disturbance(ending: str, moment: float, seconds: float, home: Path) -> Distu
     if ending == "memory":  # of what the stages take on top of what is loaded
         return (lambda: limit_memory(int(moment * 400e6))), None
     if home.is_mount():
-        (home / "ballast").write_bytes(bytes(int((DISK_MB - 2.5 * moment) * 2**20)))
+        room = int(moment * 2.5 * 2**20)  # what is kept and a result take about as much
+        (home / "ballast").write_bytes(bytes(max(0, shutil.disk_usage(home).free - room)))
         return (lambda: None), None
     return (lambda: limit_files(int(moment * 1e6))), None
 
