@@ -160,6 +160,7 @@ class Record:
         fields = ", ".join(
             f"{field.name}={_brief(getattr(self, field.name))}"
             for field in dataclasses.fields(self)
+            if field.repr
         )
         return f"{type(self).__name__}({fields})"
 

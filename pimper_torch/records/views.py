@@ -1,7 +1,7 @@
 """Photographs and the cameras that took them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,7 +35,7 @@ class Views(Record):
     masks: Bool[Tensor, "view height width"] | None = None
     focals_px: Float[Tensor, " view"]
     orientations: Int[Tensor, " view"] | None = None
-    folder: str = ""
+    folder: str = field(default="", repr=False, compare=False)
 
     @property
     def num_views(self) -> int:

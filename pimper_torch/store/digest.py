@@ -22,7 +22,7 @@ def digest(*values: object) -> str | None:
     """Hash values, so that equal hashes mean equal bits.
 
     A module is what it is made with: its class, attributes and submodules. A tensor's device
-    counts, its memory layout doesn't.
+    counts, its memory layout doesn't, nor do fields that are not compared, as where files lie.
 
     Args:
         values: Records and other dataclasses, tensors, modules, functions, tuples, lists, mappings,
@@ -53,7 +53,8 @@ def _described(value: object) -> object:
     if isinstance(value, nn.Module):
         return {"module": _named(type(value)), "holds": _described(_held(value))}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        known = [field.name for field in dataclasses.fields(value) if field.compare]
+        fields = {name: getattr(value, name) for name in known}
         return {"class": _named(type(value)), "holds": _described(fields)}
     if isinstance(value, Mapping):
         return {"map": [[_described(key), _described(inner)] for key, inner in value.items()]}

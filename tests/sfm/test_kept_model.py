@@ -58,8 +58,9 @@ def test_all_that_a_model_depends_on_counts(views, runs, tmp_path):
         views.replace(focals_px=torch.full((5,), 90.0, dtype=torch.float64)),
         views.replace(sizes_px=views.sizes_px - 1),
     ]
+    elsewhere = views.replace(folder="/elsewhere")  # which does not count
     for _ in range(2):
-        for other in others:
+        for other in (*others, elsewhere):
             find_model(other, ReconstructConfig(), Store(folder=tmp_path))
     assert len(runs) == len(others)
 
