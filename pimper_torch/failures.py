@@ -153,7 +153,8 @@ def solved_or(
         if not (memory if out_of_memory(error) else by_data(error)):
             raise
         reason = reason_of(error)
-        failure = Failure(stage=stage, what="solver", name=name, reason=reason, done=done)
+        what = "memory" if out_of_memory(error) else "solver"  # which another run may have
+        failure = Failure(stage=stage, what=what, name=name, reason=reason, done=done)
         skipped(failure, error=error)
     return otherwise()
 

@@ -237,9 +237,9 @@ def find_model(
     Returns:
         The model, and the seconds of wall clock in which it was found.
     """
-    known = views.replace(folder="")  # the model is the same from another folder
-    key = f"reconstruct-{digest(code_of(__name__), known, replace(config, threads=0))}"
-    kept = store.find(key, SparseModel) if store else None
+    hashed = digest(code_of(__name__), views, replace(config, threads=0)) if store else None
+    key = f"reconstruct-{hashed}"
+    kept = store.find(key, SparseModel) if store and hashed else None
     if kept is not None:
         for message in kept.about["cautions"]:
             caution(message, stacklevel=2)
@@ -248,7 +248,7 @@ def find_model(
     with overheard() as cautions:
         model = settled(structure_from_motion(views, config))
     seconds = time.perf_counter() - began
-    if store:
+    if store and hashed:
         try:
             store.keep(key, model, {"seconds": seconds, "cautions": cautions})
         except OutputError as error:

@@ -65,6 +65,14 @@ def test_all_that_a_model_depends_on_counts(views, runs, tmp_path):
     assert len(runs) == len(others)
 
 
+def test_photographs_that_ask_for_gradients_are_another_run_every_time(views, runs, tmp_path):
+    tracked = views.replace(images=views.images.clone().requires_grad_())
+    for _ in range(2):
+        find_model(tracked, ReconstructConfig(), Store(folder=tmp_path))
+    assert len(runs) == 2
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_that_cannot_be_written_ends_nothing(views, runs, tmp_path):
     Path(tmp_path / "file").write_text("")
     with pytest.warns(PimperWarning, match="cannot be kept there"):
