@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pimper_torch.coarse.remesh import Remesh
     from pimper_torch.coarse.surface import CoarseSurface
     from pimper_torch.fusion.fuse import Fuse
+    from pimper_torch.io.finish import MeshFiles
     from pimper_torch.io.meshes import read_mesh
     from pimper_torch.io.photographs import load_views
     from pimper_torch.io.results import write_result
@@ -82,6 +83,7 @@ __all__ = [
     "Given",
     "InputError",
     "Mesh",
+    "MeshFiles",
     "OutputError",
     "PatchSet",
     "PatchViews",
@@ -147,6 +149,7 @@ _HOMES = {
     "pimper_torch.coarse.surface": ("CoarseSurface",),
     "pimper_torch.paper.triangulate": ("Triangulate",),
     "pimper_torch.fusion.fuse": ("Fuse",),
+    "pimper_torch.io.finish": ("MeshFiles",),
     "pimper_torch.io.meshes": ("read_mesh",),
     "pimper_torch.io.photographs": ("load_views",),
     "pimper_torch.io.results": ("write_result",),

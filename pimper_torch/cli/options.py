@@ -15,6 +15,7 @@ from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
+from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.photographs import list_images
 from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import prepare_output, require_apart
@@ -34,8 +35,10 @@ class CommonOptions:
         device: Of all after structure from motion; cuda has never been run on a GPU.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         overwrite: Replace a former result in OUT.
-        full_mesh: Write every vertex, also where fewer tell the surface to a twentieth of a
-            sample's spacing and 1.5 degrees.
+        faces: Most that the mesh has, or all; as few as tell the surface unless given.
+        watertight: Close the mesh; caps are marked as not measured.
+        stl: Write the mesh as STL, too.
+        obj: Write the mesh as OBJ, too.
         fresh: Ignore what an earlier run kept.
         cache: Folder that keeps what stages find, for the next run; OUT/.stages unless given.
         max_kept: Size it may reach, such as 2GB.
@@ -46,16 +49,26 @@ class CommonOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     max_size_px: int = 0
     overwrite: Flag = False
-    full_mesh: Flag = False
+    faces: Annotated[int | Literal["all"] | None, tyro.conf.arg(metavar="N")] = None
+    watertight: Flag = False
+    stl: Flag = False
+    obj: Flag = False
     fresh: Flag = False
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     max_kept: str = MAX_KEPT
 
     def __post_init__(self) -> None:
         bytes_of(self.max_kept, "max_kept")
+        _ = self.files  # refused before anything is read
         # The smallest photographs in which depth is searched; see DensifyConfig.
         sound = self.max_size_px == 0 or self.max_size_px >= 32
         require(sound, "max_size_px", self.max_size_px, "0, or 32 pixels at least")
+
+    @property
+    def files(self) -> MeshFiles:
+        """How the surface is written."""
+        formats = (*(("stl",) if self.stl else ()), *(("obj",) if self.obj else ()))
+        return MeshFiles(faces=self.faces, watertight=self.watertight, formats=formats)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,6 +104,9 @@ class Job:
     config: Config
     inputs: InputOptions = field(default_factory=InputOptions)
 
+
+# What few people need: `--help-all` tells of it.
+_RARE = ("--kernels", "--scales", "--max-kept")
 
 # The skull's cranium and face both show in this photograph.
 SKULL = CommonOptions(reference="37")
@@ -142,7 +158,7 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         return Job(photos=bundled_photographs(), out=out, common=common, config=config)
 
     verb = reconstruct if command == "reconstruct" else demo
-    job = read_arguments(verb, command, arguments, levels=True)
+    job = read_arguments(verb, command, arguments, levels=True, rare=_RARE)
     silhouettes = job.config.silhouettes
     if job.inputs.object:
         silhouettes = dataclasses.replace(silhouettes, object=job.inputs.object)

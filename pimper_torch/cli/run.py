@@ -95,7 +95,7 @@ def _write(job: Job, result: Reconstruction) -> None:
         job.out,
         overwrite=job.common.overwrite,
         about=about,
-        full_mesh=job.common.full_mesh,
+        files=job.common.files,
     )
 
 
@@ -109,7 +109,7 @@ def _check_device(device: str) -> None:
 
 def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
     """Say what came out and where it is."""
-    fewer = "" if job.common.full_mesh else " (simplified; --full-mesh writes every vertex)"
+    fewer = " (simplified; --faces all writes every one)" if job.common.faces is None else ""
     output.remark(f"{_costs(result)}\n{headline(result)}")
     if result.scene.doubt:
         output.warning(result.scene.doubt)

@@ -25,9 +25,6 @@ from pimper_torch.sfm.surfaces import simplified
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
 
-# Weight of a mesh's border against its area when vertices are merged. A choice.
-_BORDER_WEIGHT = 10.0
-
 # Pixels of the finest depth maps between a facet and the points of the cloud on it. A choice.
 _ON_FACET_PX = 4.0
 
@@ -90,7 +87,7 @@ class CoarseSurface(Stage):
         reference = reference_view(scene, self.config.reference)
         reliable, count = self.reliable(scene), self.config.num_facets
         if mesh is not None:
-            vertices, faces = _simplified(*oriented_outward(mesh, scene.cameras), count)
+            vertices, faces = _used(*simplified(*oriented_outward(mesh, scene.cameras), count))
             pixel = pixel_size(scene, reliable) if len(reliable) else float("inf")
             support = None
         else:
@@ -102,7 +99,7 @@ class CoarseSurface(Stage):
                     "degrees), and at least 4 are needed. Take more photographs."
                 )
             fine = fine_surface(scene, reliable, contours, self.densify, self.fine)
-            vertices, faces = _simplified(fine.vertices_world, fine.faces, count)
+            vertices, faces = _used(*simplified(fine.vertices_world, fine.faces, count))
             faces = two_faces_an_edge(vertices, faces)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
             kept = supported_components(vertices, faces, whole, min_fraction(contours))
@@ -176,20 +173,6 @@ def _on_facets(
         covariance_world=point_covariances(scene, reliable[near]),
         facet=found.face[near],
     )
-
-
-def _simplified(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], count: int
-) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
-    """Simplify to a number of faces; a mesh with no more than that comes back as it is."""
-    if len(faces) <= count:
-        return vertices, faces
-    # COLMAP works in single precision: a mesh far from the origin is brought there.
-    centre = vertices.median(dim=0).values
-    fewer, left = simplified(
-        vertices - centre, faces, num_faces=count, boundary_weight=_BORDER_WEIGHT
-    )
-    return _used(fewer.to(vertices) + centre, left.to(faces.device))
 
 
 def _used(

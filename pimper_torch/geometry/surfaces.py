@@ -70,3 +70,21 @@ def barycentric_2d(
     beta = (ap[..., 0] * ac[..., 1] - ap[..., 1] * ac[..., 0]) / area
     gamma = (ab[..., 0] * ap[..., 1] - ab[..., 1] * ap[..., 0]) / area
     return torch.stack([1 - beta - gamma, beta, gamma], dim=-1)
+
+
+def barycentric(
+    points: Float[Tensor, "pair 3"], corners: Float[Tensor, "pair 3 3"]
+) -> Float[Tensor, "pair 3"]:
+    """Give barycentric coordinates of the feet of perpendiculars from points to triangles.
+
+    A triangle without area gives all to its first corner.
+    """
+    a, b, c = corners.unbind(dim=1)
+    normal = torch.linalg.cross(b - a, c - a)
+    square = normal.square().sum(dim=1)
+    flat = square == 0
+    square = torch.where(flat, 1, square)
+    beta = (torch.linalg.cross(points - a, c - a) * normal).sum(dim=1) / square
+    gamma = (torch.linalg.cross(b - a, points - a) * normal).sum(dim=1) / square
+    found = torch.stack([1 - beta - gamma, beta, gamma], dim=1)
+    return torch.where(flat[:, None], found.new_tensor([1.0, 0.0, 0.0]), found)

@@ -4,19 +4,20 @@ from collections.abc import Sequence
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
-from pimper_torch.geometry.surfaces import side_lengths, vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
+from pimper_torch.geometry.topology import corners_of
 from pimper_torch.io.mesh_headers import impossible
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.records import Mesh
@@ -37,7 +38,12 @@ _KINDS = {torch.uint8: ("uchar", "u1"), torch.float32: ("float", "<f4")}
 _KINDS |= {torch.float64: ("double", "<f8")}
 
 
-def write_ply(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
+def write_ply(
+    mesh: Mesh,
+    path: Path | str,
+    offset_world: Offset = NO_OFFSET,
+    measured: Bool[Tensor, " face"] | None = None,
+) -> None:
     """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, and what is known of errors.
 
     These are the properties ``confidence`` and ``expected_error``, the latter in scene units.
@@ -48,6 +54,7 @@ def write_ply(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
         mesh: Any.
         path: The file.
         offset_world: Added to the vertices; see ``SparseScene.offset_world``.
+        measured: Written as the faces' property of this name, 0 of those that close a hole.
     """
     path = Path(path)
     columns = dict(zip("xyz", _positions(mesh, offset_world).unbind(dim=1), strict=True))
@@ -66,8 +73,11 @@ def write_ply(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
     )
     for name, values in columns.items():
         vertices[name] = values.detach().cpu().numpy()
-    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    kind = [("count", "u1"), ("corners", "<i4", 3)]
+    faces = np.empty(len(mesh.faces), kind if measured is None else [*kind, ("measured", "u1")])
     faces["count"], faces["corners"] = 3, mesh.faces.cpu().numpy()
+    if measured is not None:
+        faces["measured"] = measured.cpu().numpy()
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -75,6 +85,7 @@ def write_ply(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
         *(f"property {kind} {name}" for name, (kind, _) in zip(columns, kinds, strict=True)),
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
+        *([] if measured is None else ["property uchar measured"]),
         "end_header",
     ]
     with path.open("wb") as file:
@@ -184,7 +195,12 @@ def read_mesh(path: Path | str) -> Mesh:
     return mesh.replace(**dict.fromkeys(broken)) if broken else mesh
 
 
-def write_glb(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
+def write_glb(
+    mesh: Mesh,
+    path: Path | str,
+    offset_world: Offset = NO_OFFSET,
+    measured: Bool[Tensor, " face"] | None = None,
+) -> None:
     """Write a binary glTF of the same frame, normals and colours as the PLY.
 
     glTF has no doubles in its buffers: vertices stay round the origin, and their node's
@@ -199,10 +215,15 @@ def write_glb(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
         mesh: Any.
         path: The file.
         offset_world: Of the node; see ``SparseScene.offset_world``.
+        measured: The attribute ``_MEASURED`` is 0 at vertices of no such face.
     """
     path = Path(path)
     colors = None if mesh.albedo is None else (255 * _colors(mesh)).round().cpu().numpy()
-    scene = trimesh.Scene(_trimesh(mesh, None if colors is None else colors.astype(np.uint8)))
+    shape = _trimesh(mesh, None if colors is None else colors.astype(np.uint8))
+    if measured is not None:
+        known = corners_of(mesh.faces, measured, len(mesh.vertices_world))
+        shape.vertex_attributes["_MEASURED"] = known.cpu().numpy().astype(np.float32)
+    scene = trimesh.Scene(shape)
 
     def postprocess(tree: dict[str, Any]) -> None:
         _make_matte(tree)
@@ -214,6 +235,62 @@ def write_glb(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
             scene, include_normals=True, tree_postprocessor=postprocess
         )
     )
+
+
+def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
+    """Write a binary STL: triangles alone, without vertices that faces share.
+
+    STL has no doubles: far from the origin vertices stay round it, and the header tells the offset.
+
+    Args:
+        mesh: Any.
+        path: The file.
+        offset_world: Told in the file's header; see ``SparseScene.offset_world``.
+    """
+    corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
+    normals = normalize(face_normals(mesh.vertices_world, mesh.faces).detach().cpu(), dim=1)
+    kind = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+    triangles = np.zeros(len(corners), kind)
+    triangles["normal"], triangles["corners"] = normals.numpy(), corners.numpy()
+    header = b"pimper_torch"
+    if offset_world != NO_OFFSET:
+        header = "offset {} {} {}".format(*offset_world).encode("ascii")
+    with Path(path).open("wb") as file:
+        file.write(header.ljust(80)[:80] + np.uint32(len(triangles)).tobytes())
+        triangles.tofile(file)
+
+
+def write_obj(
+    mesh: Mesh,
+    path: Path | str,
+    offset_world: Offset = NO_OFFSET,
+    measured: Bool[Tensor, " face"] | None = None,
+) -> None:
+    """Write an OBJ: vertex normals, and albedo as sRGB colour behind each position.
+
+    Args:
+        mesh: Any.
+        path: The file.
+        offset_world: Added to the vertices; see ``SparseScene.offset_world``.
+        measured: Faces that are not stand in a group ``caps`` of their own.
+    """
+    rows = mesh.vertices_world.detach().cpu().double() + torch.tensor(offset_world).double()
+    if mesh.albedo is not None:
+        rows = torch.cat([rows, srgb_from_linear(_colors(mesh)).cpu().double()], dim=1)
+    kept = torch.ones(len(mesh.faces), dtype=torch.bool) if measured is None else measured.cpu()
+    with Path(path).open("w", encoding="ascii") as file:
+        digits = 9 if offset_world == NO_OFFSET else 15
+        _rows_of("v", f"%.{digits}g " * 3 + "%.6g " * (rows.shape[1] - 3), rows, file)
+        _rows_of("vn", "%.6g %.6g %.6g", _normals(mesh).detach().cpu(), file)
+        for group, chosen in (("measured", kept), ("caps", ~kept)):
+            if bool(chosen.any()):
+                file.write(f"g {group}\n")
+                corners = mesh.faces.cpu()[chosen].repeat_interleave(2, dim=1) + 1
+                _rows_of("f", "%d//%d %d//%d %d//%d", corners, file)
+
+
+def _rows_of(word: str, template: str, rows: Tensor, file: TextIO) -> None:
+    np.savetxt(file, rows.numpy(), fmt=f"{word} {template.rstrip()}")
 
 
 def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401 - untyped

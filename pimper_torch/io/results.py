@@ -11,10 +11,10 @@ from PIL import Image
 from torch import Tensor
 
 from pimper_torch.config import to_yaml
-from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
-from pimper_torch.io.meshes import write_glb, write_ply, written_channels
+from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
+from pimper_torch.io.finish import Finished, MeshFiles, finished
+from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.io.reports import lights_report, summary_report
-from pimper_torch.meshing.simplify import simplify
 from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
@@ -27,6 +27,8 @@ from pimper_torch.viz.overview import draw_overview
 RESULT_NAMES = (
     "mesh.ply",
     "mesh.glb",
+    "mesh.stl",
+    "mesh.obj",
     "sparse",
     "masks",
     "normals.png",
@@ -47,7 +49,7 @@ def write_result(
     *,
     overwrite: bool = False,
     about: Mapping[str, object] | None = None,
-    full_mesh: bool = False,
+    files: MeshFiles | None = None,
 ) -> None:
     """Write everything a run found into a folder.
 
@@ -57,6 +59,8 @@ def write_result(
     `mesh.ply`       vertex normals, albedo as sRGB colour, confidence, expected error
                      in the unit of the vertices; binary
     `mesh.glb`       the same for viewers, albedo linear as glTF wants it
+    `mesh.stl`       if asked for: triangles alone
+    `mesh.obj`       if asked for: normals, albedo as sRGB colour
     `sparse/`        COLMAP model, in the mesh's frame
     `masks/`         the object's silhouette in every photograph as it was undistorted, PNG of its
                      name; none where everything is the object
@@ -75,10 +79,12 @@ def write_result(
     the ``offset_world`` that was added to the frame of the run, zero unless they stand far from
     their origin. The PLY then has doubles, and the GLB the offset as its node's translation.
 
-    The mesh is simplified, unless ``full_mesh``: every vertex of ``result.mesh`` is within a
-    twentieth of a sample's spacing of it, its normal within 1.5 degrees, and its colour, confidence
-    and expected error within :func:`~pimper_torch.io.meshes.written_channels` of what is blended
-    there (``summary.json`` tells how far off they are). The pictures show what is written.
+    The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's
+    spacing of it, its normal within 1.5 degrees, and its colour, confidence and expected error
+    within :func:`~pimper_torch.io.meshes.written_channels` of what is blended there
+    (``summary.json`` tells how far off they are). ``files`` asks for every vertex, or for fewer.
+    The pictures show what is written, but for the caps of a mesh that shall be watertight: those
+    are not measured. Faces of the PLY and the OBJ, and vertices of the GLB, say which they are.
 
     It is there whole or not at all; see :func:`pimper_torch.outputs.folders.written_whole`.
 
@@ -88,7 +94,7 @@ def write_result(
         folder: New or empty; its parents are made.
         overwrite: Replace a former result.
         about: More for ``summary.json``.
-        full_mesh: Write every vertex.
+        files: How many faces the mesh has, and in which formats.
 
     Raises:
         OutputError: The folder holds something else, or cannot be written.
@@ -96,31 +102,33 @@ def write_result(
     folder = Path(folder)
     with written_whole(folder, "result", overwrite=overwrite) as staging:
         whole = result.to("cpu")
-        summary = summary_report(whole, about or {})
-        if not full_mesh:
-            with part(0, _PARTS):
-                found = simplify(whole.mesh, values=written_channels(whole.mesh))
-            whole = whole.replace(mesh=found.mesh)
-            summary["simplified"] = {
-                "vertices": len(found.mesh.vertices_world),
-                "faces": len(found.mesh.faces),
-                "spacing": found.spacing,
-                "max_spacings": found.max_spacings,
-                "max_angle_deg": found.max_angle_deg,
-            }
+        with part(0, _PARTS):
+            ready = finished(whole.mesh, files or MeshFiles())
+        summary = {**summary_report(whole, about or {}), **ready.summary}
+        whole = whole.replace(mesh=ready.mesh)
+        with part(1, _PARTS):
+            _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
         _write_all(whole, config, staging, summary)
+
+
+def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Path) -> None:
+    mesh, measured = ready.mesh, None
+    if ready.closed is not None:
+        mesh, measured = ready.closed.mesh, ready.closed.measured
+    write_ply(mesh, folder / "mesh.ply", offset, measured)
+    write_glb(mesh, folder / "mesh.glb", offset, measured)
+    if "stl" in files.formats:
+        write_stl(mesh, folder / "mesh.stl", offset)
+    if "obj" in files.formats:
+        write_obj(mesh, folder / "mesh.obj", offset, measured)
 
 
 def _write_all(
     result: Reconstruction, config: object, folder: Path, summary: Mapping[str, object]
 ) -> None:
-    with part(1, _PARTS):
-        offset = result.scene.offset_world
-        write_ply(result.mesh, folder / "mesh.ply", offset)
-        write_glb(result.mesh, folder / "mesh.glb", offset)
-        write_model(result.scene, folder / "sparse")
-        if result.silhouettes.source != "everything":
-            _write_masks(result.silhouettes, result.scene, folder / "masks")
+    write_model(result.scene, folder / "sparse")
+    if result.silhouettes.source != "everything":
+        _write_masks(result.silhouettes, result.scene, folder / "masks")
     with part(2, _PARTS):
         _write_maps(result, folder)
     _write_json(lights_report(result), folder / "lights.json")

@@ -15,9 +15,6 @@ from pimper_torch.records import Mesh, Record
 # depend on the number of threads. Vertices between slices come last.
 _SLICES = 4
 
-# Bounds are doubled so often at most: from a twentieth of a median edge to 25. A choice.
-_DOUBLINGS = 10
-
 # Edges of which the median is taken: it is certain to a few thousandths.
 _EDGES = 100_000
 
@@ -146,22 +143,6 @@ def simplify(
         max_spacings=float(off[:, 0].max()) / spacing,
         max_angle_deg=float(np.degrees(np.arccos(min(1.0, float(off[:, 1].min()))))),
     )
-
-
-def with_few_faces(mesh: Mesh, max_faces: int) -> Mesh:
-    """Simplify a mesh for pictures until it has few faces, as faithfully as that allows.
-
-    Args:
-        mesh: Any; one that is small enough comes back as it is.
-        max_faces: Of the result, about: borders stay, however many faces they have.
-    """
-    bounds = FAITHFUL
-    for _ in range(_DOUBLINGS):
-        if len(mesh.faces) <= max_faces:
-            break
-        mesh = simplify(mesh, bounds).mesh
-        bounds = Bounds(spacings=2 * bounds.spacings, angle_deg=2 * bounds.angle_deg)
-    return mesh
 
 
 def _taken(mesh: Mesh, kept: Int[Tensor, " kept"], faces: Int[Tensor, "face 3"]) -> Mesh:

@@ -18,6 +18,9 @@ from pimper_torch.sfm.exchange import read_faces, write_cloud, write_faces
 # for: a call with less would change the surfaces of all calls after it.
 _DENSE_DEPTH = 5
 
+# Weight of a mesh's border against its area when vertices are merged. A choice.
+_BORDER_WEIGHT = 10.0
+
 
 def poisson_surface(
     points: Float[Tensor, "point 3"],
@@ -59,17 +62,16 @@ def poisson_surface(
 def simplified(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
-    *,
     num_faces: int,
-    boundary_weight: float,
 ) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
     """Merge vertices of a mesh where that changes its planes least, until few faces are left.
 
+    Borders count ten times as much as the surface. A mesh with no more faces comes back as it is.
+
     Args:
         vertices: Any unit.
-        faces: More than ``num_faces``.
+        faces: Of the mesh.
         num_faces: About so many are left.
-        boundary_weight: How much more rims count than the surface.
 
     Raises:
         ReconstructionError: COLMAP cannot simplify the mesh.
@@ -77,16 +79,20 @@ def simplified(
     Source: Garland & Heckbert, Surface simplification using quadric error metrics,
     SIGGRAPH 1997.
     """
+    if len(faces) <= num_faces:
+        return vertices, faces
     pycolmap = loaded()
-
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio = num_faces / max(1, len(faces))
-    options.boundary_weight, options.num_threads = boundary_weight, 1
+    options.boundary_weight, options.num_threads = _BORDER_WEIGHT, 1
     options.interpolate_colors = False
     with tempfile.TemporaryDirectory() as folder:
         before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
-        write_faces(vertices, faces, before)
-        return _made(after, "simplification", pycolmap.simplify_mesh, before, after, options)
+        # COLMAP works in single precision: a mesh far from the origin is brought there.
+        centre = vertices.median(dim=0).values
+        write_faces(vertices - centre, faces, before)
+        fewer, left = _made(after, "simplification", pycolmap.simplify_mesh, before, after, options)
+        return fewer.to(vertices) + centre, left.to(faces)
 
 
 def _made(
@@ -102,6 +108,6 @@ def _made(
         return read_faces(path)
     except (ValueError, RuntimeError, OSError) as error:
         raise ReconstructionError(
-            f"coarse mesh: COLMAP's {what} made no mesh ({error}). Take more photographs of "
+            f"surface: COLMAP's {what} made no mesh ({error}). Take more photographs of "
             "textured surface, or bring a mesh of your own."
         ) from error

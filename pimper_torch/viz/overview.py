@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.geometry.projection import project
-from pimper_torch.meshing.simplify import with_few_faces
+from pimper_torch.meshing.reduce import reduced
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
@@ -155,7 +155,7 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     """Make the pictures of the contact sheet."""
     reference = result.coarse.reference
     own = result.cameras.take([reference])
-    shape = with_few_faces(result.mesh, _MAX_FACES)
+    shape = reduced(result.mesh, _MAX_FACES)
     vertices = result.mesh.vertices_world
     camera = frame(own, vertices, panel_px, _MARGIN)
     name = result.scene.views.names[reference]

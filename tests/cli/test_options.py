@@ -23,15 +23,15 @@ from pimper_torch.store import Store
 RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
-        "--full-mesh --max-memory 20GB --scales (0.5,) --kernels torch --on-failure fail "
+        "--faces all --max-memory 20GB --scales (0.5,) --kernels torch --on-failure fail "
         "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
-        "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0)"
+        "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj"
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
-        "--overwrite --full-mesh --fresh --cache {out}_kept --max-kept 1.5GB --kernels numba "
-        "--max-memory 20GB --on-failure skip",
+        "--overwrite --faces 500 --watertight --stl --obj --fresh --cache {out}_kept "
+        "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip",
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "

@@ -130,7 +130,7 @@ def test_poisson_puts_a_ball_through_points_of_a_ball_and_simplification_keeps_i
     vertices, _ = icosphere(4)
     found, faces = poisson_surface(vertices, vertices, depth=6, point_weight=1.0)
     assert (found.norm(dim=1) - 1).abs().max() < 0.02
-    few, left = simplified(found, faces, num_faces=200, boundary_weight=10.0)
+    few, left = simplified(found, faces, num_faces=200)
     assert 150 <= len(left) <= 200
     assert (few.norm(dim=1) - 1).abs().max() < 0.06
     a, b, c = few[left].unbind(dim=1)

@@ -17,6 +17,7 @@ from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of, read_estimate
+from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply, written_channels
 from pimper_torch.io.reports import common_lights, lights_report, summary_report, world_lights
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -40,6 +41,9 @@ def small_pictures(monkeypatch):
     monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
 
 
+ASKED_FOR = {"masks", "mesh.stl", "mesh.obj"}  # in vain
+
+
 def names(folder: Path):
     return sorted(path.name for path in folder.iterdir())
 
@@ -51,7 +55,7 @@ def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
     assert heard == sorted(heard)  # one bar, filled once
     assert 0 < heard[0] < heard[-1] == 1
     out = tmp_path / "deep" / "out"
-    assert names(out) == sorted({*RESULT_NAMES, MARKER} - {"masks"})
+    assert names(out) == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
     assert names(tmp_path / "deep") == ["out"]
     assert yaml.safe_load((out / "config.yaml").read_text()) == {"zeta": 0.5}
     summary = json.loads((out / "summary.json").read_text())
@@ -285,7 +289,7 @@ def test_an_empty_folder_is_filled(reconstruction, tmp_path):
     (tmp_path / "out").mkdir()
     prepare_output(tmp_path / "out", "result")
     write_result(reconstruction, Config(), tmp_path / "out")
-    assert names(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - {"masks"})
+    assert names(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
 
 
 def test_preparing_leaves_no_trace(tmp_path):
@@ -358,7 +362,7 @@ def test_the_written_mesh_is_simplified_and_the_summary_says_how_far(reconstruct
     )
     result = reconstruction.replace(mesh=ball)
     write_result(result, Config(), tmp_path / "few")
-    write_result(result, Config(), tmp_path / "all", full_mesh=True)
+    write_result(result, Config(), tmp_path / "all", files=MeshFiles(faces="all"))
     summaries = [
         json.loads((tmp_path / name / "summary.json").read_text()) for name in ("few", "all")
     ]
@@ -396,7 +400,7 @@ def test_a_result_far_from_the_origin_is_written_in_the_frame_of_its_cameras(
     shift = torch.tensor(offset, dtype=torch.float64)
     far = reconstruction.replace(scene=reconstruction.scene.replace(offset_world=offset))
     for name, result in (("near", reconstruction), ("far", far)):
-        write_result(result, Config(), tmp_path / name, full_mesh=True)
+        write_result(result, Config(), tmp_path / name, files=MeshFiles(faces="all"))
     near, placed = read_estimate(tmp_path / "near"), read_estimate(tmp_path / "far")
     vertices = near.mesh.vertices_world
     assert_close(placed.mesh.vertices_world, vertices + shift, rtol=0, atol=2e-7)

@@ -6,7 +6,7 @@ from torch.testing import assert_close
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.meshing.simplify import Bounds, simplify, with_few_faces
+from pimper_torch.meshing.simplify import Bounds, simplify
 from pimper_torch.records import Mesh
 
 
@@ -142,15 +142,6 @@ def test_the_values_of_what_is_kept_carry_gradients():
     found = simplify(mesh.replace(vertices_world=vertices))
     found.mesh.vertices_world.sum().backward()
     assert set(vertices.grad.sum(dim=1).tolist()) == {0.0, 3.0}
-
-
-def test_a_mesh_for_pictures_has_few_faces():
-    vertices, faces = icosphere(5)
-    mesh = Mesh(vertices_world=vertices.double(), faces=faces)
-    few = with_few_faces(mesh, 500)
-    assert 20 < len(few.faces) <= 500
-    assert (few.vertices_world.norm(dim=1) - 1).abs().max() < 1e-6
-    assert with_few_faces(mesh, len(faces)) is mesh
 
 
 def test_meshes_that_nothing_can_be_taken_from_come_back():

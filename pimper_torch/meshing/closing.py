@@ -1,0 +1,156 @@
+"""Closing: every hole of a surface, and every outer border, gets a cap."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.topology import face_counts, face_edges, half_edges, vertex_fans
+from pimper_torch.linalg.systems import solutions
+from pimper_torch.meshing.groups import diagonal
+from pimper_torch.records import Mesh, Record
+
+# A ring so small gets a centre.
+_SMALLEST_RING = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Closed(Record):
+    """A mesh without borders.
+
+    Attributes:
+        mesh: The former faces first, in their order.
+        measured: Faces that were there; the others are caps.
+        borders: How many were closed.
+    """
+
+    mesh: Mesh
+    measured: Bool[Tensor, " face"]
+    borders: int
+
+
+def closed(mesh: Mesh) -> Closed:
+    """Close every border of a mesh by a membrane, as a soap film would.
+
+    What was there stays as it is, but that the mesh is made a manifold first: where fans of
+    faces meet in a vertex only, each gets its own copy. A cap is a disk of rings, each with half
+    the vertices of the one round it, so that it is as fine as its border outside and coarse
+    inside. It says where the surface ends, not where the object is: its vertices have no
+    confidence, the mesh's extent as expected error, and the albedo of the border continued. Caps
+    of deep or twisted borders may cross the surface or themselves.
+
+    Positions and albedo of caps are differentiable in those of the borders.
+
+    Args:
+        mesh: With faces, facing outwards.
+
+    Raises:
+        InputError: Faces on two sides of an edge face opposite ways.
+    """
+    source, faces = vertex_fans(mesh.faces)
+    count = len(source)
+    cycles = border_cycles(faces)
+    caps = [faces.new_zeros(0, 3)]
+    for cycle in cycles:
+        cap = _disk(cycle, count)
+        count = max(count, int(cap.max()) + 1)
+        caps.append(cap.to(faces))
+    added = torch.cat(caps)
+    fresh = count - len(source)
+
+    extent = float(diagonal(mesh.vertices_world.detach()))
+
+    def continued(values: Tensor | None, filler: float) -> Tensor | None:
+        if values is None:
+            return None
+        return torch.cat([values[source], values.new_full((fresh, *values.shape[1:]), filler)])
+
+    film = mesh.vertices_world[source]
+    if mesh.albedo is not None:
+        film = torch.cat([film, mesh.albedo[source].to(film)], dim=1)
+    film = _stretched(film, added, count) if fresh else film
+    vertices, everything = film[:, :3], torch.cat([faces, added])
+    normals = mesh.normals_world
+    if normals is not None:
+        normals = torch.cat([normals[source], vertex_normals(vertices, everything)[len(source) :]])
+    whole = Mesh(
+        vertices_world=vertices,
+        faces=everything,
+        normals_world=normals,
+        albedo=None if mesh.albedo is None else film[:, 3:].to(mesh.albedo),
+        confidence=continued(mesh.confidence, 0.0),
+        expected_error=continued(mesh.expected_error, extent),
+    )
+    measured = torch.arange(len(everything), device=faces.device) < len(faces)
+    return Closed(mesh=whole, measured=measured, borders=len(cycles))
+
+
+def border_cycles(faces: Int[Tensor, "face 3"]) -> list[list[int]]:
+    """Order the border of an oriented manifold: every one a cycle, its faces on the right.
+
+    A face on the other side of an edge runs the way of the cycle.
+
+    Raises:
+        InputError: Faces on two sides of an edge face opposite ways.
+    """
+    _, index = face_edges(faces)
+    alone = (face_counts(index) == 1)[index].flatten()
+    ends = half_edges(faces)[alone]
+    first = ends[:, 1].tolist()
+    following = dict(zip(first, ends[:, 0].tolist(), strict=True))
+    if len(following) < len(first) or len(set(following.values())) < len(first):
+        raise InputError(
+            "faces next to each other face opposite ways, so that nothing tells outside from "
+            "inside; needed: faces that all have their corners counter-clockwise from outside."
+        )
+    cycles, left = [], dict(following)
+    for start in first:
+        cycle = []
+        while start in left:
+            cycle.append(start)
+            start = left.pop(start)
+        if cycle:
+            cycles.append(cycle)
+    return cycles
+
+
+def _disk(cycle: list[int], first: int) -> Int[Tensor, "face 3"]:
+    """Triangulate a disk in rings; its inner vertices are numbered from ``first``."""
+    if len(cycle) == 3:
+        return torch.tensor([cycle])
+    outer, triangles = torch.tensor(cycle), []
+    while len(outer) > _SMALLEST_RING:
+        inner = torch.arange(first, first + math.ceil(len(outer) / 2))
+        first += len(inner)
+        start, after = outer, outer.roll(-1)
+        over = inner[torch.arange(len(outer)) // 2]  # each inner vertex is below two edges
+        triangles.append(torch.stack([start, after, over], dim=1))
+        ahead = torch.cat([outer[2::2], outer[:1]])
+        triangles.append(torch.stack([ahead, inner.roll(-1), inner], dim=1))
+        outer = inner
+    centre = torch.full_like(outer, first)
+    triangles.append(torch.stack([outer, outer.roll(-1), centre], dim=1))
+    return torch.cat(triangles)
+
+
+def _stretched(
+    values: Float[Tensor, "known channel"], faces: Int[Tensor, "face 3"], count: int
+) -> Float[Tensor, "vertex channel"]:
+    """Add vertices that have the mean of their neighbours' values each."""
+    edges, _ = face_edges(faces)
+    links = torch.cat([edges, edges.flip(1)])
+    here, there = links[links[:, 0] >= len(values)].unbind(dim=1)
+    here, known, size = here - len(values), there < len(values), count - len(values)
+    side = values.new_zeros(size, values.shape[1]).double()
+    side = side.index_add(0, here[known], values.double()[there[known]])
+    degree = torch.bincount(here, minlength=size).to(side)
+    every = torch.arange(size, device=here.device)
+    rows = torch.cat([every, here[~known]])
+    columns = torch.cat([every, there[~known] - len(values)])
+    entries = torch.cat([degree, -torch.ones_like(degree[here[~known]])])
+    (found,) = solutions(rows, columns, entries, side, what="the closing")
+    return torch.cat([values, found.to(values)])

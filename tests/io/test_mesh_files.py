@@ -1,0 +1,107 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.io import results
+from pimper_torch.io.finish import MeshFiles
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.io.results import write_result
+from pimper_torch.radiometry import Encoding
+from pimper_torch.records import Mesh
+from pimper_torch.viz.maps import albedo_scale
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    draw = results.draw_overview
+    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+
+
+def half_ball() -> Mesh:
+    vertices, faces = icosphere(4)
+    kept = faces[(vertices[faces][..., 2] > 0).all(dim=1)]
+    used, kept = torch.unique(kept, return_inverse=True)
+    vertices = vertices[used].float()
+    return Mesh(
+        vertices_world=vertices,
+        faces=kept,
+        normals_world=vertices,
+        albedo=0.5 + 0.4 * vertices[:, :1],
+        confidence=torch.ones(len(vertices)),
+        expected_error=torch.full((len(vertices),), 0.01),
+    )
+
+
+def test_a_watertight_mesh_says_which_of_it_was_not_measured(reconstruction, tmp_path):
+    files = MeshFiles(faces=1000, watertight=True, formats=("stl", "obj"))
+    mesh = half_ball()
+    write_result(reconstruction.replace(mesh=mesh), Encoding(), tmp_path / "out", files=files)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    ply = trimesh.load(tmp_path / "out" / "mesh.ply", process=False)
+    assert ply.is_watertight
+    assert 950 <= len(ply.faces) <= 1000
+    measured = ply.metadata["_ply_raw"]["face"]["data"]["measured"].astype(bool)
+    assert (~measured).sum() == summary["caps"]["faces"]
+    assert measured.sum() == summary["reduced"]["faces"]
+    assert summary["caps"]["borders"] == 1
+    # A disk below a half ball: a third of the whole.
+    assert summary["caps"]["area_fraction"] == pytest.approx(1 / 3, abs=0.03)
+    assert ply.volume == pytest.approx(2 / 3 * torch.pi, rel=0.1)
+    known = np.zeros(len(ply.vertices), bool)
+    known[ply.faces[measured]] = True
+    whole = read_mesh(tmp_path / "out" / "mesh.ply")
+    assert np.array_equal(whole.confidence.numpy() == 0, ~known)
+    glb = trimesh.load_scene(tmp_path / "out" / "mesh.glb", process=False)
+    (shape,) = glb.geometry.values()
+    assert np.array_equal(np.ravel(shape.vertex_attributes["_MEASURED"]) > 0, known)
+    obj = (tmp_path / "out" / "mesh.obj").read_text().splitlines()
+    at = obj.index("g caps")
+    assert sum(line.startswith("f ") for line in obj[at:]) == summary["caps"]["faces"]
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj"])
+def test_meshes_are_written_as_other_programs_read_them(reconstruction, tmp_path, suffix):
+    files = MeshFiles(faces="all", formats=(suffix,))
+    mesh = half_ball()
+    write_result(reconstruction.replace(mesh=mesh), Encoding(), tmp_path / "out", files=files)
+    assert not (tmp_path / "out" / f"mesh.{({'stl', 'obj'} - {suffix}).pop()}").exists()
+    found = read_mesh(tmp_path / "out" / f"mesh.{suffix}")
+    corners = found.vertices_world[found.faces]
+    assert_close(corners, mesh.vertices_world[mesh.faces].double(), atol=1e-7, rtol=0)
+    if suffix == "obj":
+        scaled = (mesh.albedo * albedo_scale(mesh)).clamp(0, 1).double().expand(-1, 3)
+        assert_close(found.albedo, scaled, atol=0.005, rtol=0)
+        assert_close(found.normals_world, mesh.normals_world.double(), atol=1e-5, rtol=0)
+    loaded = trimesh.load(tmp_path / "out" / f"mesh.{suffix}", process=False)
+    assert bool((loaded.face_normals[:, 2] > -0.01).all())
+
+
+def test_far_from_the_origin_an_obj_stands_there_and_an_stl_tells_the_offset(
+    reconstruction, tmp_path
+):
+    offset = (448231.0, 5411923.0, 312.0)
+    far = reconstruction.scene.replace(offset_world=offset)
+    files = MeshFiles(faces="all", formats=("stl", "obj"))
+    write_result(
+        reconstruction.replace(mesh=half_ball(), scene=far),
+        Encoding(),
+        tmp_path / "out",
+        files=files,
+    )
+    shift = torch.tensor(offset).double()
+    vertices = half_ball().vertices_world
+    obj = read_mesh(tmp_path / "out" / "mesh.obj").vertices_world
+    assert_close(obj - shift, vertices.double(), atol=1e-5, rtol=0)
+    header = (tmp_path / "out" / "mesh.stl").read_bytes()[:80]
+    assert header.rstrip() == b"offset 448231.0 5411923.0 312.0"
+
+
+def test_fewer_faces_than_a_tetrahedron_has_are_refused():
+    with pytest.raises(ConfigError, match="faces is 3; needed: all, or 4 at least"):
+        MeshFiles(faces=3)

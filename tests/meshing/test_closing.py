@@ -1,0 +1,130 @@
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.geometry.topology import face_components
+from pimper_torch.meshing.closing import border_cycles, closed
+from pimper_torch.records import Mesh
+
+
+def ball(*, above: float, level: int = 4) -> Mesh:
+    """Give a ball whose part above a height, and below its negative, is missing."""
+    vertices, faces = icosphere(level)
+    vertices = vertices.double()
+    left = (vertices[faces].mean(dim=1)[:, 2].abs() < above).nonzero()[:, 0]
+    used, faces = torch.unique(faces[left], return_inverse=True)
+    vertices = vertices[used]
+    return Mesh(
+        vertices_world=vertices,
+        faces=faces,
+        normals_world=vertices,
+        albedo=torch.full((len(vertices), 3), 0.4).double(),
+        confidence=torch.ones(len(vertices)).double(),
+        expected_error=torch.full((len(vertices),), 0.01).double(),
+    )
+
+
+def solid(mesh: Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices_world.numpy(), mesh.faces.numpy(), process=False)
+
+
+def test_a_ball_without_its_poles_gets_two_flat_caps():
+    mesh = ball(above=0.7)
+    found = closed(mesh)
+    whole = solid(found.mesh)
+    assert whole.is_watertight
+    assert whole.is_winding_consistent
+    assert found.borders == 2
+    # A ball's slice between planes at 0.7 has the volume 2 pi (h - h^3 / 3), borders are ragged.
+    assert whole.volume == pytest.approx(2 * torch.pi * (0.7 - 0.7**3 / 3), rel=0.03)
+    caps = found.mesh.faces[~found.measured]
+    assert_close(
+        found.mesh.vertices_world[caps][..., 2].abs(),
+        torch.full((len(caps), 3), 0.7).double(),
+        atol=0.07,
+        rtol=0,
+    )
+    assert bool(((found.mesh.normals_world[len(mesh.vertices_world) :, 2]).abs() > 0.9).all())
+
+
+def test_what_was_measured_stays_and_caps_say_that_they_are_not():
+    mesh = ball(above=0.7)
+    found = closed(mesh)
+    count = len(mesh.vertices_world)
+    assert torch.equal(found.mesh.faces[found.measured], mesh.faces)
+    for name in ("vertices_world", "normals_world", "albedo", "confidence", "expected_error"):
+        assert torch.equal(getattr(found.mesh, name)[:count], getattr(mesh, name)), name
+    assert bool((found.mesh.confidence[count:] == 0).all())
+    extent = (mesh.vertices_world.amax(dim=0) - mesh.vertices_world.amin(dim=0)).norm()
+    assert_close(
+        found.mesh.expected_error[count:], extent.expand(len(found.mesh.confidence) - count)
+    )
+    assert_close(found.mesh.albedo[count:], torch.full_like(found.mesh.albedo[count:], 0.4))
+
+
+def test_a_closed_mesh_comes_back():
+    vertices, faces = icosphere(2)
+    found = closed(Mesh(vertices_world=vertices, faces=faces))
+    assert found.borders == 0
+    assert torch.equal(found.mesh.vertices_world, vertices)
+    assert torch.equal(found.mesh.faces, faces)
+
+
+@pytest.mark.parametrize("missing", [1, 2, 3, 7])
+def test_holes_of_few_faces_are_closed(missing):
+    vertices, faces = icosphere(2)
+    found = closed(Mesh(vertices_world=vertices, faces=faces[missing:]))
+    assert solid(found.mesh).is_watertight
+    assert solid(found.mesh).is_winding_consistent
+
+
+def test_holes_that_meet_in_a_vertex_and_pieces_are_closed_one_by_one():
+    vertices, faces = icosphere(2)
+    fan = (faces == 20).any(dim=1).nonzero()[:, 0].tolist()
+    others = {index: {*faces[index].tolist()} - {20} for index in fan}
+    opposite = next(index for index in fan if not others[index] & others[fan[0]])
+    keep = torch.ones(len(faces), dtype=torch.bool)
+    keep[[fan[0], opposite]] = False
+    two = torch.cat([faces[keep], faces[keep] + len(vertices)])
+    both = torch.cat([vertices, vertices + 5])
+    found = closed(Mesh(vertices_world=both, faces=two))
+    assert solid(found.mesh).is_watertight
+    assert len(face_components(found.mesh.faces).unique()) == 2
+    assert found.borders == 2  # holes that meet are one
+
+
+def test_a_strip_that_is_twisted_once_has_no_inside():
+    count = 12
+    turn = torch.arange(count)
+    upper, lower = turn, turn + count
+    following, below = (turn + 1) % count, (turn + 1) % count + count
+    following[-1], below[-1] = count, 0
+    faces = torch.cat(
+        [
+            torch.stack([upper, lower, following], dim=1),
+            torch.stack([following, lower, below], dim=1),
+        ]
+    )
+    with pytest.raises(InputError, match="opposite ways"):
+        closed(Mesh(vertices_world=torch.rand(2 * count, 3), faces=faces))
+
+
+def test_a_border_runs_against_the_faces_on_it():
+    (cycle,) = border_cycles(torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    start = cycle.index(0)
+    assert cycle[start:] + cycle[:start] == [0, 3, 2, 1]
+
+
+def test_caps_follow_their_border_to_autograd():
+    mesh = ball(above=0.5, level=2)
+    vertices = mesh.vertices_world.clone().requires_grad_()
+    found = closed(mesh.replace(vertices_world=vertices))
+    # Where the border is moved, its cap goes along.
+    found.mesh.vertices_world[len(vertices) :].sum().backward()
+    borders = torch.cat([torch.tensor(cycle) for cycle in border_cycles(mesh.faces)])
+    assert set(vertices.grad.abs().sum(dim=1).nonzero()[:, 0].tolist()) == set(borders.tolist())
+    fresh = len(found.mesh.vertices_world) - len(vertices)
+    assert_close(vertices.grad.sum(dim=0), torch.full((3,), float(fresh)).double())
