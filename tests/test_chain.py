@@ -216,7 +216,7 @@ def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene) -> ViewCo
 
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")  # lit in too few views
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
     """With the coarse surface's own details for small photographs."""
     scene = ball.photographed(ball.all_round())

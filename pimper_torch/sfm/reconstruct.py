@@ -33,6 +33,7 @@ from pimper_torch.sfm.quarter_turns import turned_views
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
 from pimper_torch.sfm.scene import assemble_scene
+from pimper_torch.sfm.upright import upright
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store, digest, opened, settled
@@ -171,8 +172,9 @@ class Reconstruct(Stage):
     The photographs are written as 8-bit sRGB files to a temporary folder, where COLMAP
     finds SIFT features on the CPU, matches every pair and grows a model. Its points are then
     found again in all views by aligning patches, and everything is adjusted to that, see
-    :func:`~pimper_torch.sfm.refine_tracks.refine_tracks`. The world frame and its scale are
-    whatever the model comes in.
+    :func:`~pimper_torch.sfm.refine_tracks.refine_tracks`. In the world frame y is up, see
+    :func:`~pimper_torch.sfm.upright.upright`; its scale is arbitrary. A model that is given keeps
+    its own.
 
     A constant to autograd.
 
@@ -295,9 +297,10 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     if reason:
         caution(reason, stacklevel=3)
     model = with_background(model, found, names)
-    if not any(turns):
-        return model
-    return follow_pictures(model, views.take(numbers), [turns[number] for number in numbers])
+    if any(turns):
+        turned = [turns[number] for number in numbers]
+        model = follow_pictures(model, views.take(numbers), turned)
+    return upright(model)
 
 
 def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> SparseModel:

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.supporting_plane import Fixation, Plane, well_tracked
 from pimper_torch.records import Cameras, Record, SparseScene
-from pimper_torch.silhouettes.supporting_plane import Fixation, Plane, well_tracked
 
 _CLEAR = 1.5  # tolerances above the plane: nearer points may lie on it
 _NEAR = 0.6  # of the cameras' distance: an object that fills photographs of 60 degrees

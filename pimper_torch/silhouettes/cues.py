@@ -7,6 +7,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.geometry.supporting_plane import (
+    Fixation,
+    Plane,
+    fixation,
+    supporting_plane,
+    well_tracked,
+)
 from pimper_torch.records import Record, SparseScene
 from pimper_torch.silhouettes.cloud import pixels_of, pixels_seen, split_cloud
 from pimper_torch.silhouettes.opencv import convex_hull_of
@@ -14,13 +21,6 @@ from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
 from pimper_torch.silhouettes.pictures import Pictures, of_views, working_pictures
 from pimper_torch.silhouettes.seeds import MIN_POINTS
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
-from pimper_torch.silhouettes.supporting_plane import (
-    Fixation,
-    Plane,
-    fixation,
-    supporting_plane,
-    well_tracked,
-)
 
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
 
@@ -107,16 +107,11 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
     scene = scene.to("cpu", torch.float32)
     pictures = working_pictures(scene.views, scene.cameras, config.size_px)
     cameras, points = pictures.cameras, scene.points_world
-    focus = fixation(cameras)
-    tolerance = details.plane_tolerance * float(focus.distance)
-    plane = supporting_plane(
-        points[well_tracked(scene)],
-        cameras,
-        tolerance=tolerance,
-        min_on=details.min_on_plane,
-        max_below=details.max_below_plane,
-        generator=torch.Generator().manual_seed(details.seed),
-    )
+    focus = fixation(cameras.cam_from_world)
+    distance = float(focus.distance)
+    tracked = points[well_tracked(scene)]
+    plane = supporting_plane(tracked, cameras.centers_world, distance, details.plane)
+    tolerance = details.plane.tolerance * distance
     region = None
     if config.region:
         corners = torch.tensor(config.region, dtype=torch.float64).reshape(2, 3)

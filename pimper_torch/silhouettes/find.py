@@ -70,7 +70,7 @@ class FindSilhouettes(Stage):
         """Give the upper side of the supporting plane, as thick as its points are rough."""
         if cues.plane is None:
             return None
-        thickness = self.details.plane_tolerance * cues.fixation.distance
+        thickness = self.details.plane.tolerance * cues.fixation.distance
         height = cues.plane.offset + thickness
         return torch.cat([cues.plane.normal_world, -height.reshape(1)])
 

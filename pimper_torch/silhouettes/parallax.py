@@ -15,11 +15,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.supporting_plane import Fixation, Plane
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record
 from pimper_torch.silhouettes.opencv import warped, window_means
 from pimper_torch.silhouettes.pictures import Pictures, of_views
-from pimper_torch.silhouettes.supporting_plane import Fixation, Plane
 
 # Fractions of the pictures' longer side.
 _WINDOW = 1 / 80  # windows that are compared: 9 px of 640

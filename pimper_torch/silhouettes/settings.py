@@ -1,9 +1,10 @@
 """Settings of finding and correcting silhouettes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.geometry.supporting_plane import PlaneSearch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,10 +44,7 @@ class SilhouetteDetails:
         iterations: Of cutting and voting after the first cut.
         num_voxels: Of the visual hull.
         disagreeing: Fraction of the views that may see a voxel of the hull outside.
-        plane_tolerance: Distance up to which a point lies on the supporting plane, as a fraction of
-            the cameras' distance.
-        min_on_plane: Fraction of the points that lie on it.
-        max_below_plane: Fraction of the points that may lie below it.
+        plane: What counts as the supporting plane.
         min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
             view is not reliable.
         max_exposed: Fraction of a view's silhouette that may show a background for certain: the
@@ -56,17 +54,13 @@ class SilhouetteDetails:
             hold 0.948 and more, masks 20 px too narrow 0.50 to 0.80 (mug, potatoes).
         min_overlap: Intersection over union of silhouettes and projections, in the median, below
             which silhouettes are not reliable.
-        seed: Of the plane's trials.
     """
 
     iterations: int = 2
     num_voxels: int = 500_000
     disagreeing: float = 0.05
-    plane_tolerance: float = 0.004
-    min_on_plane: float = 0.08
-    max_below_plane: float = 0.05
+    plane: PlaneSearch = field(default_factory=PlaneSearch)
     min_covered: float = 0.9
     max_exposed: float = 0.01
     min_held: float = 0.9
     min_overlap: float = 0.8
-    seed: int = 0

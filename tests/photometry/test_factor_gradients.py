@@ -154,5 +154,5 @@ def test_threads_do_not_disturb_one_another(noisy):
 
     alone = slope(None)
     with ThreadPoolExecutor(4) as pool:
-        for other in pool.map(slope, range(60)):
+        for other in pool.map(slope, range(16)):
             assert_close(other, alone)

@@ -87,6 +87,7 @@ def test_a_similarity_of_the_world_moves_the_surface_along(preset, scene, usual)
     assert apart(back, usual.vertices_world) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_a_world_twice_as_large_gives_the_same_bits_twice_as_large(preset, scene, usual):
     """Scaling by two rounds nothing: whatever differs comes of a length that is a constant."""
     nowhere = torch.zeros(3, dtype=torch.float64)
@@ -95,6 +96,7 @@ def test_a_world_twice_as_large_gives_the_same_bits_twice_as_large(preset, scene
     assert torch.equal(found.faces, usual.faces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.5, 1.2])
 def test_brighter_photographs_give_the_same_surface_and_a_brighter_light(
     preset, scene, usual, gain

@@ -1,10 +1,10 @@
 import pytest
 import torch
-from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.supporting_plane import Plane, fixation
 from pimper_torch.records import Silhouettes, Views
 from pimper_torch.silhouettes import find
 from pimper_torch.silhouettes.cuts import Cuts, cuts_of
@@ -13,7 +13,6 @@ from pimper_torch.silhouettes.opencv import signed_distance
 from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
 from pimper_torch.silhouettes.pictures import working_pictures
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
-from pimper_torch.silhouettes.supporting_plane import Plane, fixation, supporting_plane
 
 SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
 
@@ -162,7 +161,7 @@ def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
     images = torch.where(hidden[:, None], other, views.images)
     pictures = working_pictures(views.replace(images=images), cameras, 240)
     plane = Plane(normal_world=torch.tensor([0.0, 0, 1]), offset=torch.tensor(0.0))
-    looked_at = fixation(pictures.cameras)
+    looked_at = fixation(pictures.cameras.cam_from_world)
     before = plane_agreement(pictures, plane, looked_at)
     after = plane_agreement(pictures, plane, looked_at, hidden)
     centre = (away < 8) & after.isfinite()  # not where the table is flat
@@ -234,33 +233,3 @@ def test_a_region_is_two_corners():
     for wrong in ((1.0, 2.0), (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)):
         with pytest.raises(ConfigError, match="region"):
             SilhouetteConfig(region=wrong)
-
-
-def test_the_table_is_the_supporting_plane(staged, generator):
-    scene = staged.scene
-    plane = supporting_plane(
-        scene.points_world, scene.cameras, tolerance=0.01, min_on=0.1, max_below=0.05,
-        generator=generator,
-    )  # fmt: skip
-    assert plane is not None
-    assert_close(plane.normal_world, torch.tensor([0.0, 0, 1]), atol=1e-3, rtol=0)
-    assert_close(
-        plane.height_of(torch.tensor([3.0, 1.0, 0.7])), torch.tensor(0.7), atol=0.01, rtol=0
-    )
-
-
-def test_points_without_a_plane_have_none(generator):
-    from pimper_torch.evidence.scenes.cameras import arc_cameras
-
-    cameras = arc_cameras(5, width=80, height=60, focal_px=90.0, distance=4.0).to(torch.float32)
-    points = torch.randn(500, 3, generator=generator)
-    found = supporting_plane(
-        points, cameras, tolerance=0.01, min_on=0.1, max_below=0.05, generator=generator
-    )
-    assert found is None
-
-
-def test_cameras_look_where_they_are_aimed(staged):
-    found = fixation(staged.scene.cameras)
-    assert_close(found.fixation_world, torch.tensor([0.0, 0.0, 0.4]), atol=0.01, rtol=0)
-    assert_close(found.distance, torch.tensor(3.0), atol=0.01, rtol=0)

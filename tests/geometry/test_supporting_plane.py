@@ -1,0 +1,57 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.geometry.supporting_plane import PlaneSearch, fixation, supporting_plane
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(91)
+
+
+def cameras(elevation_deg=40.0):
+    return arc_cameras(
+        9,
+        width=80,
+        height=60,
+        focal_px=90.0,
+        distance=3.0,
+        span_deg=120.0,
+        elevation_deg=elevation_deg,
+        target=(0.1, 0.4, -0.2),
+    )
+
+
+def test_points_on_a_table_lie_on_the_supporting_plane(generator):
+    table = torch.rand(200, 3, generator=generator).double() * 4 - 2
+    table[:, 1] = 0.002 * torch.randn(200, generator=generator)
+    above = torch.randn(300, 3, generator=generator).double() * 0.2 + torch.tensor([0, 0.8, 0])
+    plane = supporting_plane(torch.cat([above, table]), cameras().centers_world, 3.0)
+    assert plane is not None
+    assert_close(plane.normal_world, torch.tensor([0.0, 1, 0]).double(), atol=2e-3, rtol=0)
+    height = plane.height_of(torch.tensor([1.0, 0.7, 1.0]).double())
+    assert_close(height, torch.tensor(0.7).double(), atol=3e-3, rtol=0)
+
+
+def test_points_without_a_plane_have_none(generator):
+    points = torch.randn(500, 3, generator=generator).double()
+    assert supporting_plane(points, cameras().centers_world, 3.0) is None
+
+
+def test_a_plane_with_points_below_it_supports_nothing(generator):
+    table = torch.rand(300, 3, generator=generator).double() * 2 - 1
+    table[:, 1] = 0.0
+    points = torch.cat([table, table - torch.tensor([0, 0.5, 0])])
+    found = supporting_plane(points, cameras().centers_world, 3.0)
+    assert found is not None
+    assert_close(found.offset, torch.tensor(-0.5).double(), atol=1e-6, rtol=0)  # the lower one
+    strict = PlaneSearch(min_on=0.6)
+    assert supporting_plane(points, cameras().centers_world, 3.0, strict) is None
+
+
+def test_cameras_look_where_they_are_aimed():
+    found = fixation(cameras().cam_from_world)
+    assert_close(found.fixation_world, torch.tensor([0.1, 0.4, -0.2]).double(), atol=0.01, rtol=0)
+    assert_close(found.distance, torch.tensor(3.0).double(), atol=0.01, rtol=0)

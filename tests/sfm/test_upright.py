@@ -1,0 +1,130 @@
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.geometry.frames import invert_rigid, rigid, transform
+from pimper_torch.sfm.colmap import pinhole_lenses
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.quarter_turns import turned_pose
+from pimper_torch.sfm.upright import level_up, upright
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(92)
+
+
+def standing(num_views=12, span_deg=330.0, elevation_deg=25.0, **more):
+    """Give cameras round an object whose up is y."""
+    return arc_cameras(
+        num_views,
+        width=80,
+        height=60,
+        focal_px=90.0,
+        distance=3.0,
+        span_deg=span_deg,
+        elevation_deg=elevation_deg,
+        sway_deg=0.0,
+        **more,
+    )
+
+
+def rolled(poses, angles):
+    """Turn cameras about their optical axes, radians."""
+    roll = torch.eye(4).double().repeat(len(poses), 1, 1)
+    roll[:, 0, 0] = roll[:, 1, 1] = angles.cos()
+    roll[:, 1, 0], roll[:, 0, 1] = angles.sin(), -angles.sin()
+    return roll @ poses
+
+
+def model_of(cameras, points, world_from_true):
+    """Put a model in a frame of its own; every view sees every point."""
+    pairs = torch.cartesian_prod(torch.arange(len(points)), torch.arange(cameras.num_views))
+    placed = cameras.cam_from_world.double() @ invert_rigid(world_from_true)
+    return SparseModel(
+        names=tuple(f"{index}.png" for index in range(cameras.num_views)),
+        lenses=pinhole_lenses(cameras),
+        cam_from_world=placed,
+        points_world=transform(world_from_true, points.double()),
+        observation_point=pairs[:, 0],
+        observation_view=pairs[:, 1],
+        observation_pixels=torch.zeros(len(pairs), 2).double(),
+    )
+
+
+def any_frame(generator):
+    Q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    return rigid(Q * torch.linalg.det(Q), torch.tensor([0.3, -2.0, 1.0]).double())
+
+
+def off_deg(direction, truth=(0.0, 1.0, 0.0)):
+    cosine = direction.double() @ torch.tensor(truth).double()
+    return math.degrees(math.acos(min(1.0, float(cosine))))
+
+
+@pytest.mark.parametrize("span_deg", [330.0, 60.0])
+@pytest.mark.parametrize("elevation_deg", [-10.0, 0.0, 40.0, 75.0])
+def test_cameras_that_are_held_level_tell_which_way_is_up(span_deg, elevation_deg):
+    # Along an arc of 60 degrees, the y axes' lean counts a little against the x axes'.
+    poses = standing(span_deg=span_deg, elevation_deg=elevation_deg).cam_from_world
+    assert off_deg(level_up(poses)) < (0.01 if span_deg > 300 else 1.0)
+
+
+def test_cameras_that_are_held_by_hand_tell_it_to_a_degree(generator):
+    roll = math.radians(3.0) * torch.randn(24, generator=generator, dtype=torch.float64)
+    poses = rolled(standing(24, elevation_deg=30.0).cam_from_world, roll)
+    assert off_deg(level_up(poses)) < 1.5
+
+
+def test_a_third_of_the_cameras_turned_by_a_quarter_does_not_matter():
+    poses = standing(12).cam_from_world
+    poses = torch.stack([turned_pose(one, view % 3 == 0) for view, one in enumerate(poses)])
+    assert off_deg(level_up(poses)) < 1.0
+
+
+def test_without_motion_sideways_up_is_where_cameras_have_it():
+    poses = standing(3, span_deg=1e-6, elevation_deg=0.0).cam_from_world
+    assert off_deg(level_up(poses)) < 0.01
+
+
+def test_a_model_stands_on_its_plane(generator):
+    # Cameras lean by 5 degrees, all the same way, as before a turntable; the table does not.
+    cameras = standing(12, elevation_deg=30.0)
+    leaning = rolled(cameras.cam_from_world, torch.full((12,), math.radians(5.0)).double())
+    table = torch.rand(200, 3, generator=generator).double() * 2 - 1
+    table[:, 1] = -0.5
+    above = 0.3 * torch.randn(300, 3, generator=generator).double().clamp(-1.5, 1.5)
+    points, frame = torch.cat([above, table]), any_frame(generator)
+    found = upright(model_of(cameras.replace(cam_from_world=leaning), points, frame))
+    assert_close(found.points_world[300:, 1].std(), torch.tensor(0.0).double(), atol=1e-9, rtol=0)
+    assert bool((found.points_world[:300, 1].mean() > found.points_world[300:, 1]).all())
+    assert bool((invert_rigid(found.cam_from_world)[:, 1, 3] > found.points_world[300, 1]).all())
+
+
+def test_a_wall_is_not_taken_for_the_ground(generator):
+    cameras = standing(9, span_deg=60.0, elevation_deg=0.0)
+    wall = torch.rand(300, 3, generator=generator).double() * 2 - 1
+    wall[:, 2] = -0.2
+    frame = any_frame(generator)
+    found = upright(model_of(cameras, wall, frame))
+    assert_close(found.points_world[:, 2].std(), torch.tensor(0.0).double(), atol=1e-3, rtol=0)
+
+
+def test_cameras_stand_on_the_side_of_z_and_a_model_is_only_turned(generator):
+    cameras = standing(9, span_deg=60.0)
+    points, frame = torch.randn(50, 3, generator=generator), any_frame(generator)
+    model = model_of(cameras, points, frame)
+    found = upright(model)
+    eyes = invert_rigid(found.cam_from_world)[:, :3, 3]
+    assert bool((eyes[:, 2] - found.points_world[:, 2].mean() > 0).all())
+    assert_close(eyes.norm(dim=1), invert_rigid(model.cam_from_world)[:, :3, 3].norm(dim=1))
+    seen = [
+        transform(each.cam_from_world, each.points_world.expand(9, -1, 3))
+        for each in (model, found)
+    ]
+    assert_close(*seen)
+    again = upright(found)
+    assert_close(again.points_world, found.points_world, atol=1e-6, rtol=0)
