@@ -37,6 +37,7 @@ usage: pimper reconstruct PHOTOS -o OUT [options]
        pimper bench [-o OUT] [options]
        pimper convert DATA -o OUT --source KIND --target KIND [options]
        pimper gamma PHOTOS [options]
+       pimper frames VIDEO -o OUT [options]
        pimper clean OUT
        pimper --version
 
@@ -52,6 +53,7 @@ albedo and light.
   bench         the table: scenes, presets and baselines
   convert       a data set of another layout, or to one
   gamma         the response of photographs from a fixed camera under several lights
+  frames        photographs out of a video: sharp frames, equally far apart on the way
   clean         what runs into a folder kept to go on from, and what killed runs left
 
 `pimper COMMAND --help` tells the options, `--help-all` those of every stage, too.
@@ -70,6 +72,7 @@ _COMMANDS = {
     "bench": "pimper_torch.evidence.cli.bench",
     "convert": "pimper_torch.evidence.cli.convert",
     "gamma": "pimper_torch.single_view.cli.gamma",
+    "frames": "pimper_torch.cli.frames",
     "clean": "pimper_torch.cli.clean",
 }
 _READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}

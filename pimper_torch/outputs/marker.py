@@ -14,7 +14,7 @@ MARKER = ".pimper.json"
 STAGES = ".stages"
 """Folder in a folder of results for what a run keeps, to go on where it stopped."""
 
-Kind = Literal["result", "scene", "table", "data set", "stages"]
+Kind = Literal["result", "scene", "table", "data set", "stages", "frames"]
 
 _FORMAT, _VERSION = "pimper_torch folder", 1
 # A list of ten thousand files has 1.5 MB.

@@ -18,6 +18,7 @@ from pimper_torch.io import results
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.store import Store
+from tests.video.clips import written
 
 # What each option is given; {names} are places in the folder of `world`.
 RUNS = {
@@ -69,6 +70,7 @@ RUNS = {
         "{photos} --max-size-px 48 --photographs.response linear --photographs.saturation 250 "
         "--photographs.black 2"
     ],
+    "frames": ["{video} --out {out} --count 3 --overwrite"],
     "clean": ["{scene}"],
     "gamma": ["{photos} --mask {masks}/view_000.png --rank 3 --max-size-px 40"],
 }
@@ -100,6 +102,7 @@ def world(tmp_path_factory, dtu):
         "true_mesh": scene / "truth" / "mesh.ply",
         "dtu": dtu,
         "tiny": TINY,
+        "video": written(folder / "clip.mp4"),
     }
 
 

@@ -1,0 +1,95 @@
+"""``pimper frames``: photographs out of a video."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from PIL import Image
+
+from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.output import Output, stage
+from pimper_torch.config import require
+from pimper_torch.errors import caution, some
+from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
+from pimper_torch.progress import report
+from pimper_torch.video.choose import blurred, chosen, scanned
+from pimper_torch.video.read import frame_pictures, luma_frames
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    video: Path
+    out: Path
+    count: int
+    overwrite: bool
+
+    def __post_init__(self) -> None:
+        require(3 <= self.count <= 10_000, "count", self.count, "3 to 10,000")
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``frames``.
+
+    Raises:
+        PimperError: No video, nothing moves in it, or a folder that holds something else.
+    """
+    job = checked(command, arguments)
+    with output.observer() as observer:
+        with stage(observer, "scan") as figure:
+            scan = scanned(luma_frames(job.video))
+            figure("frames", len(scan.way))
+        frames = chosen(scan, job.count)
+        with (
+            stage(observer, "write") as figure,
+            written_whole(job.out, "frames", overwrite=job.overwrite) as folder,
+        ):
+            for done, (number, picture) in enumerate(
+                frame_pictures(job.video, frames.tolist()), start=1
+            ):
+                Image.fromarray(picture).save(folder / f"{number:06d}.png")
+                report(done, len(frames))
+            figure("photographs", len(frames))
+    dull = [f"{number:06d}.png" for number in blurred(scan, frames).tolist()]
+    if dull:
+        caution(
+            f"{job.out}: {some(dull)} are less than half as sharp as the others, and nothing "
+            "sharper is near them. Leave them out, or move more slowly there.",
+            stacklevel=2,
+        )
+    output.remark(
+        f"{len(frames)} of {len(scan.way)} frames are in {job.out}. Next:\n"
+        f"  pimper reconstruct {job.out} -o RESULT"
+    )
+    output.result({"folder": job.out}, photographs=len(frames), frames=len(scan.way))
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and refuse a folder that is taken.
+
+    Raises:
+        PimperError: The folder, or a wrong argument.
+        SystemExit: ``--help`` was answered.
+    """
+
+    def frames(
+        video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")],
+        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],
+        count: int = 40,
+        overwrite: Flag = False,
+    ) -> _Job:
+        """Choose photographs out of a video: sharp frames, equally far apart on the way.
+
+        Args:
+            video: MP4, MOV, MKV, WebM or AVI; needs pip install "pimper_torch[video]".
+            out: Folder for the photographs, PNG; new or empty.
+            count: Of photographs.
+            overwrite: Replace photographs that came from a video before.
+        """
+        return _Job(video=video, out=out, count=count, overwrite=overwrite)
+
+    job = read_arguments(frames, command, arguments)
+    require_apart(job.out, {"VIDEO": job.video})
+    prepare_output(job.out, "frames", job.overwrite)
+    return job

@@ -1,0 +1,91 @@
+"""Which frames of a video are photographs: the sharpest ones, at equal distances along the way."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.records import Record
+from pimper_torch.video.quality import motion, sharpness, thumbnail
+
+# A frame is compared with one before until it has moved so far, fractions of the width: what noise
+# adds then counts once. A choice, 6 pixels of 320: flow is still sure.
+_STEP = 0.02
+
+# Of each stretch of the way, the middle from which a frame is taken: neighbours are then at least
+# two fifths of a stretch apart. A choice.
+_MIDDLE = 0.6
+
+# Least way of all frames together, in widths: below, nothing moved. A choice.
+_LEAST_WAY = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Scan(Record):
+    """What every frame of a video is worth.
+
+    Attributes:
+        sharpness: See :func:`~pimper_torch.video.quality.sharpness`.
+        way: How far the pictures have moved since the first frame, in widths.
+    """
+
+    sharpness: Float[Tensor, " frame"]
+    way: Float[Tensor, " frame"]
+
+
+def scanned(frames: Iterable[UInt8[Tensor, "height width"]]) -> Scan:
+    """Look at every frame of a video once, in their order."""
+    sharp: list[float] = []
+    way: list[float] = []
+    anchor, walked = None, 0.0
+    for luma in frames:
+        small = thumbnail(luma)
+        moved = 0.0 if anchor is None else motion(anchor, small)
+        sharp.append(sharpness(luma))
+        way.append(walked + moved)
+        if anchor is None or moved > _STEP:
+            anchor, walked = small, walked + moved
+    return Scan(sharpness=torch.tensor(sharp), way=torch.tensor(way).cummax(dim=0).values)
+
+
+def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
+    """Choose the sharpest frame of each of equal stretches of the way.
+
+    Args:
+        scan: Of all frames.
+        count: Of frames to choose; fewer are where the pictures jump over a stretch.
+
+    Returns:
+        Numbers of frames, ascending.
+
+    Raises:
+        InputError: Fewer frames than are to be chosen, or nothing moves.
+    """
+    frames, whole = len(scan.way), float(scan.way[-1]) if len(scan.way) else 0.0
+    if frames < count:
+        raise InputError(
+            f"the video has {frames} frames, and {count} are to be chosen. Choose fewer."
+        )
+    if whole < _LEAST_WAY:
+        raise InputError(
+            f"nothing moves in the {frames} frames of the video (by {whole:.1%} of their width in "
+            "all); needed: a camera that goes round the object, or an object that turns."
+        )
+    place = scan.way / whole * count
+    stretch = place.floor().clamp(max=count - 1)
+    inner = (place - stretch - 0.5).abs() <= _MIDDLE / 2
+    kept = []
+    for number in range(count):
+        here = ((stretch == number) & inner).nonzero()[:, 0]
+        if len(here):
+            kept.append(here[scan.sharpness[here].argmax()])
+    return torch.stack(kept) if kept else torch.zeros(0, dtype=torch.long)
+
+
+def blurred(scan: Scan, frames: Int[Tensor, " chosen"]) -> Int[Tensor, " blurred"]:
+    """List chosen frames that are less than half as sharp as the median of the others."""
+    sharp = scan.sharpness[frames]
+    return frames[sharp < 0.5 * sharp.median()]

@@ -1,0 +1,40 @@
+"""Videos of a patterned plane that passes by."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+av = pytest.importorskip("av")
+WIDTH, HEIGHT, COUNT = 320, 240, 90
+
+
+def texture(seed=3):
+    noise = np.random.default_rng(seed).random((HEIGHT + 40, 900, 3))
+    smooth = gaussian_filter(noise, (1.5, 1.5, 0))
+    smooth = (smooth - smooth.min()) / np.ptp(smooth)
+    return (40 + 180 * smooth).astype(np.uint8)
+
+
+def positions():
+    """Give where the plane stands in each frame: it starts slowly."""
+    return (500 * np.linspace(0, 1, COUNT) ** 2).round().astype(int)
+
+
+def written(path, blur=lambda number: 0.0, gain=lambda number: 1.0, still=False, curve=0):
+    plane = texture()
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264" if curve else "mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.bit_rate = 8_000_000
+        if curve:
+            stream.codec_context.color_trc = curve
+        for number, at in enumerate(positions()):
+            at = 0 if still else at
+            picture = plane[20 : 20 + HEIGHT, at : at + WIDTH].astype(float) * gain(number)
+            picture = gaussian_filter(picture, (0, blur(number), 0))
+            frame = av.VideoFrame.from_ndarray(
+                picture.clip(0, 255).astype(np.uint8), format="rgb24"
+            )
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path

@@ -1,0 +1,58 @@
+import pytest
+import torch
+
+from pimper_torch.errors import InputError
+from pimper_torch.video.choose import Scan, blurred, chosen
+
+
+def scan(way, sharpness=None):
+    way = torch.as_tensor(way, dtype=torch.float32)
+    sharpness = torch.ones(len(way)) if sharpness is None else sharpness
+    return Scan(sharpness=sharpness, way=way)
+
+
+def test_frames_are_as_far_apart_on_the_way_however_fast_it_went():
+    time = torch.linspace(0, 1, 400)
+    found = scan(2 * time**3)  # slow at first
+    numbers = chosen(found, 20)
+    assert len(numbers) == 20
+    steps = found.way[numbers].diff()
+    assert steps.min() > 0.4 * 0.1
+    assert steps.max() < 1.6 * 0.1
+    assert numbers.diff()[0] > 4 * numbers.diff()[-1]
+
+
+def test_the_sharpest_frame_of_each_stretch_is_taken():
+    sharpness = torch.full((200,), 0.2)
+    sharpness[7::20] = 0.4
+    numbers = chosen(scan(torch.arange(200) / 200, sharpness), 10)
+    assert numbers.tolist() == list(range(7, 200, 20))
+
+
+def test_a_camera_that_rests_for_a_while_gives_one_frame_of_there():
+    way = torch.cat(
+        [torch.linspace(0, 0.5, 50), torch.full((200,), 0.5), torch.linspace(0.5, 1, 50)]
+    )
+    numbers = chosen(scan(way), 10)
+    assert ((numbers >= 50) & (numbers < 250)).sum() <= 1
+    assert len(numbers) >= 9
+
+
+def test_where_pictures_jump_there_is_no_frame():
+    way = torch.cat([torch.linspace(0, 0.4, 50), torch.linspace(0.8, 1, 30)])
+    assert len(chosen(scan(way), 10)) == 6
+
+
+def test_what_cannot_be_chosen_from_is_refused():
+    with pytest.raises(InputError, match="has 5 frames, and 10 are to be chosen"):
+        chosen(scan(torch.arange(5)), 10)
+    with pytest.raises(InputError, match="nothing moves in the 50 frames"):
+        chosen(scan(torch.linspace(0, 0.05, 50)), 10)
+
+
+def test_frames_that_are_blurred_beside_the_others_are_named():
+    sharpness = torch.full((10,), 0.3)
+    sharpness[4] = 0.1
+    found = scan(torch.arange(10), sharpness)
+    assert blurred(found, torch.arange(10)).tolist() == [4]
+    assert blurred(found, torch.tensor([0, 1, 2])).tolist() == []

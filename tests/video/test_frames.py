@@ -1,0 +1,130 @@
+"""Videos of a patterned plane that passes by, made here."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from pimper_torch.cli.main import main
+from pimper_torch.errors import PimperWarning
+from pimper_torch.io.photographs import list_images
+from pimper_torch.video.choose import scanned
+from pimper_torch.video.quality import motion, sharpness, thumbnail
+from pimper_torch.video.read import frame_pictures, luma_frames
+from tests.video.clips import COUNT, HEIGHT, WIDTH, positions, texture, written
+
+
+def test_frames_that_are_chosen_are_sharp_and_equally_far_apart(tmp_path, capsys):
+    video = written(tmp_path / "clip.mp4", blur=lambda number: 0.0 if number % 3 == 1 else 2.5)
+    line = ["frames", str(video), "-o", str(tmp_path / "photos"), "--count", "12", "--json"]
+    assert main(line) == 0
+    *_, result = map(json.loads, capsys.readouterr().out.splitlines())
+    assert result["photographs"] == 12
+    assert result["frames"] == COUNT
+    names = [path.name for path in list_images(tmp_path / "photos")]
+    numbers = [int(name[:6]) for name in names]
+    assert len(numbers) == 12
+    assert sum(number % 3 == 1 for number in numbers) >= 11
+    steps = np.diff(positions()[numbers])
+    assert steps.min() > 0.4 * 500 / 12
+    assert steps.max() < 1.6 * 500 / 12
+    shown = np.asarray(Image.open(tmp_path / "photos" / names[5])).astype(float)
+    at = positions()[numbers[5]]
+    assert np.abs(shown - texture()[20 : 20 + HEIGHT, at : at + WIDTH]).mean() < 6
+
+
+def test_light_that_changes_is_not_taken_for_motion(tmp_path):
+    moving = scanned(luma_frames(written(tmp_path / "a.mp4")))
+    video = written(tmp_path / "b.mp4", gain=lambda number: 0.75 + 0.25 * np.sin(number / 9))
+    lit = scanned(luma_frames(video))
+    assert moving.way[-1] == pytest.approx(500 / WIDTH, rel=0.05)
+    assert lit.way[-1] == pytest.approx(500 / WIDTH, rel=0.05)
+    away = np.abs(moving.way.numpy() * WIDTH - positions()).max()
+    assert away < 0.05 * 500
+
+
+def test_a_video_in_which_nothing_moves_is_refused(tmp_path, capsys):
+    video = written(tmp_path / "still.mp4", still=True, gain=lambda number: 1 - number / 300)
+    assert main(["frames", str(video), "-o", str(tmp_path / "photos"), "--count", "5"]) == 2
+    assert "nothing moves in the 90 frames" in capsys.readouterr().err
+    assert not (tmp_path / "photos").exists()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda path: None, "found nothing; needed: a video"),
+        (lambda path: path.mkdir(), "found a folder; needed: a video"),
+        (lambda path: path.write_bytes(b"\x00" * 5000), "cannot be decoded as a video"),
+        (lambda path: path.write_text("#EXTM3U\n#EXTINF:1,\n/etc/hostname\n"), "clip.mp4: "),
+        (lambda path: written(path).write_bytes(path.read_bytes()[:3000]), "cannot be decoded"),
+    ],
+)
+def test_what_is_no_video_is_refused(make, said, tmp_path, capsys):
+    make(tmp_path / "clip.mp4")
+    assert main(["frames", str(tmp_path / "clip.mp4"), "-o", str(tmp_path / "photos")]) == 2
+    assert said in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, capsys):
+    video = written(tmp_path / "clip.mp4")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a.png").write_bytes(b"mine")
+    line = ["frames", str(video), "-o", str(tmp_path / "mine"), "--count", "5", "--overwrite"]
+    assert main(line) == 2
+    assert (tmp_path / "mine" / "a.png").read_bytes() == b"mine"
+    line[3] = str(tmp_path / "photos")
+    assert main(line) == main(line) == 0  # what came from a video is replaced
+    assert len(list_images(tmp_path / "photos")) == 5
+    assert main(line[:-1]) == 2
+
+
+@pytest.mark.parametrize(("angle", "turns"), [(90, -1), (180, 2), (270, 1)])
+def test_pictures_are_turned_as_the_video_says(angle, turns, tmp_path):
+    plain = written(tmp_path / "clip.mp4")
+    turned = tmp_path / "turned.mp4"
+    data = bytearray(plain.read_bytes())
+    one = 1 << 16
+    # The matrix of the track's header turns clockwise.
+    a, b = {90: (0, one), 180: (-one, 0), 270: (0, -one)}[angle]
+    place = data.index(b"tkhd") + 4 + 40
+    for index, value in enumerate((a, b, 0, -b, a)):
+        data[place + 4 * index : place + 4 * index + 4] = int(value).to_bytes(4, "big", signed=True)
+    turned.write_bytes(data)
+    ((_, before),) = frame_pictures(plain, [40])
+    ((number, after),) = frame_pictures(turned, [40])
+    assert number == 40
+    assert np.array_equal(after, np.rot90(before, turns))
+
+
+def test_blur_along_the_motion_makes_a_frame_less_sharp_and_light_does_not():
+    picture = texture()[:, :WIDTH, 1].astype(np.float32)
+    plain = sharpness(torch.from_numpy(picture.astype(np.uint8)))
+    dim = sharpness(torch.from_numpy((0.6 * picture).astype(np.uint8)))
+    soft = sharpness(torch.from_numpy(gaussian_filter(picture, (0, 2)).astype(np.uint8)))
+    assert dim == pytest.approx(plain, rel=0.05)
+    assert soft < 0.7 * plain
+    assert sharpness(torch.zeros(20, 20, dtype=torch.uint8)) == 0.0
+
+
+def test_an_object_that_turns_before_a_wall_moves():
+    wall, plane = texture(4), texture()
+    before, after = (wall[:HEIGHT, :WIDTH, 1].copy() for _ in range(2))
+    before[60:200, 100:240], after[60:200, 100:240] = plane[:140, :140, 1], plane[:140, 5:145, 1]
+    resting = wall[:HEIGHT, :WIDTH, 1].copy()
+    still = motion(*(thumbnail(torch.from_numpy(one)) for one in (resting, resting)))
+    moved = motion(*(thumbnail(torch.from_numpy(one)) for one in (before, after)))
+    assert still < 0.001
+    assert moved == pytest.approx(5 / WIDTH, rel=0.2)
+
+
+@pytest.mark.parametrize(("curve", "name"), [(16, "PQ"), (18, "HLG")])
+def test_high_dynamic_range_is_warned_of(curve, name, tmp_path):
+    video = written(tmp_path / "clip.mp4", curve=curve)
+    with pytest.warns(PimperWarning, match=f"clip.mp4: is of high dynamic range, {name}"):
+        next(iter(luma_frames(video)))
+    plain = written(tmp_path / "plain.mp4", curve=1)
+    assert next(iter(luma_frames(plain))).shape == (HEIGHT, WIDTH)
