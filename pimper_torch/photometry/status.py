@@ -64,10 +64,13 @@ def light_varies(
 def warn_of_undetermined(
     buckets: Sequence[Photometry], min_views: int, min_light_variation: float
 ) -> None:
-    """Warn once, with the number of patches whose light does not determine normals, by cause."""
+    """Warn once, with the number of patches whose light does not determine normals, by cause.
+
+    Those that failed are told by :mod:`pimper_torch.failures`.
+    """
     statuses = Counter(code for bucket in buckets for code in bucket.status.tolist())
     total = sum(statuses.values())
-    undetermined = total - statuses[PatchStatus.DETERMINED]
+    undetermined = total - statuses[PatchStatus.DETERMINED] - statuses[PatchStatus.FAILED]
     if undetermined == 0:
         return
     causes = {
@@ -78,7 +81,6 @@ def warn_of_undetermined(
             "in {} the light varies too little between the views to determine normals "
             f"(variation below {min_light_variation})"
         ),
-        PatchStatus.FAILED: "in {} the solver found no finite solution",
     }
     parts = [text.format(statuses[code]) for code, text in causes.items() if statuses[code]]
     caution(

@@ -108,6 +108,14 @@ def test_an_silhouette_without_border_is_not_drawn(reconstruction, tmp_path):
         )
 
 
+def test_names_that_the_font_has_no_glyphs_for_are_no_reason_to_warn(reconstruction, tmp_path):
+    scene = reconstruction.scene
+    named = scene.replace(views=scene.views.replace(names=("\u672c.png", "\u5929.png", "c.png")))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draw_overview(reconstruction.replace(scene=named), tmp_path / "overview.png", 60)
+
+
 def test_gradients_do_not_hinder_drawing(reconstruction, tmp_path):
     vertices = reconstruction.mesh.vertices_world.clone().requires_grad_()
     mesh = reconstruction.mesh.replace(vertices_world=vertices)
