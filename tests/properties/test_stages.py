@@ -1,6 +1,7 @@
 """Invariances of single stages, on many random inputs."""
 
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
@@ -8,8 +9,11 @@ from torch.testing import assert_close
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.linalg.sums import total
+from pimper_torch.meshing.closing import closed
+from pimper_torch.meshing.simplify import simplify
 from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.robust import robust_variance
+from pimper_torch.records import Mesh
 
 SEEDS = st.integers(0, 2**31 - 1)
 
@@ -51,3 +55,31 @@ def test_a_total_is_within_rounding_of_any_other_order(seed, size):
     values = drawn(seed, size)
     order = torch.randperm(size, generator=torch.Generator().manual_seed(seed))
     assert_close(total(values[order]), total(values), rtol=0, atol=1e-15 * (1 + size))
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=SEEDS, missing=st.floats(0.0, 0.7))
+def test_whatever_is_missing_of_a_ball_is_closed(seed, missing):
+    vertices, faces = icosphere(2)
+    chosen = torch.rand(len(faces), generator=torch.Generator().manual_seed(seed)) >= missing
+    mesh = Mesh(vertices_world=vertices.double(), faces=faces[chosen])
+    found = closed(mesh)
+    solid = trimesh.Trimesh(found.mesh.vertices_world, found.mesh.faces, process=False)
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
+    assert int(found.measured.sum()) == len(mesh.faces)
+    corners, before = (one.vertices_world[one.faces] for one in (found.mesh, mesh))
+    assert torch.equal(corners[found.measured], before)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, power=st.integers(-20, 20))
+def test_a_mesh_of_another_unit_is_simplified_to_the_same_faces(seed, power):
+    vertices, faces = icosphere(4)
+    bumps = 1 + 0.05 * torch.cos(drawn(seed, 3) * 4 * vertices.double()).sum(dim=1, keepdim=True)
+    mesh = Mesh(vertices_world=vertices.double() * bumps, faces=faces)
+    usual = simplify(mesh)
+    other = simplify(mesh.replace(vertices_world=2.0**power * mesh.vertices_world))
+    assert torch.equal(other.mesh.faces, usual.mesh.faces)
+    assert torch.equal(other.mesh.vertices_world, 2.0**power * usual.mesh.vertices_world)
+    assert len(usual.mesh.faces) < len(faces)

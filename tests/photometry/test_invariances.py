@@ -1,0 +1,64 @@
+"""What must not change normals: order of views and of patches, brightness. On random orders."""
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from pimper_torch.photometry.factorize import Factorize
+from pimper_torch.records import PatchViews
+
+SEEDS = st.integers(0, 2**31 - 1)
+
+
+def shuffled(count, seed):
+    return torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+
+
+@settings(
+    max_examples=5,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(seed=SEEDS, power=st.integers(-4, 4))
+def test_order_of_views_and_patches_and_brightness_leave_normals(scene, seed, power):
+    seen = scene().seen
+    usual = Factorize()(seen)
+    gain, views = 2.0**power, shuffled(12, seed)
+    orders = [
+        shuffled(len(one.radiance), seed + 1 + index) for index, one in enumerate(seen.buckets)
+    ]
+    patches = seen.patches.replace(
+        buckets=tuple(
+            one.take(order) for one, order in zip(seen.patches.buckets, orders, strict=True)
+        )
+    )
+    buckets = tuple(
+        one.replace(radiance=gain * one.radiance[:, views], valid=one.valid[:, views]).take(order)
+        for one, order in zip(seen.buckets, orders, strict=True)
+    )
+    found = Factorize()(PatchViews(patches=patches, buckets=buckets))
+    for before, after, order in zip(usual.buckets, found.buckets, orders, strict=True):
+        assert torch.equal(after.valid, before.valid[order])
+        normals = before.normals_patch[order]
+        away = (after.normals_patch - normals).norm(dim=-1)[after.valid]
+        assert away.median() < 1e-4
+        assert away.quantile(0.99) < 0.02
+        # Radiance is albedo times light: their product takes the gain.
+        shading, usual_shading = (
+            one.albedo.mean() * one.lights_patch[..., 0].mean() for one in (after, before)
+        )
+        assert_close(shading, gain * usual_shading, rtol=1e-3, atol=0)
+        assert torch.equal(after.status, before.status[order])
+
+
+@pytest.mark.parametrize("gain", [1e-3, 1e3])
+def test_any_unit_of_radiance_will_do(scene, gain):
+    seen = scene().seen
+    brighter = seen.replace(
+        buckets=tuple(one.replace(radiance=gain * one.radiance) for one in seen.buckets)
+    )
+    for before, after in zip(Factorize()(seen).buckets, Factorize()(brighter).buckets, strict=True):
+        assert_close(after.normals_patch, before.normals_patch, rtol=0, atol=1e-3)
