@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.supporting_plane import (
     Fixation,
     Plane,
@@ -22,6 +24,7 @@ from pimper_torch.silhouettes.pictures import Pictures, of_views, working_pictur
 from pimper_torch.silhouettes.seeds import MIN_POINTS
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 
+_PROBES = 5  # places along each side of a region that photographs are asked for
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
 
 
@@ -112,10 +115,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
     tracked = points[well_tracked(scene)]
     plane = supporting_plane(tracked, cameras.centers_world, distance, details.plane)
     tolerance = details.plane.tolerance * distance
-    region = None
-    if config.region:
-        corners = torch.tensor(config.region, dtype=torch.float64).reshape(2, 3)
-        region = (corners - corners.new_tensor(scene.offset_world)).float()
+    region = _region(scene, config.region) if config.region else None
     cloud = split_cloud(scene, focus, plane, tolerance, region)
     half, centre = _BOX * focus.distance, focus.fixation_world
     turns = plane is None and len(scene.background_from_view) > 0
@@ -130,3 +130,28 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
         fixation=focus,
         box_world=torch.stack([centre - half, centre + half]) if region is None else region,
     ).observed()
+
+
+def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 3"]:
+    """Give the region in the scene's frame.
+
+    Raises:
+        InputError: No point of the cloud is in it, and no view sees any of it.
+    """
+    low, high = torch.tensor(corners, dtype=torch.float64).reshape(2, 3)
+    offset = low.new_tensor(scene.offset_world)
+    box, points = torch.stack([low, high]) - offset, scene.points_world
+    inside = ((points > box[0]) & (points < box[1])).all(dim=1)
+    steps = torch.cartesian_prod(*[torch.linspace(0, 1, _PROBES, dtype=torch.float64)] * 3)
+    cameras = scene.cameras
+    places = (box[0] + steps * (box[1] - box[0])).to(cameras.cam_from_world)
+    pixels, depth = project(places, cameras.cam_from_world, cameras.intrinsics)
+    shown = (pixels > 0) & (pixels < cameras.sizes_px[:, None])
+    if not bool(inside.any()) and not bool((shown.all(dim=-1) & (depth > 0)).any()):
+        around = torch.stack([points.quantile(q, dim=0) for q in (0.05, 0.95)]) + offset
+        found = ", ".join(f"{value:.4g}" for value in around.flatten().tolist())
+        raise InputError(
+            f"region is {corners}, which no photograph shows and no point of the cloud is in; "
+            f"nine of ten points are in ({found}). Give a box in the frame of the cameras."
+        )
+    return box.float()

@@ -233,3 +233,12 @@ def test_a_region_is_two_corners():
     for wrong in ((1.0, 2.0), (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)):
         with pytest.raises(ConfigError, match="region"):
             SilhouetteConfig(region=wrong)
+
+
+def test_a_region_that_nothing_shows_is_refused(staged):
+    away = SilhouetteConfig(size_px=240, region=(50.0, 50.0, 50.0, 51.0, 51.0, 51.0)), SMALL[1]
+    with pytest.raises(InputError, match="no photograph shows and no point of the cloud is in"):
+        FindSilhouettes(*away)(staged.scene)
+    tiny = SilhouetteConfig(size_px=240, region=(0.0, 0.0, 0.4, 1e-6, 1e-6, 0.400001)), SMALL[1]
+    with pytest.warns(PimperWarning, match="Everything"):  # shown, though no point is in it
+        FindSilhouettes(*tiny)(staged.scene)
