@@ -106,9 +106,11 @@ def main(arguments: Sequence[str] | None = None, *, supervised: bool = False) ->
             return _main(arguments, supervised)
         finally:
             sys.stdout.flush()
-    except BrokenPipeError:  # as of `pimper --help | head`: whoever reads has read enough
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # flushed again at exit
-        return 0
+        if isinstance(error, BrokenPipeError):  # `pimper --help | head`: it has been read enough
+            return 0
+        return _failed(Output(), error)
 
 
 def _print_anything() -> None:

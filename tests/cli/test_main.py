@@ -425,3 +425,14 @@ def test_a_mesh_of_ones_own_reaches_the_chain(photos, chain, tmp_path):
     assert json.loads((out / "summary.json").read_text())["mesh"] == str(tmp_path / "rough.ply")
     assert run("reconstruct", photos, "-o", tmp_path / "b", "--mesh", tmp_path / "none.ply") != 0
     assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+@pytest.mark.parametrize("line", [["--help"], ["--version"], ["config", "default"]])
+def test_an_output_that_cannot_be_written_ends_in_a_message(line):
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "pimper_torch", *line]
+        ran = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert ran.returncode == 2
+    assert ran.stderr.startswith("error: the system refuses (No space left on device)")
+    assert "Traceback" not in ran.stderr
