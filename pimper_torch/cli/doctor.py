@@ -15,7 +15,7 @@ from pimper_torch.doctor.findings import Finding
 from pimper_torch.doctor.machine import machine
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import list_images
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
             tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PHOTOS")
         ] = None,
         max_size_px: int = 0,
-        photographs: Encoding = SRGB,
+        photographs: Encoding = FROM_FILES,
     ) -> _Job:
         """Tell what is installed here, and whether photographs are fit for a run, in seconds.
 

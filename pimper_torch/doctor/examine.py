@@ -11,12 +11,12 @@ from pimper_torch.doctor.overlap import match_all, overlap
 from pimper_torch.doctor.photograph import Photograph, of_views, read_all
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import list_images
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Views
 
 
 def examine_folder(
-    folder: Path | str, encoding: Encoding = SRGB, max_size_px: int = 0
+    folder: Path | str, encoding: Encoding = FROM_FILES, max_size_px: int = 0
 ) -> list[Finding]:
     """Examine the photographs of a folder, in seconds.
 

@@ -10,13 +10,29 @@ from typing import TypeVar
 
 import kornia_rs.io
 import numpy as np
-import tifffile
 import torch
 from jaxtyping import Float
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.io.icc import read_profile
+from pimper_torch.io.profiles import (
+    PngHead,
+    colour_of_exif,
+    colour_of_png,
+    colour_of_tiff,
+    png_head,
+)
+from pimper_torch.io.tiff import (
+    CMYK_CAUTION,
+    Layout,
+    layout_of,
+    read_deep_tiff,
+    read_gray_tiff,
+    unread_tiff,
+)
+from pimper_torch.radiometry.colour import SILENT, Colour
 from pimper_torch.records import Record
 
 Result = TypeVar("Result")
@@ -29,6 +45,7 @@ MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
 # Diagonal of the 36 mm x 24 mm frame, to which CIPA DCG-001 relates the 35 mm equivalent.
 _FRAME_DIAGONAL_MM = math.hypot(36, 24)
+_FULL_SCALE = {np.dtype(kind): int(np.iinfo(kind).max) for kind in (np.uint8, np.uint16)}
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's FocalPlaneResolutionUnit
 
 
@@ -43,6 +60,11 @@ class Header(Record):
         focal_px: NaN where the file does not say.
         channels: 1 or 3; alpha not counted.
         deep: True for 16-bit samples in several channels, which Pillow would cut to 8.
+        full: Level that is full scale, 255 or 65535, or less of 16 bits where a TIFF says so.
+        significant: Bits of 16 that a PNG says are no filling; 16 where it is silent.
+        colour: What the file says about its samples.
+        cautions: What it says and is not followed, each a sentence without its subject.
+        layout: Of a TIFF; ``None`` for other files.
     """
 
     width: int
@@ -51,6 +73,11 @@ class Header(Record):
     focal_px: float
     channels: int
     deep: bool
+    full: int = 255
+    significant: int = 16
+    colour: Colour = SILENT
+    cautions: tuple[str, ...] = ()
+    layout: Layout | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -61,13 +88,21 @@ class Decoded(Record):
         samples: In [0, 1] as the file encodes them; one or three channels.
         alpha: Opacity in [0, 1]; ``None`` where the file has none.
         lossy: True for JPEG, whose samples ring round edges.
-        bits: 8 or 16; full scale, a sample of 1, is ``2 ** bits - 1`` in the file.
+        full: Level of the file that is full scale, a sample of 1: 255, 65535, or what the file
+            says.
+        colour: What the file says about its samples.
     """
 
     samples: Float[Tensor, "channel height width"]
     alpha: Float[Tensor, "height width"] | None
     lossy: bool
-    bits: int
+    full: int
+    colour: Colour = SILENT
+
+    @property
+    def bits(self) -> int:
+        """Of the file's samples: 8 or 16."""
+        return 8 if self.full == _FULL_SCALE[np.dtype(np.uint8)] else 16
 
 
 def read_header(path: Path | str) -> Header:
@@ -80,20 +115,32 @@ def read_header(path: Path | str) -> Header:
     path = Path(path)
 
     def read(image: Image.Image) -> Header:
+        layout = None
+        if isinstance(image, TiffImagePlugin.TiffImageFile):
+            layout = layout_of(path, image)
+        png = png_head(path) if image.format == "PNG" else None
         width, height = image.size
         grey = image.mode in ("1", "L", "LA", "La") or image.mode.startswith("I;16")
         _refuse_huge(path, width, height, 1 if grey else 3)
-        exif = Image.Exif() if _is_bare_png(path, image) else image.getexif()
-        orientation = _orientation(exif)
-        if orientation >= 5 and image.format != "TIFF":  # Pillow has turned a TIFF's size
+        # Pillow decodes all of a PNG to find out that it has no EXIF.
+        exif = Image.Exif() if png is not None and png.bare else image.getexif()
+        orientation, cautions = _orientation(exif)
+        if orientation >= 5 and layout is None:  # Pillow has turned a TIFF's size
             width, height = height, width
+        deep = layout.deep if layout else png is not None and _is_deep_png(path)
+        sixteen = deep or image.mode.startswith("I;16")
         return Header(
             width=width,
             height=height,
             orientation=orientation,
             focal_px=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), width, height),
             channels=1 if grey else 3,
-            deep=_is_deep(path, image),
+            deep=deep,
+            full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,
+            significant=_significant(png),
+            colour=_colour(image, exif, png),
+            cautions=(*cautions, *_mode_cautions(image), *(layout.cautions if layout else ())),
+            layout=layout,
         )
 
     return _with_image(path, read, whole=False)
@@ -102,7 +149,7 @@ def read_header(path: Path | str) -> Header:
 def decode(path: Path | str) -> Decoded:
     """Read an image file at full depth and turn it as EXIF says.
 
-    Colour profiles are not applied.
+    Profiles are not applied; what they say comes along.
 
     Raises:
         InputError: As :func:`read_header`, and for samples that are not of 8 or 16 bits.
@@ -110,22 +157,24 @@ def decode(path: Path | str) -> Decoded:
     path = Path(path)
     header = read_header(path)
     if header.deep:
-        array = rotated(_read_deep(path), header.orientation)
+        array = rotated(_read_deep(path, header.layout), header.orientation)
     else:
-        array = _with_image(path, _read_shallow)
+        array = _with_image(path, lambda image: _read_shallow(image, header.layout))
     if array.dtype not in (np.uint8, np.uint16):
         raise _unfit(path, str(array.dtype))
+    full = _full_scale(array, header)
     array = array[..., None] if array.ndim == 2 else array
     # Plane by plane, so that no more memory is taken than is returned.
     planes = torch.empty(array.shape[2], *array.shape[:2])
     for plane, channel in zip(planes, np.moveaxis(array, -1, 0), strict=True):
-        np.divide(channel, np.float32(np.iinfo(array.dtype).max), out=plane.numpy())
+        np.divide(channel, np.float32(full), out=plane.numpy())
     has_alpha = len(planes) in (2, 4)
     return Decoded(
         samples=planes[:-1] if has_alpha else planes,
         alpha=planes[-1] if has_alpha else None,
         lossy=path.suffix.lower() in (".jpg", ".jpeg"),
-        bits=8 * array.dtype.itemsize,
+        full=full,
+        colour=header.colour,
     )
 
 
@@ -181,22 +230,57 @@ def _positive(value: object) -> float:
     return number if 0 < number < math.inf else 0.0
 
 
-def _is_bare_png(path: Path, image: Image.Image) -> bool:
-    """Tell whether a PNG says nothing but its pixels; Pillow decodes all to find that out."""
-    if image.format != "PNG":
-        return False
-    with path.open("rb") as file:
-        file.seek(8)
-        while len(head := file.read(8)) == 8:
-            if head[4:] in (b"eXIf", b"tEXt", b"zTXt", b"iTXt"):
-                return False
-            file.seek(int.from_bytes(head[:4], "big") + 4, 1)
-    return True
-
-
-def _orientation(exif: Image.Exif) -> int:
+def _orientation(exif: Image.Exif) -> tuple[int, list[str]]:
     found = exif.get(ExifTags.Base.Orientation)
-    return found if isinstance(found, int) and 1 <= found <= 8 else 1
+    if isinstance(found, int) and 1 <= found <= 8:
+        return found, []
+    if found is None:
+        return 1, []
+    return 1, [f"has an EXIF orientation of {found!r:.20}, not of 1 to 8; it is taken as upright"]
+
+
+def _significant(png: PngHead | None) -> int:
+    told = b"" if png is None else png.chunks.get(b"sBIT", b"")
+    return min((*told, 16)) if all(8 < one <= 16 for one in told) else 16
+
+
+def _full_scale(array: np.ndarray, header: Header) -> int:
+    """Give the level of full scale, as the file says unless its samples contradict it.
+
+    PNG wants samples of fewer bits shifted up, and filled with zeros or their own highest bits.
+    Those that end where the fewer bits do, and are neither, were not.
+    """
+    most = _FULL_SCALE[array.dtype]
+    if array.dtype != np.uint16:
+        return most
+    highest, bits = int(array.max()), header.significant
+    if highest <= header.full < most:
+        return header.full
+    if bits == 16 or highest >= 2**bits:
+        return most
+    shifted = array >> (16 - bits) << (16 - bits)
+    filled = shifted | (shifted >> bits)
+    return most if bool((array == shifted).all() or (array == filled).all()) else 2**bits - 1
+
+
+def _colour(image: Image.Image, exif: Image.Exif, png: PngHead | None) -> Colour:
+    """Give what an image says of its samples: by its format's own means, or else by EXIF."""
+    if image.mode in ("CMYK", "LAB"):  # turned into sRGB by Pillow
+        return SILENT
+    if isinstance(image, TiffImagePlugin.TiffImageFile):
+        said = colour_of_tiff(image.tag_v2)
+    elif png is not None:
+        said = colour_of_png(png.chunks)
+    else:
+        profile = image.info.get("icc_profile")
+        said = read_profile(profile) if isinstance(profile, bytes) else SILENT
+    return colour_of_exif(exif) if said is SILENT else said
+
+
+def _mode_cautions(image: Image.Image) -> list[str]:
+    if image.mode != "CMYK" or isinstance(image, TiffImagePlugin.TiffImageFile):
+        return []
+    return [CMYK_CAUTION]
 
 
 def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
@@ -262,48 +346,41 @@ def _unfit(path: Path, kind: str) -> InputError:
 
 def _unidentified(path: Path) -> InputError:
     """Tell why Pillow does not know a file: a TIFF of samples that it has no name for, or none."""
-    try:
-        with tifffile.TiffFile(path) as file:
-            kind = file.pages.first.dtype
-            if kind is not None and kind not in (np.uint8, np.uint16):
-                return _unfit(path, str(kind))
-    except Exception:  # tifffile raises whatever its parser does: no TIFF, then
-        pass
+    found = unread_tiff(path)
+    if found.startswith(("float", "int", "uint", "complex")):
+        return _unfit(path, found)
+    if found:
+        return InputError(f"{path}: {found}")
     return InputError(
         f"{path}: holds no JPEG, PNG or TIFF image that can be read. Convert it, or take it out of "
         "the folder."
     )
 
 
-def _read_shallow(image: Image.Image) -> np.ndarray:
+def _read_shallow(image: Image.Image, layout: Layout | None) -> np.ndarray:
+    if layout is not None:
+        image.seek(layout.page)
     upright = ImageOps.exif_transpose(image)
     if upright.mode.startswith("I;16"):
-        return np.asarray(upright).astype(np.uint16)
+        return read_gray_tiff(upright, layout)
     if upright.mode in ("I", "F"):
         return np.asarray(upright)  # 32 bits: the caller refuses them
+    if upright.mode == "La":
+        upright = upright.convert("LA")
     if upright.has_transparency_data:
         return np.asarray(upright.convert("LA" if upright.mode in ("L", "LA") else "RGBA"))
     return np.asarray(upright.convert("L" if upright.mode in ("1", "L") else "RGB"))
 
 
-def _is_deep(path: Path, image: Image.Image) -> bool:
-    if image.format == "PNG":
-        with path.open("rb") as file:
-            start = file.read(26)
-        return start[24] == 16 and start[25] in (2, 4, 6)  # bit depth; RGB, LA, RGBA
-    if image.format == "TIFF":
-        bits = image.tag_v2.get(258, (1,))  # type: ignore[attr-defined]  # BitsPerSample
-        return len(bits) > 1 and max(bits) > 8
-    return False
+def _is_deep_png(path: Path) -> bool:
+    with path.open("rb") as file:
+        start = file.read(26)
+    return start[24] == 16 and start[25] in (2, 4, 6)  # bit depth; RGB, LA, RGBA
 
 
-def _read_deep(path: Path) -> np.ndarray:
+def _read_deep(path: Path, layout: Layout | None) -> np.ndarray:
     try:
-        with path.open("rb") as file:
-            is_png = file.read(4) == b"\x89PNG"
-        if is_png:
-            return _read_deep_png(path)
-        return _read_deep_tiff(path)
+        return _read_deep_png(path) if layout is None else read_deep_tiff(path, layout)
     except InputError:
         raise
     except Exception as error:  # kornia_rs raises bare Exception
@@ -321,14 +398,3 @@ def _read_deep_png(path: Path) -> np.ndarray:
             "Save it without transparency."
         )
     return np.asarray(kornia_rs.io.read_image_png_u16(str(path), "rgb" if kind == 2 else "rgba"))
-
-
-def _read_deep_tiff(path: Path) -> np.ndarray:
-    with tifffile.TiffFile(path) as file:
-        page = file.pages.first
-        samples, interleaved = page.samplesperpixel, page.planarconfig == 1
-        if interleaved and samples == 3 and page.bitspersample == 16:
-            # LZW and PackBits, which tifffile reads only with a further package.
-            return np.asarray(kornia_rs.io.read_image_tiff_u16(str(path), "rgb"))
-        array = page.asarray()
-    return array if interleaved else np.moveaxis(array, 0, -1)

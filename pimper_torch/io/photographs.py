@@ -15,9 +15,10 @@ from torch import Tensor
 from pimper_torch.errors import InputError, PimperWarning, some
 from pimper_torch.file_names import match_files
 from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header
+from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.io.turned_masks import choose_ways, mask_ways
-from pimper_torch.radiometry import SATURATED, SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.records import Views
 
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
@@ -44,17 +45,19 @@ def load_views(
     *,
     masks: Path | str | None = None,
     mask_object: Literal["auto", "bright", "dark"] = "auto",
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Views:
     """Read the photographs of a folder, in the natural order of their names.
 
     JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette; links are followed. Other files,
     hidden ones and folders inside are passed over, with a warning where they look like
-    photographs. EXIF's orientation is applied, its focal length kept in pixels. The response, sRGB
-    unless given, is undone, so that radiance is linear; colour profiles are not looked at.
-    Radiance 1 is saturation, in every colour: the level that is told, or at which values pile up,
-    or full scale. Photographs of unlike sizes are padded.
+    photographs. EXIF's orientation is applied, its focal length kept in pixels. The response is
+    undone, so that radiance is linear: the one given, else the one that each file tells by its ICC
+    profile, PNG's gAMA and cICP or EXIF, else sRGB. Colours are turned into the primaries of sRGB.
+    A warning names what files say about their samples that is not followed, or that a given
+    response contradicts. Radiance 1 is saturation, in every colour: the level that is told, or at
+    which values pile up, or full scale. Photographs of unlike sizes are padded.
 
     Masks are images of the photographs' sizes, zero off the object (JPEG: below half). Where all
     of them together are bright along the border and dark in the middle, they are turned round,
@@ -89,6 +92,7 @@ def load_views(
     _check_count(Path(folder), paths)
     _tell_passed_over(Path(folder))
     headers = [read_header(path) for path in paths]
+    tell_cautions(Path(folder), paths, headers, encoding)
     mask_paths = _match_masks(paths, Path(masks)) if masks is not None else None
     sizes = [shrunk_size(header, max_size_px) for header in headers]
     pictures = read_pictures(paths, headers, sizes, encoding)

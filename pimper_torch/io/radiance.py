@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -14,7 +14,8 @@ from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.decode import Decoded, Header, decode
 from pimper_torch.io.responses import response_of
 from pimper_torch.progress import track
-from pimper_torch.radiometry import SATURATED, Curve, Encoding, Response, find_saturation
+from pimper_torch.radiometry import SATURATED, Curve, Encoding, Response, Srgb, find_saturation
+from pimper_torch.radiometry.primaries import in_srgb_primaries
 from pimper_torch.radiometry.saturation import PIXELS
 from pimper_torch.records import Record
 
@@ -22,6 +23,8 @@ OPAQUE = 0.5
 # Saturated light in a pixel's footprint counts from this fraction on; below is the rounding of the
 # filter's weights.
 _TOUCHED = 1e-3
+# What sensors digitize to; 16 bits hold all of it.
+_SENSOR_BITS = (10, 12, 14)
 # Choices: photographs share one raster, and one that makes it so many times as large as all are
 # together is no photograph of theirs, from 400 MB of raster on.
 _MAX_PADDING, _MUCH_PADDING = 8, 10**8
@@ -41,8 +44,10 @@ class Pictures(Record):
     opaque: tuple[Bool[Tensor, "height width"] | None, ...]
 
 
-# Levels of saturation by the bits of the file, fractions of full scale, one a colour.
-_Whites = Mapping[int, Float[Tensor, " channel"]]
+# Files of one kind: their level of full scale, and their response.
+_Kind = tuple[int, Response]
+# Levels of saturation of files of a kind, fractions of full scale, one a colour.
+_Whites = Mapping[_Kind, Float[Tensor, " channel"]]
 
 
 def read_pictures(
@@ -54,7 +59,8 @@ def read_pictures(
     """Read image files as linear radiance that is 1 where the sensor saturates.
 
     Black is taken away, values above saturation are cut off. Files whose saturation is to be
-    found are read once more if it lies below full scale; a :class:`PimperWarning` tells it.
+    found are read once more if it lies below full scale; a :class:`PimperWarning` tells it. Colours
+    of other primaries than sRGB's, as a file says, are turned into those of sRGB.
 
     Args:
         paths: Of the files.
@@ -66,7 +72,7 @@ def read_pictures(
         InputError: Names a file that cannot be read, that the encoding does not fit, or that is
             much larger than all others.
     """
-    response = response_of(encoding)
+    response = None if encoding.response == "auto" else response_of(encoding)
     width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
     channels = max(header.channels for header in headers)
     files = [Path(path) for path in paths]
@@ -74,7 +80,8 @@ def read_pictures(
     images = torch.zeros(len(files), channels, height, width)
     given = None if encoding.saturation == "auto" else encoding
     opaque, tallies = _fill(images, files, sizes_px, response, encoding, {}, tally=given is None)
-    whites = _found(tallies, response)
+    whites = _found(tallies)
+    _tell_low(files[0].parent, tallies, whites)
     if whites:
         _tell(files[0].parent, whites)
         opaque, _ = _fill(images, files, sizes_px, response, encoding, whites, tally=False)
@@ -164,20 +171,34 @@ def _fill(
     images: Float[Tensor, "view channel height width"],
     paths: Sequence[Path],
     sizes_px: Sequence[tuple[int, int]],
-    response: Response,
+    given: Response | None,
     encoding: Encoding,
     whites: _Whites,
     *,
     tally: bool,
-) -> tuple[tuple[Bool[Tensor, "height width"] | None, ...], dict[int, _Tally]]:
-    """Write the radiance of each file into the images; count its levels if that is asked for."""
+) -> tuple[tuple[Bool[Tensor, "height width"] | None, ...], dict[_Kind, _Tally]]:
+    """Write the radiance of each file into the images; count its levels if that is asked for.
+
+    Args:
+        images: Written to.
+        paths: Of the files.
+        sizes_px: Of each.
+        given: Response of all; ``None`` for that of each file.
+        encoding: Of all.
+        whites: Levels of saturation that were found.
+        tally: Count levels.
+    """
     opaque: list[Tensor | None] = []
-    tallies: dict[int, _Tally] = {}
+    tallies: dict[_Kind, _Tally] = {}
     for index in track(range(len(paths))):
         decoded, (wide, high) = decode(paths[index]), sizes_px[index]
-        black, white = _levels(encoding, decoded, paths[index], whites)
+        response = file_response(decoded) if given is None else given
+        kind = (decoded.full, response)
+        black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
         _require_fit(response, decoded, paths[index])
-        radiance = radiance_of(decoded, response, black, white)
+        radiance = radiance_of(decoded, _on_full_scale(response, decoded), black, white)
+        if decoded.colour.srgb_from_file is not None and len(radiance) == 3:
+            radiance = in_srgb_primaries(radiance, decoded.colour.srgb_from_file)
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
         opaque.append(None)
         if decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any()):
@@ -185,12 +206,12 @@ def _fill(
             drawn[:high, :wide] = resized_mask(decoded.alpha, wide, high)
             opaque[-1] = drawn
         if tally:
-            tallies[decoded.bits] = _counted(decoded, images.shape[1], tallies.get(decoded.bits))
+            tallies[kind] = _counted(decoded, images.shape[1], tallies.get(kind))
     return tuple(opaque), tallies
 
 
 def _counted(decoded: Decoded, channels: int, former: _Tally | None) -> _Tally:
-    full = 2**decoded.bits - 1
+    full = decoded.full
     levels = (full * decoded.samples).round().to(torch.int32)
     counts = torch.stack([torch.bincount(one.flatten(), minlength=full + 1) for one in levels])
     counts = counts.expand(channels, -1)
@@ -200,13 +221,29 @@ def _counted(decoded: Decoded, channels: int, former: _Tally | None) -> _Tally:
     return _Tally(counts=former.counts + counts, photographs=former.photographs + often)
 
 
-def _found(tallies: Mapping[int, _Tally], response: Response) -> dict[int, Tensor]:
-    """Give the saturation of files of each depth, where it is below full scale.
+def file_response(decoded: Decoded) -> Response:
+    """Give the response that a file says it has, sRGB where it does not say."""
+    said = decoded.colour.response
+    if said is None or (isinstance(said, Curve) and len(said.radiance) > len(decoded.samples)):
+        return Srgb()
+    return said
+
+
+def _on_full_scale(response: Response, decoded: Decoded) -> Response:
+    """Let a curve that was measured over 16 bits begin and end with those that a file uses."""
+    most = 2**decoded.bits - 1
+    if not isinstance(response, Curve) or response.bits is None or decoded.full == most:
+        return response
+    return replace(response, encoded=response.encoded * most / decoded.full)
+
+
+def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
+    """Give the saturation of files of each kind, where it is below full scale.
 
     A colour that shows none saturates where the highest of the others does.
     """
     whites = {}
-    for bits, tally in tallies.items():
+    for (full, response), tally in tallies.items():
         found = [
             find_saturation(counts, photographs)
             for counts, photographs in zip(tally.counts, tally.photographs, strict=True)
@@ -215,41 +252,57 @@ def _found(tallies: Mapping[int, _Tally], response: Response) -> dict[int, Tenso
         if not levels:
             continue
         filled = [max(levels) if level is None else level for level in found]
-        white = torch.tensor(filled) / (2**bits - 1)
+        white = torch.tensor(filled) / full
         beyond = response.linear_from_encoded(white[:, None, None]).min()
         end = response.linear_from_encoded(torch.ones_like(white)[:, None, None]).max()
         if beyond < SATURATED * end:
-            whites[bits] = white
+            whites[full, response] = white
     return whites
 
 
 def _tell(folder: Path, whites: _Whites) -> None:
-    for bits, white in whites.items():
-        full = 2**bits - 1
+    for (full, _), white in whites.items():
         levels = [str(round(full * float(one))) for one in white]
         same = len(set(levels)) == 1
         text = levels[0] if same else f"{', '.join(levels)} (red, green, blue)"
         warnings.warn(
-            f"{folder}: values of its files of {bits} bits pile up at {text} of {full}, which is "
-            "taken for the level of saturation. If it is not, set `photographs.saturation` to "
-            "the true level, or to 1 for full scale.",
+            f"{folder}: values of its files of {full.bit_length()} bits pile up at {text} of "
+            f"{full}, which is taken for the level of saturation. If it is not, set "
+            "`photographs.saturation` to the true level, or to 1 for full scale.",
+            PimperWarning,
+            stacklevel=4,
+        )
+
+
+def _tell_low(folder: Path, tallies: Mapping[_Kind, _Tally], whites: _Whites) -> None:
+    """Warn of files of 16 bits that may hold 10, 12 or 14, as cameras' sensors do."""
+    deep = {kind: tally for kind, tally in tallies.items() if kind[0] == 2**16 - 1}
+    if not deep or any(kind in whites for kind in deep):
+        return
+    highest = max(int(tally.counts.sum(dim=0).nonzero().max()) for tally in deep.values())
+    bits = next((bits for bits in _SENSOR_BITS if highest < 2**bits), None)
+    if bits is not None:
+        warnings.warn(
+            f"{folder}: no value of its files of 16 bits is above {highest} of 65535. If they hold "
+            f"{bits} bits, full scale is {2**bits - 1}: say so by `photographs.saturation`; "
+            "saturated pixels are taken for radiance otherwise.",
             PimperWarning,
             stacklevel=4,
         )
 
 
 def _levels(
-    encoding: Encoding, decoded: Decoded, path: Path, whites: _Whites
+    encoding: Encoding, decoded: Decoded, path: Path, found: Float[Tensor, " channel"] | None
 ) -> tuple[Float[Tensor, ""], Float[Tensor, " channel"]]:
     """Give black and white of a file as fractions of its full scale.
 
     Raises:
         InputError: Levels above full scale, ones for other colours, or no span between them.
     """
-    full, channels = 2**decoded.bits - 1, decoded.samples.shape[0]
+    full, channels = decoded.full, decoded.samples.shape[0]
     saturation, black = encoding.saturation, encoding.black
     if saturation == "auto":
-        white = whites.get(decoded.bits, torch.ones(channels))[:channels]
+        white = (torch.ones(channels) if found is None else found)[:channels]
         given: tuple[float | int, ...] = ()
     else:
         given = saturation if isinstance(saturation, tuple) else (saturation,) * channels
@@ -257,9 +310,9 @@ def _levels(
     highest = max((black, *given))
     if highest > full:
         raise InputError(
-            f"{path}: holds {decoded.bits} bits, levels 0 to {full}, but a level of {highest:g} is "
-            "given for saturation or black; needed: a level that the files have, or a fraction of "
-            "full scale up to 1."
+            f"{path}: holds {full.bit_length()} bits, levels 0 to {full}, but a level of "
+            f"{highest:g} is given for saturation or black; needed: a level that the files have, "
+            "or a fraction of full scale up to 1."
         )
     if len(white) != channels:
         raise InputError(

@@ -24,11 +24,13 @@ _LAYOUT = (
 def response_of(encoding: Encoding) -> Response:
     """Give the response that was chosen, reading its file if it is a measured one.
 
+    ``auto``, where no file says another, is sRGB.
+
     Raises:
         InputError: As :func:`read_curve`.
     """
     choice = encoding.response
-    if choice == "srgb":
+    if choice in ("auto", "srgb"):
         return Srgb()
     if choice == "linear":
         return Linear()

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pimper_torch.config import require
 
-ResponseChoice = Literal["srgb", "linear"] | float | Path
+ResponseChoice = Literal["auto", "srgb", "linear"] | float | Path
 # A whole number is one of a file's levels.
 SaturationChoice = Literal["auto"] | float | tuple[float | int, float | int, float | int]
 
@@ -20,21 +20,22 @@ class Encoding:
     0.25 and 16384 are the same in files of 16 bits.
 
     Attributes:
-        response: srgb; linear; the exponent of a gamma curve, such as 2.2; or a CSV, JSON or
-            NPY file with a measured response curve.
+        response: auto takes what each file says (its ICC profile, PNG's gAMA and cICP, EXIF),
+            sRGB where it is silent; or, whatever they say, srgb; linear; the exponent of a gamma
+            curve, such as 2.2; a CSV, JSON or NPY file with a measured response curve.
         saturation: Level at which the sensor saturates, one or red, green and blue; auto finds
             it in the photographs, and takes full scale where they show none.
         black: Level that the files hold in the dark.
     """
 
-    response: ResponseChoice = "srgb"
+    response: ResponseChoice = "auto"
     saturation: SaturationChoice = "auto"
     black: float = 0.0
 
     def __post_init__(self) -> None:
         if isinstance(self.response, float):
             usual = 0.1 <= self.response <= 10
-            require(usual, "response", self.response, "srgb, linear, a file, or 0.1 to 10")
+            require(usual, "response", self.response, "auto, srgb, linear, a file, or 0.1 to 10")
         require(0 <= self.black < math.inf, "black", self.black, "0 or more")
         if self.saturation == "auto":
             return
@@ -50,6 +51,8 @@ class Encoding:
             )
 
 
-# What cameras and programs write, and what is proportional to radiance up to full scale.
-SRGB = Encoding()
+# What files say; what most cameras and programs write; what is proportional to radiance up to full
+# scale.
+FROM_FILES = Encoding()
+SRGB = Encoding(response="srgb")
 LINEAR = Encoding(response="linear", saturation=1.0)

@@ -4,12 +4,14 @@ import math
 import os
 import shlex
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -24,13 +26,31 @@ from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.io.version import installed_version
 from pimper_torch.outputs.marker import MARKER
-from pimper_torch.radiometry import Encoding
+from pimper_torch.radiometry import Encoding, linear_from_srgb
 from pimper_torch.records import Mesh, Silhouettes
 from pimper_torch.silhouettes.find import FindSilhouettes
 
 
 def run(*arguments):
     return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def write_profile():
+    """Write photographs anew with a linear profile, and give the pixels of the first."""
+
+    def write(folder):
+        tags, body, start = (b"kTRC", b"desc"), b"curv" + bytes(8), 132 + 24
+        entries = struct.pack(">4sII4sII", tags[0], start, 12, tags[1], start, 12)
+        head = bytearray(128)
+        head[12:24], head[36:40] = b"mntrGRAY" + b"XYZ ", b"acsp"
+        profile = bytes(head) + struct.pack(">I", 2) + entries + body
+        pictures = [np.asarray(Image.open(path)) for path in sorted(folder.iterdir())]
+        for path, picture in zip(sorted(folder.iterdir()), pictures, strict=True):
+            Image.fromarray(picture).save(path, icc_profile=profile)
+        return pictures[0]
+
+    return write
 
 
 def held(folder):
@@ -72,6 +92,23 @@ def test_options_reach_their_stages(photos, chain, tmp_path):
     assert config.photographs == Encoding(response="linear", saturation=(250, 251, 252))
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["response"], summary["photographs"]) == ("linear", str(photos))
+
+
+def test_a_linear_profile_is_followed_unless_a_response_is_given(
+    photos, chain, tmp_path, write_profile, capsys
+):
+    picture = write_profile(photos)
+    stored = torch.from_numpy(picture / 255).movedim(-1, 0)
+    assert run("reconstruct", photos, "-o", tmp_path / "a", "--photographs.response", "auto") == 0
+    config, views, _ = chain.given
+    assert config.photographs == Encoding()
+    assert float((views.images[0].double() - stored).abs().max()) < 1e-6
+    assert "is given" not in capsys.readouterr().err
+    assert run("reconstruct", photos, "-o", tmp_path / "b", "--photographs.response", "srgb") == 0
+    assert float((chain.given[1].images[0].double() - linear_from_srgb(stored)).abs().max()) < 1e-6
+    assert "the response srgb is given, but an ICC profile says linear" in (
+        " ".join(capsys.readouterr().err.split())
+    )
 
 
 def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):

@@ -11,7 +11,7 @@ import scipy.io
 import tifffile
 import torch
 import trimesh
-from PIL import Image
+from PIL import Image, ImageCms
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.config import build, read_mapping, to_yaml
@@ -112,6 +112,12 @@ def _images(root: Path) -> list[Seed]:
     planes = np.moveaxis(deep, -1, 0)
     tifffile.imwrite(root / "planes.tif", planes, photometric="rgb", planarconfig="separate")
     tifffile.imwrite(root / "tiled.tif", deep, photometric="rgb", tile=(16, 16))
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for name in ("profile.jpg", "profile.png", "profile.tif"):
+        Image.fromarray(pixels).save(root / name, icc_profile=profile)
+    with tifffile.TiffWriter(root / "pages.tif") as file:
+        file.write(pixels[::2, ::2], photometric="rgb", subfiletype=1)
+        file.write(pixels, photometric="rgb", extratags=[(281, "H", 3, (255,) * 3, True)])
     Image.fromarray(pixels).save(root / "a.bmp")
     Image.fromarray(pixels).save(root / "a.ppm")
     names = sorted(path.name for path in root.iterdir())

@@ -70,3 +70,48 @@ def write_packbits_tiff():
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def s15(*values):
+    """Numbers as profiles hold them."""
+    return b"".join(struct.pack(">i", round(65536 * value)) for value in values)
+
+
+@pytest.fixture
+def make_profile():
+    """Make ICC profiles: a curve as bytes for all colours, and primaries as columns."""
+
+    def make(curve, columns=None, name="test", space=b"RGB ", connection=b"XYZ ", more=None):
+        colours = b"rgb" if space == b"RGB " else b"k"
+        curves = (curve,) * len(colours) if isinstance(curve, bytes) else curve
+        tags = {bytes([one]) + b"TRC": each for one, each in zip(colours, curves, strict=True)}
+        for one, column in zip(b"rgb", columns or (), strict=False):
+            tags[bytes([one]) + b"XYZ"] = b"XYZ " + bytes(4) + s15(*column)
+        text = name.encode() + b"\0"
+        tags[b"desc"] = b"desc" + bytes(4) + struct.pack(">I", len(text)) + text + bytes(78)
+        tags |= more or {}
+        tags[b"wtpt"] = b"XYZ " + bytes(4) + s15(0.9642, 1, 0.8249)
+        head = bytearray(128)
+        head[8:12], head[12:24], head[36:40] = b"\2\x40\0\0", b"mntr" + space + connection, b"acsp"
+        head[68:80] = s15(0.9642, 1, 0.8249)
+        start, entries, body = 132 + 12 * len(tags), b"", b""
+        for tag, data in tags.items():
+            entries += struct.pack(">4sII", tag, start + len(body), len(data))
+            body += data + bytes(-len(data) % 4)
+        head[:4] = struct.pack(">I", start + len(body))
+        return bytes(head) + struct.pack(">I", len(tags)) + entries + body
+
+    return make
+
+
+@pytest.fixture
+def png_with():
+    """Write 8-bit RGB PNG with chunks before its pixels."""
+
+    def write(path: Path, array: np.ndarray, **chunks: bytes) -> None:
+        Image.fromarray(array).save(path)
+        data = path.read_bytes()
+        extra = b"".join(_chunk(name.encode(), data) for name, data in chunks.items())
+        path.write_bytes(data[:33] + extra + data[33:])
+
+    return write

@@ -9,7 +9,8 @@ import tyro
 
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output, stage
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, caution, held
+from pimper_torch.io.file_cautions import CONTRADICTED
 from pimper_torch.io.photographs import list_images, load_views, read_mask
 from pimper_torch.radiometry import LINEAR
 from pimper_torch.single_view.factorization.gamma import GammaEstimate, gamma_of_photographs
@@ -25,8 +26,11 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         PimperError: Photographs that cannot be read, or too few under too few lights.
     """
     job = checked(command, arguments)
-    with output.observer() as observer, stage(observer, "read"):
+    with output.observer() as observer, stage(observer, "read"), held() as messages:
         views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
+    for message in messages:
+        if CONTRADICTED not in message:  # values are looked at as they are, whatever files say
+            caution(message)
     drawn = None if job.mask is None else read_mask(job.mask, job.max_size_px)
     found = gamma_of_photographs(views, mask=drawn, rank=job.rank)
     output.say(f"{found}{advice(found)}")

@@ -1,0 +1,68 @@
+"""What a file says about how its samples encode radiance."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.radiometry.response import Curve, Gamma, Linear, Response, Srgb
+
+# Half a level of 255: what no file of 8 bits tells from the curve itself.
+_SAME = 0.5 / 255
+_STEPS = 1025
+# Responses that differ by so much of full scale disagree: gamma 2.2 and sRGB do not, by 0.008.
+_DISAGREE = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Colour:
+    """What a file says about its samples.
+
+    Attributes:
+        source: Where it says so, such as ``ICC profile "Display P3"``; empty where it is silent.
+        response: ``None`` where it says nothing, or nothing that can be followed.
+        srgb_from_file: From linear values to linear sRGB; ``None`` where primaries are those of
+            sRGB, or not told.
+        trouble: What about it cannot be followed; empty where all can.
+    """
+
+    source: str = ""
+    response: Response | None = None
+    srgb_from_file: Float[Tensor, "3 3"] | None = None
+    trouble: str = ""
+
+
+SILENT = Colour()
+
+
+def plain(response: Response) -> Response:
+    """Give the standard response that a file's own cannot be told from, or the file's own."""
+    levels = torch.linspace(0, 1, _STEPS, dtype=torch.float64)
+    known: tuple[Response, ...] = (Linear(), Srgb())
+    for standard in known:
+        again = standard.encoded_from_linear(_through(response, levels))
+        if float((again - levels).abs().max()) <= _SAME:
+            return standard
+    return response
+
+
+def disagree(one: Response, other: Response) -> bool:
+    """Tell whether two responses give radiance that differs by more than 0.02 of full scale."""
+    levels = torch.linspace(0, 1, _STEPS, dtype=torch.float64)
+    return float((_through(one, levels) - _through(other, levels)).abs().max()) > _DISAGREE
+
+
+def told(response: Response) -> str:
+    """Name a response as the option does."""
+    if isinstance(response, Linear):
+        return "linear"
+    if isinstance(response, Srgb):
+        return "srgb"
+    return f"{response.exponent:.4g}" if isinstance(response, Gamma) else "a curve"
+
+
+def _through(response: Response, levels: Float[Tensor, " level"]) -> Float[Tensor, "channel level"]:
+    rows = len(response.radiance) if isinstance(response, Curve) else 1
+    spread = levels.expand(rows, 1, -1)
+    return response.linear_from_encoded(spread)[:, 0]
