@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pimper_torch.errors import InputError
 
 _SUFFIXES = re.compile(
-    r"(\.(jpe?g|png|tiff?|bmp|webp|gif|hei[cf]|avif|dng|cr[23]|nef|arw|orf|raf|rw2))+$",
+    r"(\.(jpe?g|png|tiff?|bmp|webp|gif|hei[cf]|hif|avif|dng|cr[23w]|nef|nrw|arw|sr2|orf|raf|rw[2l]|pef|srw|3fr|iiq))+$",
     re.IGNORECASE,
 )
 # What programs write for a space, and runs of it that they shorten.

@@ -16,6 +16,8 @@ from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageErr
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.io.extras import is_heic, is_raw
+from pimper_torch.io.heic import read_heic, read_heic_head
 from pimper_torch.io.icc import read_profile
 from pimper_torch.io.profiles import (
     PngHead,
@@ -24,6 +26,7 @@ from pimper_torch.io.profiles import (
     colour_of_tiff,
     png_head,
 )
+from pimper_torch.io.raw import read_raw, read_raw_head
 from pimper_torch.io.tiff import (
     CMYK_CAUTION,
     Layout,
@@ -61,6 +64,7 @@ class Header(Record):
         channels: 1 or 3; alpha not counted.
         deep: True for 16-bit samples in several channels, which Pillow would cut to 8.
         full: Level that is full scale, 255 or 65535, or less of 16 bits where a TIFF says so.
+        full_told: The file itself says what its full scale is.
         significant: Bits of 16 that a PNG says are no filling; 16 where it is silent.
         colour: What the file says about its samples.
         cautions: What it says and is not followed, each a sentence without its subject.
@@ -74,6 +78,7 @@ class Header(Record):
     channels: int
     deep: bool
     full: int = 255
+    full_told: bool = False
     significant: int = 16
     colour: Colour = SILENT
     cautions: tuple[str, ...] = ()
@@ -90,6 +95,7 @@ class Decoded(Record):
         lossy: True for JPEG, whose samples ring round edges.
         full: Level of the file that is full scale, a sample of 1: 255, 65535, or what the file
             says.
+        full_told: The file itself says so.
         colour: What the file says about its samples.
     """
 
@@ -97,6 +103,7 @@ class Decoded(Record):
     alpha: Float[Tensor, "height width"] | None
     lossy: bool
     full: int
+    full_told: bool = False
     colour: Colour = SILENT
 
     @property
@@ -109,10 +116,14 @@ def read_header(path: Path | str) -> Header:
     """Read size, orientation and focal length of an image file.
 
     Raises:
-        InputError: Names a file that is no JPEG, PNG or TIFF, is damaged, or is too large
-            to be a photograph.
+        InputError: Names a file that is no JPEG, PNG or TIFF, HEIC or camera raw, is damaged,
+            is too large to be a photograph, or needs a package that is not installed.
     """
     path = Path(path)
+    if is_heic(path):
+        return _guarded(path, lambda: _header_of_heic(path))
+    if is_raw(path):
+        return _guarded(path, lambda: _header_of_raw(path))
 
     def read(image: Image.Image) -> Header:
         layout = None
@@ -146,6 +157,61 @@ def read_header(path: Path | str) -> Header:
     return _with_image(path, read, whole=False)
 
 
+def _header_of_heic(path: Path) -> Header:
+    _refuse_bytes(path)
+    head = read_heic_head(path)
+    channels = 1 if head.gray else 3
+    _refuse_huge(path, head.width, head.height, channels)
+    said = colour_of_exif(head.exif) if head.colour is SILENT else head.colour
+    return Header(
+        width=head.width,
+        height=head.height,
+        orientation=1,
+        focal_px=focal_from_exif(head.exif.get_ifd(ExifTags.IFD.Exif), head.width, head.height),
+        channels=channels,
+        deep=head.full > _FULL_SCALE[np.dtype(np.uint8)],
+        full=head.full,
+        colour=said,
+    )
+
+
+def _header_of_raw(path: Path) -> Header:
+    _refuse_bytes(path)
+    head = read_raw_head(path)
+    _refuse_huge(path, head.width, head.height, 1)  # one sample a pixel, whatever its colour
+    width, height = head.width, head.height
+    if head.orientation >= 5:
+        width, height = height, width
+    return Header(
+        width=width,
+        height=height,
+        orientation=head.orientation,
+        focal_px=focal_from_exif(head.exif.get_ifd(ExifTags.IFD.Exif), width, height),
+        channels=1 if head.gray else 3,
+        deep=True,
+        full=_FULL_SCALE[np.dtype(np.uint16)],
+        full_told=True,
+        colour=head.colour,
+        cautions=head.cautions,
+    )
+
+
+def _guarded(path: Path, read: Callable[[], Result]) -> Result:
+    """Turn whatever a library raises of a file into one error."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return read()
+    except (InputError, MemoryError):
+        raise
+    except OSError as error:
+        if error.errno is not None:
+            raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+        raise _damaged(path) from error
+    except Exception as error:  # libheif's bindings raise ValueError, EOFError and others
+        raise _damaged(path) from error
+
+
 def decode(path: Path | str) -> Decoded:
     """Read an image file at full depth and turn it as EXIF says.
 
@@ -156,7 +222,11 @@ def decode(path: Path | str) -> Decoded:
     """
     path = Path(path)
     header = read_header(path)
-    if header.deep:
+    if is_heic(path):
+        array = _guarded(path, lambda: read_heic(path))
+    elif is_raw(path):
+        array = rotated(_guarded(path, lambda: read_raw(path)), header.orientation)
+    elif header.deep:
         array = rotated(_read_deep(path, header.layout), header.orientation)
     else:
         array = _with_image(path, lambda image: _read_shallow(image, header.layout))
@@ -164,6 +234,8 @@ def decode(path: Path | str) -> Decoded:
         raise _unfit(path, str(array.dtype))
     full = _full_scale(array, header)
     array = array[..., None] if array.ndim == 2 else array
+    if array.shape[:2] != (header.height, header.width):
+        raise _damaged(path)
     # Plane by plane, so that no more memory is taken than is returned.
     planes = torch.empty(array.shape[2], *array.shape[:2])
     for plane, channel in zip(planes, np.moveaxis(array, -1, 0), strict=True):
@@ -172,8 +244,9 @@ def decode(path: Path | str) -> Decoded:
     return Decoded(
         samples=planes[:-1] if has_alpha else planes,
         alpha=planes[-1] if has_alpha else None,
-        lossy=path.suffix.lower() in (".jpg", ".jpeg"),
+        lossy=path.suffix.lower() in (".jpg", ".jpeg") or is_heic(path),
         full=full,
+        full_told=header.full_told,
         colour=header.colour,
     )
 
@@ -281,6 +354,15 @@ def _mode_cautions(image: Image.Image) -> list[str]:
     if image.mode != "CMYK" or isinstance(image, TiffImagePlugin.TiffImageFile):
         return []
     return [CMYK_CAUTION]
+
+
+def _refuse_bytes(path: Path) -> None:
+    """Refuse, before a library reads it into memory, a file larger than any photograph."""
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(
+            f"{path}: has {path.stat().st_size} bytes; needed: at most {_MAX_BYTES // 2**30} GB. "
+            "Scale it down."
+        )
 
 
 def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:

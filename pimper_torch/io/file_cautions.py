@@ -15,7 +15,7 @@ CONTRADICTED = "is given, but"
 
 
 def tell_cautions(
-    folder: Path, paths: Sequence[Path], headers: Sequence[Header], encoding: Encoding
+    folder: Path | str, paths: Sequence[Path | str], headers: Sequence[Header], encoding: Encoding
 ) -> None:
     """Warn of what photographs say and is not followed.
 
@@ -28,7 +28,7 @@ def tell_cautions(
     kinds: dict[str, list[str]] = defaultdict(list)
     for path, header in zip(paths, headers, strict=True):
         for sentence in (*header.cautions, *_of_colour(header, encoding)):
-            kinds[sentence].append(path.name)
+            kinds[sentence].append(Path(path).name)
     for sentence, names in kinds.items():
         caution(
             f"{folder}: {len(names)} of {len(paths)} photographs ({some(names, 4)}): {sentence}.",

@@ -15,6 +15,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError, PimperWarning, some
 from pimper_torch.file_names import match_files
 from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header
+from pimper_torch.io.extras import installed_suffixes, is_heic, is_raw, load_extra
 from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.io.turned_masks import choose_ways, mask_ways
@@ -34,10 +35,12 @@ _MASK = re.compile(r"[ _.-]?mask((\.[A-Za-z]+)+)$", re.IGNORECASE)
 # What people take for photographs, and is none of SUFFIXES: images, camera raw, video.
 _PICTURES = re.compile(
     r"\.(gif|hei[cf]|avif|webp|bmp|jp2|jxl|psd|exr|hdr|p[pg]m"
-    r"|cr[23]|nef|arw|dng|orf|raf|rw2|pef|srw|3fr|iiq|raw"
+    r"|cr[23w]|n(ef|rw)|arw|sr2|dng|orf|raf|rw[2l]|pef|srw|3fr|iiq|raw|hif"
     r"|mp4|mov|avi|mkv|m4v|webm|mts)",
     re.IGNORECASE,
 )
+
+_MORE = "HEIC and camera raw where no other is of the same name and their extras are installed"
 
 
 def load_views(
@@ -50,7 +53,8 @@ def load_views(
 ) -> Views:
     """Read the photographs of a folder, in the natural order of their names.
 
-    JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette; links are followed. Other files,
+    JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette, HEIC and camera raw where their
+    extras are installed; links are followed. Other files,
     hidden ones and folders inside are passed over, with a warning where they look like
     photographs. EXIF's orientation is applied, its focal length kept in pixels. The response is
     undone, so that radiance is linear: the one given, else the one that each file tells by its ICC
@@ -90,7 +94,7 @@ def load_views(
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
     paths = list_images(Path(folder))
     _check_count(Path(folder), paths)
-    _tell_passed_over(Path(folder))
+    _tell_passed_over(Path(folder), paths)
     headers = [read_header(path) for path in paths]
     tell_cautions(Path(folder), paths, headers, encoding)
     mask_paths = _match_masks(paths, Path(masks)) if masks is not None else None
@@ -154,12 +158,13 @@ def list_images(folder: Path | str) -> list[Path]:
         entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
-    paths = [path for path in entries if path.suffix.lower() in SUFFIXES and path.is_file()]
+    paths = _readable(entries)
     if not paths:
+        _refuse_absent(entries)
         content = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
         raise InputError(
-            f"{folder}: no images; {content}. Read are files ending in {', '.join(SUFFIXES)}, not "
-            "those in folders inside."
+            f"{folder}: no images; {content}. Read are files ending in {', '.join(SUFFIXES)}, "
+            f"{_MORE}, not those in folders inside."
         )
     paths.sort(key=lambda path: _natural(path.name))
     stems: dict[str, Path] = {}
@@ -173,13 +178,35 @@ def list_images(folder: Path | str) -> list[Path]:
     return paths
 
 
-def _tell_passed_over(folder: Path) -> None:
+def _readable(entries: Sequence[Path]) -> list[Path]:
+    """Choose the image files; HEIC and camera raw beside a JPEG of the same name are passed over.
+
+    Cameras and telephones write both of one photograph.
+    """
+    files = [path for path in entries if path.is_file()]
+    plain = [path for path in files if path.suffix.lower() in SUFFIXES]
+    stems, more = {path.stem.casefold() for path in plain}, installed_suffixes()
+    others = [
+        path for path in files if path.suffix.lower() in more and path.stem.casefold() not in stems
+    ]
+    return plain + others
+
+
+def _refuse_absent(entries: Sequence[Path]) -> None:
+    """Name the package that a folder of nothing but HEIC or camera raw needs."""
+    for path in sorted(entries):
+        if path.is_file() and (is_heic(path) or is_raw(path)):
+            load_extra("heic" if is_heic(path) else "raw", path)
+
+
+def _tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
     """Warn of what looks like photographs and is not read, kind by kind with its count."""
+    names = {path.name for path in read}
     kinds: Counter[str] = Counter()
     examples: list[str] = []
     for path in sorted(folder.iterdir()):
         suffix = path.suffix.lower()
-        if path.name.startswith("."):
+        if path.name.startswith(".") or path.name in names:
             continue
         if path.is_symlink() and not path.exists():
             kind = "broken link"
@@ -194,8 +221,8 @@ def _tell_passed_over(folder: Path) -> None:
         counts = ", ".join(f"{kind} ({count})" for kind, count in kinds.items())
         warnings.warn(
             f"{folder}: these were not read: {counts}; {some(examples)}. Read are files ending in "
-            f"{', '.join(SUFFIXES)}, not those in folders inside. Convert or move what belongs to "
-            "the photographs.",
+            f"{', '.join(SUFFIXES)}, {_MORE}, not those in folders inside. Convert or move what "
+            "belongs to the photographs.",
             PimperWarning,
             stacklevel=3,
         )

@@ -32,7 +32,7 @@ _EXIF_GAMMA, _UNCALIBRATED, _ADOBE = 0xA500, 65535, "R03"
 _ADOBE_GAMMA = 563 / 256  # Adobe RGB (1998)
 # Of ITU-T H.273, as cICP and HEIC have them.
 _PRIMARIES: Mapping[int, Chromaticities] = {1: REC_709, 9: REC_2020, 12: DISPLAY_P3}
-_PRIMARIES_UNTOLD = 2
+_UNTOLD = 2
 _REC_709_CURVE = (1, 6, 14, 15)
 _STEPS = 4097
 
@@ -50,11 +50,11 @@ class PngHead:
     bare: bool = False
 
 
-def png_head(path: Path) -> PngHead:
+def png_head(path: Path | str) -> PngHead:
     """Walk over a PNG's chunks, reading only those that tell of samples."""
     chunks: dict[bytes, bytes] = {}
     bare, told = True, True
-    with path.open("rb") as file:
+    with Path(path).open("rb") as file:
         file.seek(8)
         while len(head := file.read(8)) == 8:
             length, kind = int.from_bytes(head[:4], "big"), head[4:]
@@ -118,14 +118,17 @@ def colour_of_codes(primaries: int, curve: int, source: str, *, narrow: bool = F
 
     Args:
         primaries: 1 sRGB's, 9 BT.2020, 12 Display P3; 2 where they are not told.
-        curve: 13 sRGB, 8 linear, 4 and 5 gamma 2.2 and 2.8, 1, 6, 14 and 15 BT.709.
+        curve: 13 sRGB, 8 linear, 4 and 5 gamma 2.2 and 2.8, 1, 6, 14 and 15 BT.709; 2 where it
+            is not told.
         source: Where it stands, for messages.
         narrow: Samples are no RGB over the full range.
     """
-    response: Response
+    response: Response | None
     if narrow:
         return Colour(source=source, trouble="tells of samples that are no RGB of full range")
-    if curve in _REC_709_CURVE:
+    if curve == _UNTOLD:
+        response = None
+    elif curve in _REC_709_CURVE:
         level = torch.linspace(0, 1, _STEPS, dtype=torch.float64)
         curved = ((level + 0.099) / 1.099) ** (1 / 0.45)
         response = table(torch.where(level < 0.081, level / 4.5, curved))
@@ -135,14 +138,14 @@ def colour_of_codes(primaries: int, curve: int, source: str, *, narrow: bool = F
         response = Linear() if curve == 8 else Srgb()
     else:
         return Colour(source=source, trouble=f"names transfer {curve}, of HDR or film")
-    if primaries == _PRIMARIES_UNTOLD:
+    if primaries == _UNTOLD:
         return Colour(source=source, response=response)
     if primaries not in _PRIMARIES:
         return Colour(source=source, response=response, trouble=f"names primaries {primaries}")
     return _with_primaries(source, response, _PRIMARIES[primaries])
 
 
-def _with_primaries(source: str, response: Response, told: Chromaticities) -> Colour:
+def _with_primaries(source: str, response: Response | None, told: Chromaticities) -> Colour:
     xyz = primaries_of(told)
     matrix = None if xyz is None else srgb_from_primaries(xyz)
     if matrix is None:

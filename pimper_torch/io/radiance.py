@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -44,8 +45,14 @@ class Pictures(Record):
     opaque: tuple[Bool[Tensor, "height width"] | None, ...]
 
 
-# Files of one kind: their level of full scale, and their response.
-_Kind = tuple[int, Response]
+class _Kind(NamedTuple):
+    """Files of one kind: their level of full scale, whether they tell it, and their response."""
+
+    full: int
+    full_told: bool
+    response: Response
+
+
 # Levels of saturation of files of a kind, fractions of full scale, one a colour.
 _Whites = Mapping[_Kind, Float[Tensor, " channel"]]
 
@@ -193,7 +200,7 @@ def _fill(
     for index in track(range(len(paths))):
         decoded, (wide, high) = decode(paths[index]), sizes_px[index]
         response = file_response(decoded) if given is None else given
-        kind = (decoded.full, response)
+        kind = _Kind(decoded.full, decoded.full_told, response)
         black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
         _require_fit(response, decoded, paths[index])
         radiance = radiance_of(decoded, _on_full_scale(response, decoded), black, white)
@@ -243,7 +250,7 @@ def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
     A colour that shows none saturates where the highest of the others does.
     """
     whites = {}
-    for (full, response), tally in tallies.items():
+    for kind, tally in tallies.items():
         found = [
             find_saturation(counts, photographs)
             for counts, photographs in zip(tally.counts, tally.photographs, strict=True)
@@ -252,16 +259,17 @@ def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
         if not levels:
             continue
         filled = [max(levels) if level is None else level for level in found]
-        white = torch.tensor(filled) / full
-        beyond = response.linear_from_encoded(white[:, None, None]).min()
-        end = response.linear_from_encoded(torch.ones_like(white)[:, None, None]).max()
+        white = torch.tensor(filled) / kind.full
+        beyond = kind.response.linear_from_encoded(white[:, None, None]).min()
+        end = kind.response.linear_from_encoded(torch.ones_like(white)[:, None, None]).max()
         if beyond < SATURATED * end:
-            whites[full, response] = white
+            whites[kind] = white
     return whites
 
 
 def _tell(folder: Path, whites: _Whites) -> None:
-    for (full, _), white in whites.items():
+    for kind, white in whites.items():
+        full = kind.full
         levels = [str(round(full * float(one))) for one in white]
         same = len(set(levels)) == 1
         text = levels[0] if same else f"{', '.join(levels)} (red, green, blue)"
@@ -276,7 +284,11 @@ def _tell(folder: Path, whites: _Whites) -> None:
 
 def _tell_low(folder: Path, tallies: Mapping[_Kind, _Tally], whites: _Whites) -> None:
     """Warn of files of 16 bits that may hold 10, 12 or 14, as cameras' sensors do."""
-    deep = {kind: tally for kind, tally in tallies.items() if kind[0] == 2**16 - 1}
+    deep = {
+        kind: tally
+        for kind, tally in tallies.items()
+        if kind.full == 2**16 - 1 and not kind.full_told
+    }
     if not deep or any(kind in whites for kind in deep):
         return
     highest = max(int(tally.counts.sum(dim=0).nonzero().max()) for tally in deep.values())

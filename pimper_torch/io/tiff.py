@@ -65,13 +65,13 @@ class Layout:
     cautions: tuple[str, ...] = ()
 
 
-def layout_of(path: Path, image: TiffImagePlugin.TiffImageFile) -> Layout:
+def layout_of(path: Path | str, image: TiffImagePlugin.TiffImageFile) -> Layout:
     """Find the picture among a TIFF's pages, and leave the image at it.
 
     Raises:
         InputError: None of its pages is a photograph that can be read.
     """
-    page, cautions = _picture(path, image)
+    page, cautions = _picture(Path(path), image)
     tags: Mapping[int, Any] = image.tag_v2
     bits = tags.get(_BITS, (1,))
     photometric = tags.get(_PHOTOMETRIC, _WHITE_IS_ZERO)
@@ -154,7 +154,7 @@ def _full(tags: Mapping[int, Any], bits: int) -> int:
     return full
 
 
-def read_deep_tiff(path: Path, layout: Layout) -> np.ndarray:
+def read_deep_tiff(path: Path | str, layout: Layout) -> np.ndarray:
     """Read colour of more than 8 bits, ``height width channel``; opacity comes last.
 
     Raises:
@@ -197,7 +197,7 @@ def read_gray_tiff(image: Image.Image, layout: Layout | None) -> np.ndarray:
     return (layout.full - np.minimum(array, layout.full)).astype(np.uint16)
 
 
-def unread_tiff(path: Path) -> str:
+def unread_tiff(path: Path | str) -> str:
     """Tell why Pillow does not know a TIFF: the kind of its samples, or a sentence; else empty."""
     try:
         with tifffile.TiffFile(path) as file:

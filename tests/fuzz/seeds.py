@@ -1,9 +1,12 @@
 """Small valid files of every kind that the package reads, and their readers."""
 
 import json
+import sys
 import warnings
+from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +15,10 @@ import tifffile
 import torch
 import trimesh
 from PIL import Image, ImageCms
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
+from dng import write_dng
+from heic_files import UPRIGHT
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.config import build, read_mapping, to_yaml
@@ -118,6 +125,10 @@ def _images(root: Path) -> list[Seed]:
     with tifffile.TiffWriter(root / "pages.tif") as file:
         file.write(pixels[::2, ::2], photometric="rgb", subfiletype=1)
         file.write(pixels, photometric="rgb", extratags=[(281, "H", 3, (255,) * 3, True)])
+    if find_spec("rawpy"):
+        write_dng(root / "a.dng", np.tile(deep[..., 1] // 16, (2, 2)), equivalent=50)
+    if find_spec("pi_heif") or find_spec("pillow_heif"):
+        (root / "a.heic").write_bytes(b64decode(UPRIGHT))
     Image.fromarray(pixels).save(root / "a.bmp")
     Image.fromarray(pixels).save(root / "a.ppm")
     names = sorted(path.name for path in root.iterdir())

@@ -1,0 +1,215 @@
+import importlib.util
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.io.decode import decode, read_header, rotated
+from pimper_torch.io.photographs import list_images, load_views
+from pimper_torch.radiometry import Encoding, Linear, srgb_from_linear
+from pimper_torch.radiometry.srgb import linear_from_srgb
+from tests.io.dng import XYZ_TO_CAMERA, write_dng
+
+SRGB_TO_XYZ = torch.tensor(
+    [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.1191920, 0.9503041],
+    ],
+    dtype=torch.float64,
+)
+NEUTRAL = torch.tensor([0.5, 1.0, 0.7], dtype=torch.float64)
+BLACK, WHITE = 256, 4000
+X_TRANS = np.array(
+    [
+        [1, 1, 0, 1, 1, 2],
+        [1, 1, 2, 1, 1, 0],
+        [2, 0, 1, 0, 2, 1],
+        [1, 1, 2, 1, 1, 0],
+        [1, 1, 0, 1, 1, 2],
+        [0, 2, 1, 2, 0, 1],
+    ]
+)
+
+
+@pytest.fixture(autouse=True)
+def needs_rawpy():
+    pytest.importorskip("rawpy")
+
+
+@pytest.fixture
+def colours():
+    """Radiance in sRGB's primaries that changes linearly, so that interpolation is exact."""
+    v, u = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
+    planes = torch.stack([0.10 + u / 300, 0.15 + v / 250, 0.12 + (u + v) / 500]).double()
+    return planes
+
+
+def sensor_of(colours):
+    """What a camera of this matrix measures, saturation 1, and red and blue weaker than green."""
+    matrix = torch.tensor(XYZ_TO_CAMERA, dtype=torch.float64) @ SRGB_TO_XYZ
+    matrix = matrix / matrix.sum(dim=1, keepdim=True)
+    return torch.einsum("ij,jhw->ihw", NEUTRAL[:, None] * matrix, colours)
+
+
+def mosaic_of(sensor):
+    """Take one colour a pixel, as a sensor does."""
+    planes = sensor.clone()
+    out = planes[1].clone()
+    out[::2, ::2], out[1::2, 1::2] = planes[0, ::2, ::2], planes[2, 1::2, 1::2]
+    return (BLACK + (WHITE - BLACK) * out).round().clamp(0, WHITE).numpy().astype(np.uint16)
+
+
+@pytest.fixture
+def folder(tmp_path, colours):
+    for index in range(3):
+        write_dng(tmp_path / f"{index}.dng", mosaic_of(sensor_of(colours)), equivalent=50)
+    return tmp_path
+
+
+def test_raw_is_linear_radiance_in_the_primaries_of_srgb(folder, colours):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = load_views(folder).images[0].double()
+    inner = (slice(None), slice(3, -3), slice(3, -3))
+    scale = (colours / found)[inner].median()
+    assert_close(scale * found[inner], colours[inner], rtol=0, atol=0.002)  # 3,744 levels
+    colour = read_header(folder / "0.dng").colour
+    assert (colour.response, colour.source) == (Linear(), "camera raw")
+
+
+def test_samples_are_what_the_sensor_saw_between_black_and_saturation(folder, colours):
+    decoded = decode(folder / "0.dng")
+    assert (decoded.full, decoded.full_told, decoded.lossy) == (65535, True, False)
+    inner = (slice(None), slice(3, -3), slice(3, -3))
+    wanted = sensor_of(colours)[inner].float()
+    assert_close(decoded.samples[inner], wanted, rtol=0, atol=5e-4)  # a level of 3,744
+
+
+def test_a_level_of_saturation_below_full_scale_is_counted_from_black(folder, monkeypatch, colours):
+    monkeypatch.setattr("pimper_torch.io.raw._white", lambda _: 3000)
+    inner = (slice(None), slice(3, -3), slice(3, -3))
+    found = decode(folder / "0.dng").samples
+    wanted = sensor_of(colours).float() * (WHITE - BLACK) / (3000 - BLACK)
+    assert_close(found[inner], wanted[inner], rtol=0, atol=5e-4)
+
+
+def test_dark_raw_is_not_taken_for_fewer_bits_and_scales_with_exposure(tmp_path, colours):
+    for index, exposure in enumerate((1.0, 0.25, 0.25)):
+        write_dng(tmp_path / f"{index}.dng", mosaic_of(exposure * sensor_of(colours)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        images = load_views(tmp_path).images.double()
+    inner = (slice(None), slice(3, -3), slice(3, -3))
+    # No brightening, whatever the picture: a quarter of the light is a quarter of the radiance.
+    assert_close(images[1][inner], images[0][inner] / 4, rtol=0, atol=5e-4)
+
+
+def test_whatever_a_saturated_sample_reaches_is_saturated(tmp_path, colours):
+    sensor = sensor_of(colours)
+    sensor[:, 10:14, 20:24] = 5.0
+    sensor[:, 30, 40] = 5.0  # one sample of red alone
+    for index in range(3):
+        write_dng(tmp_path / f"{index}.dng", mosaic_of(sensor))
+    images = load_views(tmp_path).images
+    wanted = torch.zeros(40, 60, dtype=torch.bool)
+    wanted[9:15, 19:25] = True
+    wanted[29:32, 39:42] = True
+    assert torch.equal((images[0] == 1).all(dim=0), wanted)
+    assert float(images[0][:, ~wanted].max()) < 0.9
+
+
+def test_other_sensors_and_all_colours_a_pixel_are_read_too(tmp_path, colours):
+    sensor = sensor_of(colours)
+    sensor[:, 10:13, 20:23] = 5.0
+    whole = (BLACK + (WHITE - BLACK) * sensor).round().clamp(0, WHITE).movedim(0, -1)
+    write_dng(tmp_path / "all.dng", whole.numpy().astype(np.uint16))
+    index = torch.from_numpy(np.tile(X_TRANS, (7, 10))[:40, :60])
+    one = whole.gather(2, index[..., None])[..., 0].numpy().astype(np.uint16)
+    write_dng(tmp_path / "x.dng", one, pattern=X_TRANS)
+    for name, reach in (("all", 0), ("x", 3)):
+        samples = decode(tmp_path / f"{name}.dng").samples
+        wanted = torch.zeros(40, 60, dtype=torch.bool)
+        wanted[10 - reach : 13 + reach, 20 - reach : 23 + reach] = True
+        full = (samples == 1).all(dim=0)
+        assert torch.equal(full, wanted)
+        away = (slice(None), slice(20, -8), slice(8, -8))
+        ratio = samples[away] / sensor[away].float()
+        assert float((ratio / ratio.median() - 1).abs().max()) < 0.03
+
+
+@pytest.mark.parametrize(("orientation", "size"), [(1, (60, 40)), (3, (60, 40)), (6, (40, 60))])
+def test_raw_is_turned_as_its_exif_says(tmp_path, colours, orientation, size):
+    mosaic = mosaic_of(sensor_of(colours))
+    write_dng(tmp_path / "a.dng", mosaic)
+    write_dng(tmp_path / "b.dng", mosaic, orientation=orientation, equivalent=50)
+    header = read_header(tmp_path / "b.dng")
+    assert (header.orientation, (header.width, header.height)) == (orientation, size)
+    upright = decode(tmp_path / "a.dng").samples.movedim(0, -1).numpy()
+    wanted = torch.from_numpy(rotated(upright, orientation)).movedim(-1, 0)
+    assert torch.equal(decode(tmp_path / "b.dng").samples, wanted)
+    diagonal = np.hypot(60, 40) / np.hypot(36, 24)
+    assert header.focal_px == pytest.approx(50 * diagonal)
+    assert np.isnan(read_header(tmp_path / "a.dng").focal_px)
+
+
+def test_a_response_that_is_given_wins_over_raw_too(folder):
+    with pytest.warns(PimperWarning, match="srgb is given, but camera raw says linear"):
+        load_views(folder, encoding=Encoding(response="srgb"))
+
+
+def test_raw_beside_a_jpeg_of_the_same_name_is_passed_over(folder, colours):
+    picture = (255 * srgb_from_linear(colours)).round().to(torch.uint8).movedim(0, -1).numpy()
+    for index in range(3):
+        Image.fromarray(picture).save(folder / f"{index}.jpg", quality=100)
+    assert [path.suffix for path in list_images(folder)] == [".jpg"] * 3
+    with pytest.warns(PimperWarning, match=r"were not read: DNG \(3\)"):
+        found = load_views(folder).images[0]
+    wanted = linear_from_srgb(torch.from_numpy(picture / 255).movedim(-1, 0)).float()
+    assert float((found - wanted).abs().mean()) < 0.01
+
+
+def test_raw_and_jpeg_of_other_names_are_one_set(folder, colours):
+    picture = (255 * srgb_from_linear(colours)).round().to(torch.uint8).movedim(0, -1).numpy()
+    Image.fromarray(picture).save(folder / "5.png")
+    images = load_views(folder).images.double()
+    inner = (slice(None), slice(3, -3), slice(3, -3))
+    scale = (images[3] / images[0])[inner].median()
+    assert_close(scale * images[0][inner], images[3][inner], rtol=0, atol=0.005)
+
+
+def test_without_its_package_raw_is_refused_with_what_to_install(folder, monkeypatch, pixels):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        "pimper_torch.io.extras.find_spec", lambda name: None if name == "rawpy" else find(name)
+    )
+    with pytest.raises(InputError, match=r'0\.dng: is camera raw.*pip install "pimper_torch\[raw'):
+        load_views(folder)
+    with pytest.raises(InputError, match=r'pip install "pimper_torch\[raw\]"'):
+        read_header(folder / "1.dng")
+    for index in range(3):  # with others, it is passed over with a word
+        Image.fromarray(pixels).save(folder / f"p{index}.png")
+    with pytest.warns(PimperWarning, match=r"were not read: DNG \(3\).*their extras"):
+        assert load_views(folder).num_views == 3
+
+
+def test_damaged_and_huge_raw_is_refused_by_name(tmp_path, colours, monkeypatch):
+    mosaic = mosaic_of(sensor_of(colours))
+    write_dng(tmp_path / "a.dng", mosaic)
+    whole = (tmp_path / "a.dng").read_bytes()
+    for fraction in (0, 0.001, 0.3, 0.9):
+        (tmp_path / "cut.dng").write_bytes(whole[: int(fraction * len(whole))])
+        with pytest.raises(InputError, match=r"cut\.dng"):
+            decode(tmp_path / "cut.dng")
+    write_dng(tmp_path / "huge.dng", mosaic, size=(30000, 20000))
+    with pytest.raises(InputError, match=r"huge\.dng: cannot be read as camera raw"):
+        decode(tmp_path / "huge.dng")  # more than its bytes hold
+    monkeypatch.setattr("pimper_torch.io.decode.MAX_PIXELS", 1000)
+    with pytest.raises(InputError, match=r"a\.dng: has 60 x 40 pixels"):
+        decode(tmp_path / "a.dng")
+    with pytest.raises(InputError, match=r"gone\.dng: cannot be read \(No such file"):
+        read_header(tmp_path / "gone.dng")
