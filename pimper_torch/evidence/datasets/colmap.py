@@ -15,7 +15,7 @@ from pimper_torch.evidence.datasets.pictures import (
     write_picture,
 )
 from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble, mask_finder, read_views
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, SparseScene, Views
 from pimper_torch.sfm.colmap import pinhole_lenses, read_model, write_binary
 from pimper_torch.sfm.model import SparseModel
@@ -32,7 +32,7 @@ def read_colmap(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Capture:
     """Read a COLMAP model, text or binary, and the photographs it was made from.
@@ -71,7 +71,7 @@ def read_colmap_scene(
     *,
     images: Path | str | None = None,
     masks: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> SparseScene:
     """Read a COLMAP model with its cloud and tracks, as structure from motion gives it.

@@ -22,7 +22,7 @@ from pimper_torch.geometry.pixels import indices_from_pixels, pixels_from_indice
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.decode import read_header
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Views
 
 _KIND = "an IDR or NeuS set"
@@ -37,7 +37,7 @@ def read_idr(
     camera_file: str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.

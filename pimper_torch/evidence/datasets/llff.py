@@ -20,7 +20,7 @@ from pimper_torch.evidence.datasets.posed import (
 )
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.io.arrays import read_npy
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Capture, Lens
 
 _KIND = "an LLFF set"
@@ -34,7 +34,7 @@ def read_llff(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of ``poses_bounds.npy`` and the photographs beside it.

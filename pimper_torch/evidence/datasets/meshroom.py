@@ -23,7 +23,7 @@ from pimper_torch.evidence.datasets.posed import (
     rigid_or_refuse,
 )
 from pimper_torch.geometry.pixels import pixels_from_indices
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Capture, Lens
 
 _KIND = "a Meshroom cameras.sfm"
@@ -42,7 +42,7 @@ def read_meshroom(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of Meshroom's ``cameras.sfm`` and the photographs it names.

@@ -18,7 +18,7 @@ from pimper_torch.evidence.datasets.posed import (
     rigid_or_refuse,
 )
 from pimper_torch.geometry.frames import invert_rigid, rigid
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Capture, Lens
 
 _KIND = "a Metashape camera XML"
@@ -31,7 +31,7 @@ def read_metashape(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras that Metashape exported as XML, and their photographs.

@@ -13,7 +13,7 @@ from pimper_torch.evidence.datasets.posed import (
 )
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.decode import read_header
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Capture
 
 _KIND = "a Middlebury multi-view set"
@@ -25,7 +25,7 @@ def read_middlebury(
     masks: Path | str | None = None,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of ``*_par.txt`` and the photographs beside it.

@@ -16,7 +16,7 @@ from pimper_torch.io.decode import SUFFIXES, decode, read_header
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Record, Truth, Views
 from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
 from pimper_torch.sfm.undistort import pinhole_for, undistort
@@ -56,7 +56,7 @@ def assemble(
     *,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
     one_light: bool = False,
 ) -> Capture:
@@ -106,7 +106,7 @@ def assemble(
 
 
 def read_views(
-    photographs: Sequence[PosedPhotograph], *, encoding: Encoding = SRGB, max_size_px: int = 0
+    photographs: Sequence[PosedPhotograph], *, encoding: Encoding = FROM_FILES, max_size_px: int = 0
 ) -> Views:
     """Read photographs as their lenses saw them, linear, padded to one raster.
 

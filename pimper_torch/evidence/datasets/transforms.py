@@ -27,7 +27,7 @@ from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble, rigi
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.io.decode import SUFFIXES, read_header
 from pimper_torch.io.meshes import write_ply
-from pimper_torch.radiometry import SRGB, Encoding
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Mesh, Views
 
 _KIND = "a transforms.json set"
@@ -42,7 +42,7 @@ def read_transforms(
     *,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
-    encoding: Encoding = SRGB,
+    encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Capture:
     """Read the cameras of a ``transforms.json`` and the photographs it names.
