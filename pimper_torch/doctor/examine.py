@@ -9,6 +9,7 @@ from pimper_torch.doctor.light import light, variations
 from pimper_torch.doctor.machine import available_gb
 from pimper_torch.doctor.overlap import match_all, overlap
 from pimper_torch.doctor.photograph import Photograph, of_views, read_all
+from pimper_torch.doctor.samples import samples
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import list_images
 from pimper_torch.radiometry import FROM_FILES, Encoding
@@ -26,13 +27,14 @@ def examine_folder(
         max_size_px: As of a run.
 
     Returns:
-        In the order of the checks: files, number, blur, saturation, exposure, lenses, overlap,
-        light, cost.
+        In the order of the checks: files, samples, number, blur, saturation, exposure, lenses,
+        overlap, light, cost.
 
     Raises:
         InputError: No such folder, or no images in it.
     """
-    read = read_all(list_images(folder), encoding, max_size_px)
+    paths = list_images(folder)
+    read = read_all(paths, encoding, max_size_px)
     photographs = [one for one in read if isinstance(one, Photograph)]
     findings = [
         Finding(
@@ -46,6 +48,7 @@ def examine_folder(
     matches = match_all(photographs)
     return [
         *findings,
+        *samples(paths, encoding),
         *each_alone(photographs),
         *overlap([one.name for one in photographs], matches),
         *light(variations(photographs, matches)),

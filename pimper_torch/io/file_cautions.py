@@ -1,6 +1,6 @@
 """What files say about their samples and is not followed, in one warning a kind."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,28 +12,47 @@ from pimper_torch.radiometry.colour import disagree, told
 
 # Of the warning that a given response contradicts what files say.
 CONTRADICTED = "is given, but"
+_SILENT = "srgb, as files are silent"
 
 
 def tell_cautions(
     folder: Path | str, paths: Sequence[Path | str], headers: Sequence[Header], encoding: Encoding
 ) -> None:
-    """Warn of what photographs say and is not followed.
+    """Warn of what photographs say and is not followed, as :func:`find_cautions` has it."""
+    for sentence, names in find_cautions(paths, headers, encoding).items():
+        caution(
+            f"{folder}: {len(names)} of {len(paths)} photographs ({some(names, 4)}): {sentence}.",
+            stacklevel=3,
+        )
+
+
+def find_cautions(
+    paths: Sequence[Path | str], headers: Sequence[Header], encoding: Encoding
+) -> dict[str, list[str]]:
+    """Find what photographs say and is not followed.
 
     Args:
-        folder: With the photographs.
         paths: Of each.
         headers: Of each.
         encoding: As given. A measured curve is not compared with what files say.
+
+    Returns:
+        The names of those to which each sentence applies.
     """
     kinds: dict[str, list[str]] = defaultdict(list)
     for path, header in zip(paths, headers, strict=True):
         for sentence in (*header.cautions, *_of_colour(header, encoding)):
             kinds[sentence].append(Path(path).name)
-    for sentence, names in kinds.items():
-        caution(
-            f"{folder}: {len(names)} of {len(paths)} photographs ({some(names, 4)}): {sentence}.",
-            stacklevel=3,
-        )
+    return dict(kinds)
+
+
+def responses_told(headers: Sequence[Header]) -> dict[str, int]:
+    """Count the responses that are taken unless one is given, and where files say so."""
+    counts: Counter[str] = Counter()
+    for header in headers:
+        said = header.colour
+        counts[f"{told(said.response)} by {said.source}" if said.response else _SILENT] += 1
+    return dict(counts)
 
 
 def _of_colour(header: Header, encoding: Encoding) -> list[str]:

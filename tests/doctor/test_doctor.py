@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from pimper_torch.cli.main import main
@@ -19,6 +19,7 @@ from pimper_torch.doctor.sharpness import edge_blur_px
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Mesh
 
 
@@ -198,7 +199,17 @@ def test_light_that_moves_is_told_from_light_that_stays(scenes):
     assert found["moving"]["light"].severity == "ok"
     assert found["constant"]["light"].severity == "warning"
     assert found["constant"]["overlap"].severity == "ok"
-    checks = ["number", "blur", "saturation", "exposure", "lenses", "overlap", "light", "cost"]
+    checks = [
+        "samples",
+        "number",
+        "blur",
+        "saturation",
+        "exposure",
+        "lenses",
+        "overlap",
+        "light",
+        "cost",
+    ]
     assert list(found["moving"]) == checks
 
 
@@ -218,6 +229,29 @@ def test_matches_lie_on_the_same_points(scenes):
     assert len(match.first) > 50
     off = (match.second - match.first).median(dim=0).values
     torch.testing.assert_close(off, torch.tensor([5.0, 3.0]), atol=0.1, rtol=0)
+
+
+def test_what_files_say_about_their_samples_is_told(scenes, tmp_path):
+    for path in sorted(scenes["constant"].iterdir()):
+        Image.open(path).save(tmp_path / path.name)
+    found = {one.check: one for one in examine_folder(tmp_path)}
+    assert found["samples"].found == "response srgb, as files are silent (5)"
+    path = tmp_path / path.name
+    exif = Image.Exif()
+    exif[274] = 9
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.open(path).save(path, exif=exif, icc_profile=profile)
+    found = {one.check: one for one in examine_folder(tmp_path)}
+    assert found["samples"].severity == "warning"
+    assert found["samples"].found.startswith(
+        f"1 of 5 photographs ({path.name}): has an EXIF orientation of 9"
+    )
+    Image.open(path).save(path, exif=Image.Exif(), icc_profile=profile)
+    (found,) = [one for one in examine_folder(tmp_path) if one.check == "samples"]
+    assert found.found.startswith("response srgb, as files are silent (4); srgb by the ICC profile")
+    linear = Encoding(response="linear")
+    (found,) = [one for one in examine_folder(tmp_path, linear) if one.check == "samples"]
+    assert "the response linear is given, but the ICC profile" in found.found
 
 
 def test_a_file_that_cannot_be_read_hides_no_other(scenes, tmp_path, capsys):
