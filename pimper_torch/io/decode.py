@@ -66,6 +66,7 @@ class Header(Record):
         full: Level that is full scale, 255 or 65535, or less of 16 bits where a TIFF says so.
         full_told: The file itself says what its full scale is.
         significant: Bits of 16 that a PNG says are no filling; 16 where it is silent.
+        transparent: Levels of the one colour of 16 bits that a PNG calls transparent.
         colour: What the file says about its samples.
         cautions: What it says and is not followed, each a sentence without its subject.
         layout: Of a TIFF; ``None`` for other files.
@@ -80,6 +81,7 @@ class Header(Record):
     full: int = 255
     full_told: bool = False
     significant: int = 16
+    transparent: tuple[int, ...] = ()
     colour: Colour = SILENT
     cautions: tuple[str, ...] = ()
     layout: Layout | None = None
@@ -149,6 +151,7 @@ def read_header(path: Path | str) -> Header:
             deep=deep,
             full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,
             significant=_significant(png),
+            transparent=_transparent(png) if sixteen else (),
             colour=_colour(image, exif, png),
             cautions=(*cautions, *_mode_cautions(image), *(layout.cautions if layout else ())),
             layout=layout,
@@ -234,6 +237,9 @@ def decode(path: Path | str) -> Decoded:
         raise _unfit(path, str(array.dtype))
     full = _full_scale(array, header)
     array = array[..., None] if array.ndim == 2 else array
+    if array.shape[2] == len(header.transparent):
+        opaque = (array != np.array(header.transparent, dtype=array.dtype)).any(axis=2)
+        array = np.concatenate([array, opaque[..., None] * np.uint16(full)], axis=2)
     if array.shape[:2] != (header.height, header.width):
         raise _damaged(path)
     # Plane by plane, so that no more memory is taken than is returned.
@@ -315,6 +321,12 @@ def _orientation(exif: Image.Exif) -> tuple[int, list[str]]:
 def _significant(png: PngHead | None) -> int:
     told = b"" if png is None else png.chunks.get(b"sBIT", b"")
     return min((*told, 16)) if all(8 < one <= 16 for one in told) else 16
+
+
+def _transparent(png: PngHead | None) -> tuple[int, ...]:
+    told = b"" if png is None else png.chunks.get(b"tRNS", b"")
+    levels = zip(told[::2], told[1::2], strict=False)
+    return tuple(256 * high + low for high, low in levels) if len(told) in (2, 6) else ()
 
 
 def _full_scale(array: np.ndarray, header: Header) -> int:
