@@ -4,13 +4,13 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_torch.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
     image_files,
     mask_finder,
-    rigid_or_refuse,
     shrink,
 )
 from pimper_torch.geometry.projection import project

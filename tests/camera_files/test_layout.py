@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from pimper_torch.camera_files.layout import expect, inside, numbers, objects, read_json
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.layout import expect, inside, numbers, objects, read_json
 
 
 def test_a_refusal_tells_where_what_was_needed_and_what_there_is(tmp_path):
