@@ -36,7 +36,7 @@ from pimper_torch.records import (
 from pimper_torch.reporting import Observer, Silent, recorded, stage
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.sound_views import sound
-from pimper_torch.sfm.triangulation import lacks_points
+from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store
 
@@ -164,7 +164,7 @@ class Chain(Stage):
 
     def _with_points(self, scene: SparseScene, mesh: Mesh | None) -> SparseScene:
         """Take points of depth maps where features gave hardly any, unless a mesh is given."""
-        if mesh is not None or scene.cameras.num_views < 3 or not lacks_points(scene):
+        if mesh is not None or scene.cameras.num_views < 3 or not lacks_points(scene, FEW_OBSERVED):
             return scene
         return self.kept(depth_points, scene)
 

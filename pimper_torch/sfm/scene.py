@@ -95,12 +95,17 @@ def _undistorted_map(
 
 
 def model_of_scene(scene: SparseScene) -> SparseModel:
-    """Give the cameras of a scene, as pinholes of its undistorted photographs, and its tracks."""
+    """Give the cameras of a scene, as pinholes of its undistorted photographs, and its tracks.
+
+    They are in the frame of the model that the scene came from.
+    """
+    poses = scene.cameras.cam_from_world.detach().cpu().double()
+    offset = torch.tensor(scene.offset_world, dtype=torch.float64)
     return SparseModel(
         names=scene.views.names,
         lenses=colmap.pinhole_lenses(scene.cameras),
-        cam_from_world=scene.cameras.cam_from_world.detach().cpu().double(),
-        points_world=scene.points_world.detach().cpu().double(),
+        cam_from_world=from_local(poses, scene.offset_world),
+        points_world=scene.points_world.detach().cpu().double() + offset,
         observation_point=scene.observation_point.cpu(),
         observation_view=scene.observation_view.cpu(),
         observation_pixels=scene.observation_pixels.detach().cpu().double(),
@@ -109,10 +114,10 @@ def model_of_scene(scene: SparseScene) -> SparseModel:
 
 def with_model_points(scene: SparseScene, model: SparseModel) -> SparseScene:
     """Put points and tracks of :func:`model_of_scene` into the scene, its cameras untouched."""
-    like = scene.points_world
+    like, offset = scene.points_world, torch.tensor(scene.offset_world, dtype=torch.float64)
     pixels = photographed(scene, model.observation_pixels, model.observation_view)
     return scene.replace(
-        points_world=model.points_world.to(like),
+        points_world=(model.points_world - offset).to(like),
         reprojection_errors_px=reprojection_errors(model).to(like),
         observation_point=model.observation_point.to(like.device),
         observation_view=model.observation_view.to(like.device),

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pimper_torch.errors import caution
+from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
@@ -41,11 +42,9 @@ from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.reprojection import observation_errors
 from pimper_torch.sfm.workspace import Workspace, workspace
 
-# Observed points of the median view below which a model counts as one without points: half of
-# those that a view must see to stay in a model of our own. A choice.
-FEWEST_OBSERVED = 15
-# Distances that verify a match, at which it still agrees with given cameras, which are rounded.
-_AGREEING = 2.0
+# Observed points of the median view below which points are triangulated, and below which depth maps
+# help, too. In a model of COLMAP's or our own a view sees 30 at least; the other is half of it.
+FEWEST_OBSERVED, FEW_OBSERVED = 15, 30
 # Angle between optical axes from which on photographs have nothing to match. A choice.
 _MAX_ANGLE_DEG = 60.0
 
@@ -67,11 +66,11 @@ class TriangulationSettings:
     tracks: TrackSettings
 
 
-def lacks_points(model: SparseModel | SparseScene) -> bool:
-    """Tell whether most views observe hardly any point, or none."""
+def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED) -> bool:
+    """Tell whether most views observe fewer points."""
     count = model.num_views if isinstance(model, SparseModel) else model.cameras.num_views
     seen = torch.bincount(model.observation_view, minlength=count)
-    return float(seen.double().median()) < FEWEST_OBSERVED
+    return float(seen.double().median()) < fewest
 
 
 def triangulate(
@@ -98,8 +97,7 @@ def triangulate(
     Raises:
         InputError: Cameras and photographs do not belong together.
     """
-    max_error_px = settings.matching.max_error_px
-    lenses = _numbered(models[0])
+    lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
     with workspace(views, thread_count(settings.matching.threads)) as space:
         counts = find_features(space, settings.features, [None] * views.num_views, lenses)
         release_memory()
@@ -107,15 +105,17 @@ def triangulate(
             match_pairs(space, all_pairs(views.num_views), settings.matching)
             leave_out_room(space.database, settings.matching)
         verified = verified_pairs(space)
-        limit = _AGREEING * max_error_px
-        given = _way(models, verified, limit, where)
-        require_agreement(given, verified, limit, where)
-        _match_along_lines(space, given, verified, settings)
-        found = _triangulated(space, given, settings.matching.seed)
+        given = _way(models, verified, settings, where)
+        require_agreement(given, verified, settings.matching.max_error_px, where)
+        offset = local_origin(given.cam_from_world, given.points_world)
+        local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
+        _match_along_lines(space, local, verified, settings)
+        found = _triangulated(space, local, settings.matching.seed)
     release_memory()
     if len(found.points_world):
-        refined = refine_tracks(views, found, settings.tracks, cameras=False)
-        found = _with_cameras_of(given, refined)
+        found = refine_tracks(views, found, settings.tracks, cameras=False)
+    points = found.points_world + found.points_world.new_tensor(offset)
+    found = _with_cameras_of(given, found.replace(points_world=points))
     if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
         _tell_nothing(found, where)
         return given
@@ -126,27 +126,28 @@ def triangulate(
 def _way(
     models: Sequence[SparseModel],
     verified: Sequence[VerifiedPair],
-    max_error_px: float,
+    settings: TriangulationSettings,
     where: str,
 ) -> SparseModel:
     """Choose between cameras of photographs as they stand, and as their files store them."""
     if len(models) == 1:
         return models[0]
-    best = best_of(models, verified, max_error_px)
-    told = (
-        "were made of pictures that stand otherwise than the photographs, such as the pixels that "
-        "files store before EXIF turns them. They are turned with these"
-        if best
-        else "are taken for those of the photographs as EXIF turns them"
-    )
-    caution(f"{where}: its cameras {told}, as matches between photographs tell.", stacklevel=5)
+    best = best_of(models, verified, settings.matching.max_error_px)
+    if sum(pair.num_matches for pair in verified) < settings.matching.min_inliers:
+        caution(
+            f"{where}: EXIF turns photographs, and neither sizes nor matches tell whether its "
+            "cameras are of them before or after that; they are taken as after. If the result is "
+            "wrong, save the photographs turned, without EXIF's orientation.",
+            stacklevel=5,
+        )
+    elif best:
+        caution(
+            f"{where}: its cameras are of pictures that stand otherwise than the photographs, such "
+            "as the pixels that files store before EXIF turns them. They are turned with these, as "
+            "matches between photographs tell.",
+            stacklevel=5,
+        )
     return models[best]
-
-
-def _numbered(model: SparseModel) -> list[int]:
-    """Number the lenses in the order in which they first occur."""
-    numbers = {lens.camera: None for lens in model.lenses}
-    return [list(numbers).index(lens.camera) for lens in model.lenses]
 
 
 def _match_along_lines(
@@ -215,10 +216,7 @@ def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseMode
     options.extract_colors = False
     options.ba_refine_focal_length = False
     options.ba_refine_extra_params = False
-    lenses = tuple(
-        lens.replace(camera=number + 1)
-        for lens, number in zip(model.lenses, _numbered(model), strict=True)
-    )
+    lenses = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(model.lenses))
     nothing = torch.zeros(0, dtype=torch.long)
     bare = model.replace(
         names=space.files,
