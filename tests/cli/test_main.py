@@ -74,6 +74,13 @@ def test_options_reach_their_stages(photos, chain, tmp_path):
     assert (summary["response"], summary["photographs"]) == ("linear", str(photos))
 
 
+def test_cameras_may_be_a_file(photos, chain, tmp_path):
+    file = tmp_path / "transforms.json"
+    file.write_text("{}")
+    assert run("reconstruct", photos, "-o", tmp_path / "out", "--sparse", file) == 0
+    assert chain.given[2] == file
+
+
 def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):
     preset = tmp_path / "mine.yaml"
     preset.write_text("reconstruct: {starts: 5, seed: 3}\n")

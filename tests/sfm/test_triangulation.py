@@ -9,6 +9,7 @@ from torch.nn.functional import grid_sample
 
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.geometry.frames import invert_rigid, rigid
+from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
@@ -87,6 +88,17 @@ def test_matches_follow_the_lens(views, bare):
         found = triangulate(bent(views, lens), [model], SETTINGS, "The model")
     assert found.lenses == model.lenses
     assert float((found.points_world.norm(dim=1) - 1).abs().median()) < 0.001
+    assert float(observation_errors(found).median()) < 0.3
+
+
+def test_georeferenced_cameras_give_the_points_of_those_near_the_origin(views, bare):
+    offset = torch.tensor([448231.25, 5411923.5, 312.125], dtype=torch.float64)
+    far = bare.replace(cam_from_world=from_local(bare.cam_from_world, tuple(offset.tolist())))
+    with pytest.warns(PimperWarning, match="were triangulated"):
+        found = triangulate(views, [far], SETTINGS, "The model")
+    assert torch.equal(found.cam_from_world, far.cam_from_world)
+    assert len(found.points_world) > 100
+    assert float(((found.points_world - offset).norm(dim=1) - 1).abs().median()) < 0.001
     assert float(observation_errors(found).median()) < 0.3
 
 
