@@ -268,7 +268,7 @@ def placed_scene(views: Views, model: SparseModel) -> SparseScene:
             f"out: {', '.join(missing)}.",
             stacklevel=3,
         )
-    reason = doubt(model, views.num_views)
+    reason = "" if lacks_points(model) else doubt(model, views.num_views)
     if reason:
         caution(reason, stacklevel=3)
     return assemble_scene(views, model).replace(doubt=reason)

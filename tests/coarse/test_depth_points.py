@@ -63,3 +63,20 @@ def test_points_of_the_scene_itself_stay(scene):
         found = depth_points(given)
     assert torch.equal(found.points_world[:2], own)
     assert bool(found.observed[:2].all())
+
+
+@pytest.mark.parametrize("order", [[1, 2, 3, 4, 5, 0], [3, 0, 5, 1, 4, 2]])
+def test_cameras_of_other_photographs_give_none(scene, order):
+    cameras = scene.cameras.replace(cam_from_world=scene.cameras.cam_from_world[order])
+    wrong = scene.replace(cameras=cameras)
+    with pytest.warns(PimperWarning, match="No points"):
+        assert depth_points(wrong) is wrong
+
+
+def test_cameras_that_see_nothing_in_common_give_none(scene):
+    poses = scene.cameras.cam_from_world.clone()
+    poses[:, :2] *= torch.where(torch.arange(len(poses)) % 2 == 0, 1.0, -1.0)[:, None, None]
+    poses[:, 0, 3] += 1e4 * torch.arange(len(poses)) ** 2
+    apart = scene.replace(cameras=scene.cameras.replace(cam_from_world=poses))
+    with pytest.warns(PimperWarning, match="No points"):
+        assert depth_points(apart) is apart
