@@ -33,8 +33,9 @@ _ROOM, _STEPS = 100_000, 48
 _NEAREST, _FARTHEST = 0.3, 3.0
 # Fraction of the views with a place in their frames whose masks may lack it: masks err, too.
 _MAX_LACKING = 0.2
-# Points a view that are kept, spread evenly: about as many as a photograph's features.
-_MOST = 400
+# Points a view that are kept, spread evenly. A choice: with 400 borders of what several views see
+# are lost (Chamfer distance of 8 potatoes of 240x180 0.177 in place of 0.152 % of the diagonal).
+_MOST = 1500
 # Views that a point must be found in.
 _FEWEST_VIEWS = 3
 # Pixels of the maps by which depth maps may disagree, and of the photographs that a point may be
