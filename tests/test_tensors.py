@@ -13,6 +13,7 @@ import pimper_torch as pt
 from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.projection import project
+from tests.sfm.ball import cameras_on_an_arc, photographs
 
 SCRIPT = Path(__file__).parent / "scripts" / "look_inside.py"
 
@@ -155,3 +156,33 @@ def test_gradients_reach_cameras_far_from_the_origin(given):
     poses = from_local(scene.cameras.cam_from_world.double(), (1e6, 0.0, 0.0)).requires_grad_()
     scene_of(scene, cam_from_world=poses).cameras.cam_from_world.sum().backward()
     assert torch.equal(poses.grad[:, :3, 3], torch.ones_like(poses[:, :3, 3]))
+
+
+@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+def test_a_chain_triangulates_points_for_poses_that_come_without():
+    cameras = cameras_on_an_arc()
+    views = photographs(cameras, lit=False)
+    made = pt.scene_of(views.images.float(), cameras.intrinsics, cameras.cam_from_world)
+    found = pt.load_chain("fast").placed(made, None)
+    assert len(found.points_world) > 100
+    assert float((found.points_world.norm(dim=1) - 1).abs().median()) < 0.003
+    assert torch.equal(found.cameras.cam_from_world, made.cameras.cam_from_world)
+    assert torch.equal(found.cameras.intrinsics, made.cameras.intrinsics)
+
+
+def test_a_chain_refuses_poses_of_another_convention():
+    cameras = cameras_on_an_arc()
+    views = photographs(cameras, lit=False)
+    poses = cameras.cam_from_world.inverse()
+    made = pt.scene_of(views.images.float(), cameras.intrinsics, poses)
+    with pytest.raises(pt.InputError, match=r"The scene: these cameras.*invert them"):
+        pt.load_chain("fast").placed(made, None)
+
+
+@pytest.mark.parametrize("preset", ["default", "fast"])
+def test_an_unknown_reference_is_refused_before_structure_from_motion(preset, monkeypatch):
+    views = photographs(cameras_on_an_arc(), lit=False)
+    chain = pt.load_chain(preset, {"coarse_surface": {"reference": "nobody"}})
+    monkeypatch.setattr(chain, "placed", lambda *given: pytest.fail("it ran"))
+    with pytest.raises(pt.InputError, match=r"0 photographs are named 'nobody'; needed: one of 0"):
+        chain(views)

@@ -9,7 +9,9 @@ from typing import TypeVar
 from torch import nn
 
 from pimper_torch.chains.kept import kept_call
+from pimper_torch.coarse.depth_points import depth_points
 from pimper_torch.coarse.given_mesh import prepared
+from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
@@ -32,7 +34,9 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer, Silent, recorded, stage
+from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.sound_views import sound
+from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store
 
@@ -114,6 +118,13 @@ class Chain(Stage):
     ) -> Iterator[Step]:
         """Run the stages up to the surface; give each pass's records, without reports."""
 
+    def references(self) -> Iterator[str]:
+        """List the photographs that stages were asked to take for the reference view."""
+        for module in self.children():
+            named = getattr(getattr(module, "config", None), "reference", "")
+            if isinstance(named, str) and named:
+                yield named
+
     def kept(self, call: Callable[..., R], *inputs: object, **derived: object) -> R:
         """Call a stage, or give the record that an earlier run kept.
 
@@ -126,22 +137,36 @@ class Chain(Stage):
         name = names[0] if names else getattr(call, "__name__", type(call).__name__)
         return kept_call(self.store, name, call, inputs, derived, self.kernels)
 
-    def placed(self, views: Views | SparseScene, sparse_model: Path | str | None) -> SparseScene:
+    def placed(
+        self,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None,
+        mesh: Mesh | None = None,
+    ) -> SparseScene:
         """Give photographs with their cameras: those that come with them, or else find them.
 
-        Views that cannot be used are left out.
+        Views that cannot be used are left out. A scene without observed points gets some, unless a
+        mesh stands in for them.
 
         Raises:
             InputError: Cameras come twice.
         """
         if isinstance(views, Views):
-            return sound(self.reconstruct(views, sparse_model))
+            return sound(self._with_points(self.reconstruct(views, sparse_model), mesh))
         if sparse_model is not None:
             raise InputError(
                 f"{type(self).__name__}: cameras come twice, with the scene and as the model in "
                 f"{sparse_model}; needed: one of the two."
             )
-        return sound(views)
+        if mesh is None and isinstance(self.reconstruct, Reconstruct):
+            views = self.reconstruct.with_points(views)
+        return sound(self._with_points(views, mesh))
+
+    def _with_points(self, scene: SparseScene, mesh: Mesh | None) -> SparseScene:
+        """Take points of depth maps where features gave hardly any, unless a mesh is given."""
+        if mesh is not None or scene.cameras.num_views < 3 or not lacks_points(scene, FEW_OBSERVED):
+            return scene
+        return self.kept(depth_points, scene)
 
     def given_mesh(
         self,
@@ -183,6 +208,9 @@ class Chain(Stage):
         Yields:
             The records of a pass, as soon as it is done. The next one runs when it is asked for.
         """
+        names = (views if isinstance(views, Views) else views.views).names
+        for named in self.references():
+            view_named(named, names)  # not first after structure from motion
         passes = self.passes(views, sparse_model, mesh)
         compiled = self.kernels == "torch"
         failures: list[Failure] = []
@@ -215,8 +243,8 @@ class Chain(Stage):
             views: Photographs, on the device that everything after structure from motion
                 is to run on; or a scene whose cameras are known, see
                 :func:`~pimper_torch.io.tensors.scene_of`.
-            sparse_model: Folder of a COLMAP model of these photographs, used instead of
-                running structure from motion.
+            sparse_model: Folder of a COLMAP model of these photographs, or a file of their cameras,
+                used instead of running structure from motion.
             mesh: A rough surface in that model's frame, or in the scene's, of any floating-point
                 type, used instead of the photographs' own.
 

@@ -135,7 +135,7 @@ class CoarseToFine(Chain):
         self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
-        placed = self.placed(views, sparse_model)
+        placed = self.placed(views, sparse_model, mesh)
         silhouettes = self.kept(self.silhouettes, placed)
         mesh = self.given_mesh(mesh, views, placed, silhouettes)
         silhouettes = self.corrected(placed, silhouettes, mesh)

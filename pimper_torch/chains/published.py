@@ -105,7 +105,7 @@ class Published(Chain):
         self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
         """Run once through the stages."""
-        scene = self.placed(views, sparse_model)
+        scene = self.placed(views, sparse_model, mesh)
         silhouettes = self.kept(self.silhouettes, scene)
         mesh = self.given_mesh(mesh, views, scene, silhouettes)
         scene = masked(scene, silhouettes)

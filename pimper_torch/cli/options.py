@@ -78,7 +78,7 @@ class InputOptions:
     Attributes:
         masks: Folder with a mask for each photograph, of the same name; zero off the object.
         mask_object: How masks show the object; auto looks at all of them together.
-        sparse: Folder of a COLMAP model to use instead of structure from motion.
+        sparse: Known cameras: a COLMAP model's folder, transforms.json, cameras.xml, .sfm or .npz.
         mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB) to start from.
         object: Find silhouettes of the object, take masks for them, or take everything for the
             object, as of walls and scenes. (default: auto)
@@ -88,7 +88,7 @@ class InputOptions:
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     mask_object: Literal["auto", "bright", "dark"] = "auto"
-    sparse: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    sparse: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     object: Literal["auto", "masks", "everything"] | None = None
     region: tuple[float, ...] = ()

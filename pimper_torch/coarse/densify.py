@@ -277,8 +277,8 @@ def agreeing(
     forth = pair(level, view, others)
     pixels, ratio = forth.replace(ray=forth.ray[:, :, chosen]).look(known)
     grid = grid_from_pixels(pixels.movedim(1, -1), width, height)
-    there = _nearest_pixels(inverse_depth[others], grid)
-    valid = _nearest_pixels(good[others].to(there), grid) > 0.5
+    there = nearest_pixels(inverse_depth[others], grid)
+    valid = nearest_pixels(good[others].to(there), grid) > 0.5
     expected = known / ratio.clamp_min(1e-6)
     # To first order, so that rounding to the source's nearest pixel does not count.
     rate = _pixels_per_inverse_depth(level, view, others, pixels, there)
@@ -380,7 +380,8 @@ def _largest_around(
     return max_pool2d(field[None, None], 2 * radius + 1, 1, radius)[0, 0]
 
 
-def _nearest_pixels(
+def nearest_pixels(
     maps: Float[Tensor, "other height width"], grid: Float[Tensor, "other point 2"]
 ) -> Float[Tensor, "other point"]:
+    """Look maps up in the pixel that each place lies in."""
     return grid_sample(maps[:, None], grid[:, None], mode="nearest", align_corners=False)[:, 0, 0]

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
-from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.reports import common_lights
+from pimper_torch.numpy_files import read_npz
 from pimper_torch.records import Cameras, Estimate, Reconstruction
 from pimper_torch.sfm.colmap import pinhole_of, read_model
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from pimper_torch.errors import InputError
-from pimper_torch.io.arrays import read_npy
+from pimper_torch.numpy_files import read_npy
 from pimper_torch.radiometry import Curve, Encoding, Gamma, Linear, Response, Srgb
 from pimper_torch.radiometry.response import curve_from_table
 

@@ -37,7 +37,8 @@ def scene_of(
         intrinsics: ``K`` of every view, ``view 3 3``, or one for all, ``3 3``; in pixels, the
             centre of the top-left pixel at (0.5, 0.5).
         cam_from_world: ``view 4 4`` or ``view 3 4``, rigid; camera axes x right, y down, z forward.
-        points_world: A cloud, ``point 3``; none unless given. A chain then needs masks or a mesh.
+        points_world: A cloud, ``point 3``; none unless given. A chain then triangulates points with
+            the cameras held fixed, unless a mesh comes with the scene.
         observed: Which view sees which point, ``point view``. Without it, every view that has a
             point in its frame and, where there are masks, on the object.
         masks: True on the object, ``view height width``.

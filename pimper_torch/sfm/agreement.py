@@ -62,7 +62,7 @@ def misplaced_views(
 def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> float:
     """Give the fraction of a pair's matches that the model's epipolar geometry explains."""
     ends = [
-        _undistorted(model, view, pixels)
+        undistorted_pixels(model, view, pixels)
         for view, pixels in zip(pair.views, (pair.first, pair.second), strict=True)
     ]
     errors = sampson_errors(epipolar_geometry(model, pair.views), *ends)
@@ -78,9 +78,10 @@ def epipolar_geometry(model: SparseModel, views: PhotographPair) -> Float[Tensor
     return geometry
 
 
-def _undistorted(
+def undistorted_pixels(
     model: SparseModel, view: int, pixels: Float[Tensor, "match 2"]
 ) -> Float[Tensor, "match 2"]:
+    """Give where a pinhole of the lens's own focal length has pixels of a photograph."""
     K = pinhole_of(model.lenses[view])
     plane = undistort_pixels(model.lenses[view], pixels)
     return plane * K.diagonal()[:2] + K[:2, 2]

@@ -1,16 +1,19 @@
-"""A COLMAP model that the photographs come with."""
+"""A COLMAP model, or a file of cameras, that the photographs come with."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from PIL import Image
 
-from pimper_torch.errors import ReconstructionError
+from pimper_torch.camera_files.read_cameras import read_cameras
+from pimper_torch.errors import InputError, ReconstructionError, some
+from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel, match_names
-from pimper_torch.sfm.orientation import find_turns
+from pimper_torch.sfm.orientation import find_turns, possible_turns
 from pimper_torch.sfm.quarter_turns import (
     turned_lens,
     turned_pixels,
@@ -19,29 +22,109 @@ from pimper_torch.sfm.quarter_turns import (
     turning,
 )
 
+# Of the corners of a photograph by a skew, up to which it is rounding: a choice.
+_MAX_SKEW_PX = 0.1
 
-def existing_model(views: Views, folder: Path) -> SparseModel:
-    """Read a COLMAP model and put it in the photographs' order, sizes and orientations.
+
+def existing_model(views: Views, path: Path) -> SparseModel:
+    """Read cameras and put them in the photographs' order, sizes and orientations.
 
     Args:
-        views: Matched by file name; the model's cameras may have been made from photographs of
-            another size, and from the pixels that files store where EXIF turns them.
-        folder: Of the model.
+        views: Matched by file name; cameras may have been made from photographs of another size,
+            and from the pixels that files store where EXIF turns them.
+        path: Folder of a COLMAP model, or a file of cameras, see
+            :func:`~pimper_torch.camera_files.read_cameras.read_cameras`.
 
     Raises:
-        ReconstructionError: The model holds fewer than 3 of the photographs.
-        InputError: It does not belong to the photographs, or cannot be read.
+        ReconstructionError: There are cameras of fewer than 3 of the photographs.
+        InputError: They do not belong to the photographs, or cannot be read.
     """
-    model = match_names(colmap.read_model(folder), views.names, folder, views.folder)
+    return existing_ways(views, path)[0]
+
+
+def existing_ways(views: Views, path: Path) -> list[SparseModel]:
+    """Do what :func:`existing_model` does, in the two ways that cameras without points allow.
+
+    Returns:
+        One model where the points tell how photographs are turned, or nothing turns them; else
+        that of the photographs as they stand, and that of the pixels that files store.
+    """
+    where = place(path)
+    read = _model_of_file(views, path) if path.is_file() else colmap.read_model(path)
+    model = match_names(read, views.names, where, views.folder)
     if model.num_views < 3:
         raise ReconstructionError(
-            f"The COLMAP model in {folder} holds {model.num_views} of {views.num_views} "
+            f"{where} holds {model.num_views} of {views.num_views} "
             f"photographs ({', '.join(model.names)}); at least 3 are needed. Use a model that "
             "holds more of them, or leave it out to run structure from motion."
         )
+    shown = taken(views, model)
+    if len(model.points_world):
+        return [follow_pictures(model, shown, find_turns(model, shown, where))]
+    return [follow_pictures(model, shown, turns) for turns in possible_turns(model, shown)]
+
+
+def place(path: Path) -> str:
+    """Say what cameras come from, at the start of a sentence."""
+    return f"The file of cameras {path}" if path.is_file() else f"The COLMAP model in {path}"
+
+
+def taken(views: Views, model: SparseModel) -> Views:
+    """Take the photographs of a model, in its order."""
     number = {name: index for index, name in enumerate(views.names)}
-    shown = views.take([number[name] for name in model.names])
-    return follow_pictures(model, shown, find_turns(model, shown, str(folder)))
+    return views.take([number[name] for name in model.names])
+
+
+def _model_of_file(views: Views, path: Path) -> SparseModel:
+    """Read cameras that come without points."""
+    cameras = read_cameras(path, views.names, lambda names: _stored_sizes(views, names, path))
+    names = [camera.name.replace("\\", "/") for camera in cameras]
+    skewed = [
+        camera.name
+        for camera in cameras
+        if abs(camera.skew_px) * camera.lens.height > 2 * _MAX_SKEW_PX * camera.lens.params[1]
+    ]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if skewed or twice:
+        found = f"a skew in {some(skewed)}" if skewed else f"several cameras of {some(twice)}"
+        raise InputError(
+            f"{path}: found {found}; needed: one camera a photograph, with axes at right angles. "
+            "Export the cameras of undistorted photographs."
+        )
+    return SparseModel(
+        names=tuple(names),
+        lenses=tuple(camera.lens for camera in cameras),
+        cam_from_world=torch.stack([camera.cam_from_world for camera in cameras]),
+        points_world=torch.zeros(0, 3, dtype=torch.float64),
+        observation_point=torch.zeros(0, dtype=torch.long),
+        observation_view=torch.zeros(0, dtype=torch.long),
+        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
+    )
+
+
+def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[int, int] | None]:
+    """Give the sizes of photographs in their files, which others' programs count pixels of.
+
+    Where there is no such file, those that they were read at.
+    """
+    where = f"The file of cameras {path}"
+    found = match_files(views.names, names, folder=views.folder, where=where, what="camera")
+    sizes: list[tuple[int, int] | None] = [None] * len(names)
+    for view, camera in enumerate(found):
+        if camera is not None:
+            sizes[camera] = _stored_size(views, view)
+    return sizes
+
+
+def _stored_size(views: Views, view: int) -> tuple[int, int]:
+    width, height = (int(side) for side in views.sizes_px[view])
+    if not views.folder:
+        return width, height
+    try:
+        with Image.open(Path(views.folder) / views.names[view]) as picture:
+            return picture.size
+    except (OSError, ValueError, Image.DecompressionBombError):
+        return width, height
 
 
 def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:

@@ -125,7 +125,7 @@ def match_guided(
             if near is not None:
                 geometries[ends], nears[ends] = geometry, near
                 features |= {
-                    image: _read_features(stored, image) for image in ends if image not in features
+                    image: read_features(stored, image) for image in ends if image not in features
                 }
 
         def matches(ends: tuple[int, int]) -> Int[Tensor, "match 2"]:
@@ -250,7 +250,8 @@ def _clearly_best(alike: Alike, max_ratio: float) -> Bool[Tensor, " feature"]:
     )
 
 
-def _read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycolmap is untyped
+def read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycolmap is untyped
+    """Read the features of an image of the database."""
     pixels = np.array(stored.read_keypoints(image))[:, :2].astype(np.float64)
     descriptors = np.array(stored.read_descriptors(image).data).astype(np.float32)
     return Features(

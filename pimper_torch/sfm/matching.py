@@ -1,7 +1,7 @@
 """Features matched between pairs of photographs, and verified by an epipolar geometry."""
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -111,11 +111,13 @@ def tiles(pairs: Sequence[PhotographPair]) -> Iterator[list[PhotographPair]]:
     yield from (groups[key] for key in sorted(groups))
 
 
-def strongest(counts: dict[PhotographPair, int], num_views: int, most: int) -> list[PhotographPair]:
+def strongest(
+    counts: Mapping[PhotographPair, float], num_views: int, most: int
+) -> list[PhotographPair]:
     """List, without repetition, the pairs with most matches of each photograph.
 
     Args:
-        counts: Verified matches of each pair.
+        counts: Verified matches of each pair, or another weight.
         num_views: How many photographs there are.
         most: Pairs a photograph.
     """

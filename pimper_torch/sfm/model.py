@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -129,7 +128,7 @@ def longest_tracks(model: SparseModel, most: int) -> SparseModel:
 
 
 def match_names(
-    model: SparseModel, names: Sequence[str], folder: Path, photographs: str = ""
+    model: SparseModel, names: Sequence[str], where: str, photographs: str = ""
 ) -> SparseModel:
     """Find the photographs in a model by file name and put it in their order.
 
@@ -139,13 +138,12 @@ def match_names(
     Args:
         model: Any.
         names: Of the photographs.
-        folder: Where the model came from, for the message.
+        where: The model came from, for the message.
         photographs: Path of the folder that they lie in.
 
     Raises:
         InputError: No photograph is in the model, or a name may be any of several.
     """
-    where = f"The COLMAP model in {folder}"
     found = match_files(names, model.names, folder=photographs, where=where, what="image")
     chosen = [index for index in found if index is not None]
     if not chosen:

@@ -77,12 +77,36 @@ def find_turns(model: SparseModel, views: Views, where: str) -> tuple[int, ...]:
     Args:
         model: Its views are the photographs, in their order.
         views: The photographs.
-        where: The model is, for messages.
+        where: The model is, for messages, as a sentence starts.
 
     Raises:
         InputError: A photograph has another shape than the model's whichever way it is turned, or
             may be turned either way.
     """
+    allowed, exif = _allowed(model, views), _exif_turns(views)
+    sizes = [(width, height) for width, height in views.sizes_px.tolist()]
+    upright, stored = _hypotheses(exif, allowed)
+    squares = _squares(model, views, allowed)
+    turns, sure = _better(squares, upright, stored)
+    turns = _each(squares, turns, allowed)
+    _require_sides(squares, model, sizes, turns, exif)
+    _tell(model, views, turns, where, sure=sure or not torch.equal(turns, upright))
+    _tell_strangers(squares, turns, where)
+    return tuple(turns.tolist())
+
+
+def possible_turns(model: SparseModel, views: Views) -> list[tuple[int, ...]]:
+    """List the turns that the pictures of a model without points may have, as :func:`find_turns`.
+
+    Raises:
+        InputError: A photograph has another shape than the model's whichever way it is turned.
+    """
+    ways = _hypotheses(_exif_turns(views), _allowed(model, views))
+    return [tuple(one) for one in dict.fromkeys(tuple(way.tolist()) for way in ways)]
+
+
+def _allowed(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
+    """Mark the turns that the shapes of pictures allow."""
     sizes = [(width, height) for width, height in views.sizes_px.tolist()]
     allowed = torch.tensor(
         [
@@ -93,15 +117,7 @@ def find_turns(model: SparseModel, views: Views, where: str) -> tuple[int, ...]:
     for name, lens, size, fits in zip(model.names, model.lenses, sizes, allowed, strict=True):
         if not bool(fits.any()):
             raise _other_shape(name, lens, size, "whichever way it is turned")
-    exif = _exif_turns(views)
-    upright, stored = _hypotheses(exif, allowed)
-    squares = _squares(model, views, allowed)
-    turns, sure = _better(squares, upright, stored)
-    turns = _each(squares, turns, allowed)
-    _require_sides(squares, model, sizes, turns, exif)
-    _tell(model, views, turns, where, sure=sure or not torch.equal(turns, upright))
-    _tell_strangers(squares, turns, where)
-    return tuple(turns.tolist())
+    return allowed
 
 
 def _fits(lens: Lens, width: int, height: int) -> bool:
@@ -220,19 +236,23 @@ def _tell(
     if told:
         number = int((turns > 0).sum())
         caution(
-            f"The COLMAP model in {where} was made of pictures that stand otherwise than the "
+            f"{where} was made of pictures that stand otherwise than the "
             "photographs, such as the pixels that files store before EXIF turns them. Its cameras "
             f"and observations are turned for {number} of {model.num_views} photographs: {told}.",
             stacklevel=5,
         )
     if not sure:
         caution(
-            f"EXIF turns photographs, and neither sizes nor points tell whether the COLMAP model "
-            f"in {where} was made of them before or after that; it is taken as made after. If the "
-            "result is wrong, save the photographs turned, without EXIF's orientation, and make "
-            "the model anew.",
+            f"EXIF turns photographs, and neither sizes nor points tell whether {_within(where)} "
+            "was made of them before or after that; it is taken as made after. If the result is "
+            "wrong, save the photographs turned, without EXIF's orientation, and make the model "
+            "anew.",
             stacklevel=5,
         )
+
+
+def _within(where: str) -> str:
+    return where.replace("The ", "the ", 1)
 
 
 def _tell_strangers(squares: Squares, turns: Int[Tensor, " view"], where: str) -> None:
@@ -242,7 +262,7 @@ def _tell_strangers(squares: Squares, turns: Int[Tensor, " view"], where: str) -
     if len(told) < _TELLING or _errors(told) > _ERRORS:
         return
     caution(
-        f"What the photographs show round the points of the COLMAP model in {where} agrees no "
+        f"What the photographs show round the points of {_within(where)} agrees no "
         f"better between views than by chance (correlation {float(told.mean()):.2f} above it, of "
         f"{len(told)} observations). The model may be of other photographs of these names, or of "
         "cropped ones.",

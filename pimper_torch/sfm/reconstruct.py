@@ -1,7 +1,7 @@
 """Structure from motion: photographs to cameras and a sparse cloud."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from pimper_torch.sfm.binding import thread_count
 from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
 from pimper_torch.sfm.doubt import doubt
-from pimper_torch.sfm.existing import existing_model, follow_pictures
+from pimper_torch.sfm.existing import existing_ways, follow_pictures, place, taken
 from pimper_torch.sfm.features import FeatureSettings, find_features
 from pimper_torch.sfm.lenses import choose_lenses, sensor_turns
 from pimper_torch.sfm.mapping import MapSettings
@@ -32,7 +32,8 @@ from pimper_torch.sfm.one_lens import doubt_one_lens
 from pimper_torch.sfm.quarter_turns import turned_views
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
-from pimper_torch.sfm.scene import assemble_scene
+from pimper_torch.sfm.scene import assemble_scene, model_of_scene, with_model_points
+from pimper_torch.sfm.triangulation import TriangulationSettings, lacks_points, triangulate
 from pimper_torch.sfm.upright import upright
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
@@ -158,6 +159,16 @@ class ReconstructConfig:
         )
 
     @property
+    def triangulation(self) -> TriangulationSettings:
+        """How points of given cameras are found."""
+        return TriangulationSettings(
+            features=self.features,
+            matching=self.registration.matching,
+            guided_pairs=self.guided_pairs,
+            tracks=self.tracks,
+        )
+
+    @property
     def tracks(self) -> TrackSettings:
         """How tracks are refined."""
         return TrackSettings(
@@ -196,9 +207,11 @@ class Reconstruct(Stage):
 
         Args:
             views: At least 3.
-            sparse_model: Folder of a COLMAP model to take instead of running structure
-                from motion. Views are matched by file name; the model's cameras may have
-                been made from photographs of another size.
+            sparse_model: Folder of a COLMAP model, or a file of cameras (``transforms.json``,
+                Metashape, Meshroom, arrays), to take instead of running structure from motion.
+                Views are matched by file name; the cameras may have been made from photographs of
+                another size. Without observed points, these are triangulated with the cameras
+                held fixed.
 
         Raises:
             ReconstructionError: Fewer than 3 views found their place, or the model split.
@@ -208,7 +221,39 @@ class Reconstruct(Stage):
         _require_finite(views)
         if sparse_model is None:
             return placed_scene(views, find_model(views, self.config, self.store)[0])
-        return placed_scene(views, existing_model(views, Path(sparse_model)))
+        return placed_scene(views, self._given(views, Path(sparse_model)))
+
+    def with_points(self, scene: SparseScene) -> SparseScene:
+        """Triangulate points for a scene whose views observe hardly any, its cameras held fixed.
+
+        Raises:
+            InputError: Cameras and photographs do not belong together.
+        """
+        model = model_of_scene(scene)
+        if not lacks_points(model) or not scene.lenses:
+            return scene
+        found = self._triangulated(scene.views, [model], "The scene")
+        return scene if found is model else with_model_points(scene, found)
+
+    def _given(self, views: Views, path: Path) -> SparseModel:
+        """Read cameras, and triangulate points where they come without."""
+        ways = existing_ways(views, path)
+        if not lacks_points(ways[0]):
+            return ways[0]
+        return self._triangulated(taken(views, ways[0]), ways, place(path))
+
+    def _triangulated(self, views: Views, ways: list[SparseModel], where: str) -> SparseModel:
+        """Take points that were kept, or triangulate them and keep them."""
+        settings = self.config.triangulation
+        alone = replace(settings, features=replace(settings.features, threads=0))
+        alone = replace(alone, matching=replace(alone.matching, threads=0))
+        hashed = digest(code_of(__name__), views, ways, alone) if self.store else None
+        found, _ = kept_model(
+            self.store,
+            f"triangulate-{hashed}" if hashed else None,
+            lambda: triangulate(views, ways, settings, where),
+        )
+        return found
 
 
 def placed_scene(views: Views, model: SparseModel) -> SparseScene:
@@ -223,7 +268,7 @@ def placed_scene(views: Views, model: SparseModel) -> SparseScene:
             f"out: {', '.join(missing)}.",
             stacklevel=3,
         )
-    reason = doubt(model, views.num_views)
+    reason = "" if lacks_points(model) else doubt(model, views.num_views)
     if reason:
         caution(reason, stacklevel=3)
     return assemble_scene(views, model).replace(doubt=reason)
@@ -240,21 +285,37 @@ def find_model(
         The model, and the seconds of wall clock in which it was found.
     """
     hashed = digest(code_of(__name__), views, replace(config, threads=0)) if store else None
-    key = f"reconstruct-{hashed}"
-    kept = store.find(key, SparseModel) if store and hashed else None
+    key = f"reconstruct-{hashed}" if hashed else None
+    return kept_model(store, key, lambda: structure_from_motion(views, config))
+
+
+def kept_model(
+    store: Store | None, key: str | None, find: Callable[[], SparseModel]
+) -> tuple[SparseModel, float]:
+    """Take a model that was kept, or find one and keep it; what was warned of is warned of again.
+
+    Args:
+        store: Where; without it, or a key, nothing is kept.
+        key: Of the model.
+        find: Finds it.
+
+    Returns:
+        The model, and the seconds of wall clock in which it was found.
+    """
+    kept = store.find(key, SparseModel) if store and key else None
     if kept is not None:
         for message in kept.about["cautions"]:
-            caution(message, stacklevel=2)
+            caution(message, stacklevel=3)
         return kept.record, float(kept.about["seconds"])
     began = time.perf_counter()
     with overheard() as cautions:
-        model = settled(structure_from_motion(views, config))
+        model = settled(find())
     seconds = time.perf_counter() - began
-    if store and hashed:
+    if store and key:
         try:
             store.keep(key, model, {"seconds": seconds, "cautions": cautions})
         except OutputError as error:
-            caution(str(error), stacklevel=2)
+            caution(str(error), stacklevel=3)
     return model, seconds
 
 

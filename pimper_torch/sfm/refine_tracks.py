@@ -61,7 +61,9 @@ class TrackSettings:
     track_observations: SightingSettings = field(default_factory=SightingSettings)
 
 
-def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> SparseModel:
+def refine_tracks(
+    views: Views, model: SparseModel, settings: TrackSettings, *, cameras: bool = True
+) -> SparseModel:
     """Find the points again in every view, and adjust cameras, lenses and points to that.
 
     Features are found in each photograph by itself, off by half a pixel; patches are aligned
@@ -73,23 +75,25 @@ def refine_tracks(views: Views, model: SparseModel, settings: TrackSettings) -> 
         views: The photographs, in the model's order.
         model: As structure from motion found it.
         settings: How.
+        cameras: Whether cameras and lenses are adjusted, too. Held fixed, one round is enough.
 
     Returns:
         The same views. Points that nothing agrees about are left out.
     """
-    for left in reversed(range(settings.iterations)):
+    rounds = settings.iterations if cameras else min(settings.iterations, 1)
+    for left in reversed(range(rounds)):
         some = longest_tracks(model, _PILOTS) if left else model
-        found, cameras = _sighted(views, some, settings.track_observations)
-        renewed, aligned = _renewed(some, found, cameras, settings.fewest_points)
+        found, pinholes = _sighted(views, some, settings.track_observations)
+        renewed, aligned = _renewed(some, found, pinholes, settings.fewest_points)
         if not bool(aligned.any()):
             return model
-        tied, scale = _cameras_adjusted(renewed, aligned, settings)
+        tied, scale = _adjusted(renewed, aligned, settings, cameras=cameras)
         model = (
             model if left else renewed
         )  # all points of the last round, with its track observations
         model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
         model = bundle(model, _FIRST_SCALE_PX, cameras=False, tolerance=_FIRST_TOLERANCE)
-    if settings.iterations:
+    if rounds:
         model = bundle(model, scale, cameras=False)
         limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
         model = model.without(observation_errors(model) > limit)
@@ -153,15 +157,19 @@ def _photographed(
     return found
 
 
-def _cameras_adjusted(
-    model: SparseModel, aligned: Bool[Tensor, " observation"], settings: TrackSettings
+def _adjusted(
+    model: SparseModel,
+    aligned: Bool[Tensor, " observation"],
+    settings: TrackSettings,
+    *,
+    cameras: bool,
 ) -> tuple[SparseModel, float]:
-    """Adjust cameras to what was aligned; tell the scale of the residuals, too."""
+    """Adjust cameras, unless held fixed, to what was aligned; tell the residuals' scale."""
     tied, leading = _leading(model, aligned, settings.fewest_points)
-    tied = bundle(tied, _FIRST_SCALE_PX, tolerance=_FIRST_TOLERANCE)
+    tied = bundle(tied, _FIRST_SCALE_PX, cameras=cameras, tolerance=_FIRST_TOLERANCE)
     spread = float(observation_errors(tied)[leading].median()) / _MEDIAN_LENGTH
     scale = min(max(spread, _SCALES_PX[0]), _SCALES_PX[1])
-    return bundle(tied, scale), scale
+    return (bundle(tied, scale) if cameras else tied), scale
 
 
 def _leading(

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local, local_origin, to_local
-from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.pixels import grid_from_pixels, homogeneous
 from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Lens, SparseScene, Views
@@ -92,6 +92,51 @@ def _undistorted_map(
     ends = raster, mapped(one, raster)
     first, second = (mapped(intrinsics, colmap.undistort_pixels(lens, pixels)) for pixels in ends)
     return least_squares_map(first, second)
+
+
+def model_of_scene(scene: SparseScene) -> SparseModel:
+    """Give the cameras of a scene, as pinholes of its undistorted photographs, and its tracks.
+
+    They are in the frame of the model that the scene came from.
+    """
+    poses = scene.cameras.cam_from_world.detach().cpu().double()
+    offset = torch.tensor(scene.offset_world, dtype=torch.float64)
+    return SparseModel(
+        names=scene.views.names,
+        lenses=colmap.pinhole_lenses(scene.cameras),
+        cam_from_world=from_local(poses, scene.offset_world),
+        points_world=scene.points_world.detach().cpu().double() + offset,
+        observation_point=scene.observation_point.cpu(),
+        observation_view=scene.observation_view.cpu(),
+        observation_pixels=scene.observation_pixels.detach().cpu().double(),
+    )
+
+
+def with_model_points(scene: SparseScene, model: SparseModel) -> SparseScene:
+    """Put points and tracks of :func:`model_of_scene` into the scene, its cameras untouched."""
+    like, offset = scene.points_world, torch.tensor(scene.offset_world, dtype=torch.float64)
+    pixels = photographed(scene, model.observation_pixels, model.observation_view)
+    return scene.replace(
+        points_world=(model.points_world - offset).to(like),
+        reprojection_errors_px=reprojection_errors(model).to(like),
+        observation_point=model.observation_point.to(like.device),
+        observation_view=model.observation_view.to(like.device),
+        observation_pixels=pixels.to(like),
+    )
+
+
+def photographed(
+    scene: SparseScene, pixels: Float[Tensor, "pixel 2"], view: Int[Tensor, " pixel"]
+) -> Float[Tensor, "pixel 2"]:
+    """Give where the photographs, before undistortion, have pixels of the undistorted ones."""
+    found = pixels.clone()
+    pinholes = colmap.pinhole_lenses(scene.cameras)
+    for index, (own, pinhole) in enumerate(zip(scene.lenses, pinholes, strict=True)):
+        if own.replace(camera=pinhole.camera) != pinhole:
+            here = view == index
+            ends = homogeneous(colmap.undistort_pixels(pinhole, pixels[here]))
+            found[here] = colmap.distort(own, ends)
+    return found
 
 
 def write_model(scene: SparseScene, folder: Path) -> None:

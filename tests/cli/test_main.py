@@ -111,6 +111,13 @@ def test_a_linear_profile_is_followed_unless_a_response_is_given(
     )
 
 
+def test_cameras_may_be_a_file(photos, chain, tmp_path):
+    file = tmp_path / "transforms.json"
+    file.write_text("{}")
+    assert run("reconstruct", photos, "-o", tmp_path / "out", "--sparse", file) == 0
+    assert chain.given[2] == file
+
+
 def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):
     preset = tmp_path / "mine.yaml"
     preset.write_text("reconstruct: {starts: 5, seed: 3}\n")

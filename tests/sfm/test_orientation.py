@@ -10,7 +10,7 @@ from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
 from pimper_torch.sfm.colmap import write_binary
-from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.existing import existing_model, existing_ways
 from pimper_torch.sfm.quarter_turns import QUARTERS
 from pimper_torch.sfm.scene import assemble_scene
 from tests.sfm.ball import (
@@ -184,12 +184,14 @@ def test_poses_of_other_photographs_are_warned_of(stored, sparse):
         existing_model(shuffled, sparse)
 
 
-def test_a_point_alone_leaves_open_which_way_and_a_warning_says_so(stored, tmp_path):
-    folder = written(tmp_path, points=1)
+def test_without_points_both_ways_are_left_open(stored, tmp_path):
+    folder = written(tmp_path, points=0)
     views = turned(stored, [2] * 6)
-    with pytest.warns(PimperWarning, match="neither sizes nor points tell whether"):
-        found = existing_model(views, folder)
-    assert torch.equal(found.cam_from_world, existing_model(stored, folder).cam_from_world)
+    upright, as_stored = existing_ways(views, folder)
+    plain = existing_model(stored, folder)
+    assert torch.equal(upright.cam_from_world, plain.cam_from_world)
+    assert torch.equal(back(as_stored, [2] * 6), plain.cam_from_world)
+    assert len(existing_ways(stored, folder)) == 1
 
 
 def test_of_a_model_of_two_cameras_the_photographs_folder_takes_its_own(stored, tmp_path):

@@ -1,9 +1,9 @@
 """Consistency checks of a capture: common mistakes in its conventions, by hypothesis testing.
 
-Every mistake is a hypothesis with a way to undo it (:mod:`.mistakes`). The capture as given and
-as corrected under each hypothesis are scored by the measures that its data allow
-(:mod:`pimper_torch.evidence.datasets.evidence`), and a mistake is reported where undoing it scores
-significantly higher.
+Every mistake is a hypothesis with a way to undo it (:mod:`pimper_torch.camera_files.conventions`,
+:mod:`.mistakes`). The capture as given and as corrected under each hypothesis are scored by the
+measures that its data allow (:mod:`pimper_torch.evidence.datasets.evidence`), and a mistake is
+reported where undoing it scores significantly higher.
 """
 
 import warnings
@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.camera_files.conventions import CameraMistake, camera_mistakes
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.datasets.evidence import (
     depth_agreement,
@@ -26,7 +27,6 @@ from pimper_torch.evidence.datasets.evidence import (
     silhouette_overlap,
 )
 from pimper_torch.evidence.datasets.findings import CheckReport, Comparison, Finding
-from pimper_torch.evidence.datasets.mistakes import CameraMistake, camera_mistakes
 from pimper_torch.evidence.datasets.orientation import check_lights, check_mesh, check_normals
 from pimper_torch.evidence.metrics.sampling import sample_surface
 from pimper_torch.geometry.visibility import RayCaster

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.evidence.datasets.layout import expect, first_of, inside
+from pimper_torch.camera_files.layout import expect, first_of, inside
 from pimper_torch.evidence.datasets.pictures import (
     file_names,
     refuse_skew,

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.camera_files.layout import contents, expect, inside, read_text
+from pimper_torch.camera_files.layout import numbers as numbers_of
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.layout import contents, expect, inside, read_text
-from pimper_torch.evidence.datasets.layout import numbers as numbers_of
 from pimper_torch.evidence.datasets.matlab import read_matlab
 from pimper_torch.evidence.datasets.raster import (
     intrinsics_from_indices,
@@ -21,9 +21,9 @@ from pimper_torch.evidence.datasets.raster import (
     there,
 )
 from pimper_torch.evidence.datasets.sampling import choose_photographs
-from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.decode import decode
 from pimper_torch.io.photographs import read_mask
+from pimper_torch.numpy_files import read_npz
 from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Capture, Record, Truth
 

@@ -9,15 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.camera_files.layout import expect
+from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.diligent import (
     FLIP,
     directed_lights,
     point_light_files,
     read_normals,
 )
-from pimper_torch.evidence.datasets.layout import expect
 from pimper_torch.evidence.datasets.matlab import read_toolbox_projections
-from pimper_torch.evidence.datasets.projections import decompose_projections
 from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, nearest, read_photographs
 from pimper_torch.evidence.datasets.sampling import choose_photographs
 from pimper_torch.geometry.pixels import scale_intrinsics

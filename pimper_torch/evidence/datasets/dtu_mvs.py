@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.camera_files.layout import contents, expect, numbers, read_text
+from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.dtu import CALIBRATED_WIDTH, dtu_capture
-from pimper_torch.evidence.datasets.layout import contents, expect, numbers, read_text
 from pimper_torch.evidence.datasets.matlab import read_matlab
-from pimper_torch.evidence.datasets.projections import decompose_projections
 from pimper_torch.evidence.datasets.sampling import choose_photographs
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.io.meshes import read_mesh

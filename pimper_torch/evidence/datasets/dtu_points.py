@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.camera_files.layout import expect, first_of
+from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.dtu import dtu_capture
-from pimper_torch.evidence.datasets.layout import expect, first_of
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
-from pimper_torch.evidence.datasets.projections import decompose_projections
 from pimper_torch.evidence.datasets.sampling import choose_photographs
 from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Capture, Truth

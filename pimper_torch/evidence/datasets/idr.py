@@ -8,24 +8,22 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.camera_files.camera_arrays import IDR, numbered_matrices, read_world_mats
+from pimper_torch.camera_files.layout import expect, first_of
+from pimper_torch.camera_files.posed_camera import pinhole_lens
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.layout import expect, first_of, numbers
 from pimper_torch.evidence.datasets.pictures import write_mask, write_picture
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
     image_files,
-    pinhole_lens,
 )
-from pimper_torch.evidence.datasets.projections import decompose_projections
-from pimper_torch.geometry.pixels import indices_from_pixels, pixels_from_indices
+from pimper_torch.geometry.pixels import indices_from_pixels
 from pimper_torch.geometry.projection import project
-from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.decode import read_header
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Views
 
-_KIND = "an IDR or NeuS set"
 _CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz", "cameras_large.npz")
 # The object takes this fraction of the unit sphere, so that nothing of it touches the rim.
 _FRACTION = 0.9
@@ -63,26 +61,25 @@ def read_idr(
     """
     folder = Path(folder)
     path = _camera_file(folder, camera_file)
-    files = image_files(folder / "image", _KIND)
+    files = image_files(folder / "image", IDR)
     masks: list[Path | None] = [None] * len(files)
     if (folder / "mask").is_dir():
-        masks = list(image_files(folder / "mask", _KIND))
+        masks = list(image_files(folder / "mask", IDR))
     expect(
         len(masks) == len(files),
         folder / "mask",
-        _KIND,
+        IDR,
         f"{len(files)} masks, one for each image",
         f"{len(masks)}",
     )
-    matrices = _matrices(path, "world_mat", len(files))
     photographs = [
-        _photograph(image, mask, matrix, f"world_mat_{index}", path)
-        for index, (image, mask, matrix) in enumerate(zip(files, masks, matrices, strict=True))
+        _photograph(*one)
+        for one in zip(files, masks, *read_world_mats(path, len(files)), strict=True)
     ]
     return assemble(
         photographs,
         folder,
-        _KIND,
+        IDR,
         names=names,
         mesh=mesh,
         encoding=encoding,
@@ -103,7 +100,7 @@ def read_scale_mats(
         InputError: The file is not there or has none.
     """
     path = _camera_file(Path(folder), camera_file)
-    return _matrices(path, "scale_mat", len(image_files(Path(folder) / "image", _KIND)))
+    return numbered_matrices(path, "scale_mat", len(image_files(Path(folder) / "image", IDR)))
 
 
 def write_idr(
@@ -228,43 +225,14 @@ def _reach(
 def _camera_file(folder: Path, name: str | None) -> Path:
     names = _CAMERA_FILES if name is None else (name,)
     path = first_of([folder / one for one in names])
-    expect(path is not None, folder, _KIND, f"a file {' or '.join(names)}")
+    expect(path is not None, folder, IDR, f"a file {' or '.join(names)}")
     assert path is not None
     return path
 
 
-def _matrices(path: Path, key: str, count: int) -> Float[Tensor, "view 4 4"]:
-    """Read ``key_0`` and so on, and refuse more or fewer than there are images."""
-    try:
-        arrays = read_npz(path, lambda name: name.startswith(f"{key}_") and "inv" not in name)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); needed: an archive of arrays as numpy.savez "
-            "writes it. Copy it again."
-        ) from error
-    wanted = [f"{key}_{index}" for index in range(count)]
-    expect(
-        set(arrays) == set(wanted) and bool(wanted),
-        path,
-        _KIND,
-        f"{key}_0 to {key}_{count - 1}, one for each file in image/",
-        f"{len(arrays)} of them",
-    )
-    return torch.stack(
-        [numbers(arrays[name], 16, name, path, _KIND).reshape(4, 4) for name in wanted]
-    )
-
-
 def _photograph(
-    image: Path, mask: Path | None, world_mat: Float[Tensor, "4 4"], what: str, path: Path
+    image: Path, mask: Path | None, K: Float[Tensor, "3 3"], cam_from_world: Float[Tensor, "4 4"]
 ) -> PosedPhotograph:
-    try:
-        intrinsics, poses = decompose_projections(world_mat[None, :3])
-    except ValueError as error:
-        expect(False, path, _KIND, f"K [R t] in {what}", str(error))
-        raise
-    K = intrinsics[0].clone()
-    K[:2, 2] = pixels_from_indices(K[:2, 2])
     header = read_header(image)
     return PosedPhotograph(
         name=image.name,
@@ -272,5 +240,5 @@ def _photograph(
         mask=mask,
         lens=pinhole_lens(K, (header.width, header.height)),
         skew_px=float(K[0, 1]),
-        cam_from_world=poses[0],
+        cam_from_world=cam_from_world,
     )

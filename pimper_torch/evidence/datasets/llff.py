@@ -9,17 +9,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.camera_files.layout import expect, first_of
+from pimper_torch.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.layout import expect, first_of
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
     image_files,
     mask_finder,
-    rigid_or_refuse,
 )
 from pimper_torch.geometry.frames import invert_rigid
-from pimper_torch.io.arrays import read_npy
+from pimper_torch.numpy_files import read_npy
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Capture, Lens
 

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.camera_files.layout import expect
 from pimper_torch.errors import InputError, some
-from pimper_torch.evidence.datasets.layout import expect
 from pimper_torch.io.matlab import read_variables
 
 
@@ -80,7 +80,7 @@ def read_toolbox_projections(
     Returns:
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is
         taken as it stands: in published files it is not exactly orthogonal, which
-        :func:`~pimper_torch.evidence.datasets.projections.decompose_projections` settles.
+        :func:`~pimper_torch.camera_files.projections.decompose_projections` settles.
 
     Raises:
         InputError: As :func:`read_matlab`, or arrays of other shapes.

@@ -2,26 +2,18 @@
 
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
-from xml.etree import ElementTree
-from xml.parsers import expat
 
-from jaxtyping import Float
-from torch import Tensor
-
-from pimper_torch.errors import InputError, some
-from pimper_torch.evidence.datasets.layout import expect, first_of, numbers
+from pimper_torch.camera_files.layout import expect, first_of
+from pimper_torch.camera_files.metashape_xml import KIND, read_metashape_cameras
+from pimper_torch.errors import some
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
     image_files,
     mask_finder,
-    rigid_or_refuse,
 )
-from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.radiometry import FROM_FILES, Encoding
-from pimper_torch.records import Capture, Lens
-
-_KIND = "a Metashape camera XML"
+from pimper_torch.records import Capture
 
 
 def read_metashape(
@@ -36,14 +28,8 @@ def read_metashape(
 ) -> Capture:
     """Read the cameras that Metashape exported as XML, and their photographs.
 
-    A camera's ``transform`` is ``chunk_from_cam``, row by row, with our camera axes. The
-    chunk's own transform (of the camera's ``component`` in newer files) is a similarity from
-    there to the world, applied where there is one; for a georeferenced chunk that world is
-    geocentric. The manual's appendix "Camera models" defines the lens: ``f``, with ``b1``
-    added along x; ``cx``, ``cy`` from (width / 2, height / 2) in a frame whose top-left pixel
-    has its centre at (0.5, 0.5), as ours; ``p1`` and ``p2`` the other way round than OpenCV.
-
-    Cameras without a transform are not aligned and left out, as are those switched off.
+    Their meaning is that of
+    :func:`~pimper_torch.camera_files.metashape_xml.read_metashape_cameras`.
 
     Args:
         folder: With one ``.xml`` file; or the file itself.
@@ -60,92 +46,35 @@ def read_metashape(
             that cannot be read; or a photograph is missing or damaged.
     """
     path = _xml_file(Path(folder))
-    chunk = _chunk(path)
-    lenses = {
-        str(sensor.get("id")): (sensor, number)
-        for number, sensor in enumerate(chunk.iterfind("sensors//sensor"), start=1)
-    }
+    cameras = read_metashape_cameras(path)
     picture_folder = Path(images) if images else first_of([path.parent / "images", path.parent])
     assert picture_folder is not None
-    files = image_files(picture_folder, _KIND)
-    mask_of = mask_finder(Path(masks) if masks else None, _KIND)
-    photographs = []
-    for camera in chunk.iterfind("cameras//camera"):
-        label = str(camera.get("label"))
-        rig = camera.get("master_id") not in (None, camera.get("id"))
-        expect(not rig, path, _KIND, f"a transform of its own for {label}", "a camera of a rig")
-        placed = camera.find("transform")
-        if placed is None or camera.get("enabled") in ("0", "false"):
-            continue
-        sensor = lenses.get(str(camera.get("sensor_id")))
-        expect(sensor is not None, path, _KIND, f"the sensor of {label}", "no such sensor")
-        assert sensor is not None
-        image = _file_of(label, files, picture_folder)
-        lens, skew_px = _lens(*sensor, path)
-        photographs.append(
-            PosedPhotograph(
-                name=image.name,
-                image=image,
-                mask=mask_of(image),
-                lens=lens,
-                skew_px=skew_px,
-                cam_from_world=_cam_from_world(camera, chunk, path),
-            )
+    files = image_files(picture_folder, KIND)
+    mask_of = mask_finder(Path(masks) if masks else None, KIND)
+    images_of = [_file_of(camera.name, files, picture_folder) for camera in cameras]
+    photographs = [
+        PosedPhotograph(
+            name=image.name,
+            image=image,
+            mask=mask_of(image),
+            lens=camera.lens,
+            skew_px=camera.skew_px,
+            cam_from_world=camera.cam_from_world,
         )
-    expect(bool(photographs), path, _KIND, "cameras with a transform", "none")
+        for camera, image in zip(cameras, images_of, strict=True)
+    ]
     return assemble(
-        photographs, path, _KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
+        photographs, path, KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
     )
-
-
-def parse_without_entities(path: Path, kind: str) -> ElementTree.Element:
-    """Parse XML from a stranger: a file that declares a document type is refused.
-
-    Entities need such a declaration, and with them a small file can grow without bound or
-    name other files.
-
-    Raises:
-        InputError: The file is no XML, or declares a document type.
-    """
-
-    def refuse(name: str, *_: object) -> None:
-        raise InputError(
-            f"{path}: declares the document type {name}; needed: plain XML without one, as {kind} "
-            "has. Export it again."
-        )
-
-    try:
-        content = path.read_bytes()
-        checker = expat.ParserCreate()
-        checker.StartDoctypeDeclHandler = refuse
-        checker.Parse(content, True)
-        return ElementTree.fromstring(content)
-    except (OSError, expat.ExpatError, ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputError(
-            f"{path}: cannot be read as XML ({error}); needed: {kind}. Export it again."
-        ) from error
 
 
 def _xml_file(given: Path) -> Path:
     if given.is_file():
         return given
-    expect(given.is_dir(), given, _KIND, "its file or folder")
+    expect(given.is_dir(), given, KIND, "its file or folder")
     found = sorted(given.glob("*.xml"))
-    expect(len(found) == 1, given, _KIND, "one .xml file")
+    expect(len(found) == 1, given, KIND, "one .xml file")
     return found[0]
-
-
-def _chunk(path: Path) -> ElementTree.Element:
-    root = parse_without_entities(path, _KIND)
-    chunks = [root] if root.tag == "chunk" else root.findall("chunk")
-    expect(
-        len(chunks) == 1,
-        path,
-        _KIND,
-        "a document of one chunk",
-        f"<{root.tag}> with {len(chunks)} chunks",
-    )
-    return chunks[0]
 
 
 def _file_of(label: str, files: Sequence[Path], folder: Path) -> Path:
@@ -156,108 +85,8 @@ def _file_of(label: str, files: Sequence[Path], folder: Path) -> Path:
     expect(
         len(found) == 1,
         folder,
-        _KIND,
+        KIND,
         f"one photograph called {name}",
         some([path.name for path in found or files]),
     )
     return found[0]
-
-
-def _cam_from_world(
-    camera: ElementTree.Element, chunk: ElementTree.Element, path: Path
-) -> Float[Tensor, "4 4"]:
-    what = f"transform of {camera.get('label')}"
-    chunk_from_cam = numbers(camera.findtext("transform"), 16, what, path, _KIND).reshape(4, 4)
-    pose = rigid_or_refuse(chunk_from_cam[:3, :3], chunk_from_cam[:3, 3], what, path, _KIND)
-    similarity = _similarity_of(camera, chunk)
-    if similarity is not None:
-        # Metres or whatever: the scale moves the camera and leaves its axes unit.
-        world_from_chunk, scale = _rigid_and_scale(similarity, path)
-        pose = world_from_chunk @ rigid(pose[:3, :3], scale * pose[:3, 3])
-    return invert_rigid(pose)
-
-
-def _similarity_of(
-    camera: ElementTree.Element, chunk: ElementTree.Element
-) -> ElementTree.Element | None:
-    components = {
-        component.get("id"): component.find("transform")
-        for component in chunk.iterfind("components/component")
-    }
-    found = components.get(camera.get("component_id"))
-    return chunk.find("transform") if found is None else found
-
-
-def _rigid_and_scale(
-    element: ElementTree.Element, path: Path
-) -> tuple[Float[Tensor, "4 4"], float]:
-    def values(tag: str, count: int, default: str) -> Float[Tensor, " value"]:
-        what = f"{tag} of the chunk"
-        return numbers(element.findtext(tag, default), count, what, path, _KIND)
-
-    rotation = values("rotation", 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
-    translation = values("translation", 3, "0 0 0")
-    scale = float(values("scale", 1, "1"))
-    expect(scale > 0, path, _KIND, "a positive scale of the chunk", f"{scale}")
-    return rigid_or_refuse(rotation, translation, "the chunk's transform", path, _KIND), scale
-
-
-def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, float]:
-    """Translate a sensor's calibration, and give its skew."""
-    label = sensor.get("label") or sensor.get("id")
-    found = sensor.findall("calibration")
-    adjusted = [one for one in found if one.get("class") == "adjusted"] or found
-    expect(bool(adjusted), path, _KIND, f"a calibration of the sensor {label}", "none")
-    calibration = adjusted[0]
-
-    def value(tag: str) -> float:
-        text = calibration.findtext(tag, "0")
-        return float(numbers(text, 1, f"{tag} of the sensor {label}", path, _KIND))
-
-    resolution = calibration.find("resolution")
-    resolution = sensor.find("resolution") if resolution is None else resolution
-    resolution_px = (
-        None if resolution is None else [resolution.get("width"), resolution.get("height")]
-    )
-    width, height = (
-        int(side)
-        for side in numbers(resolution_px, 2, f"resolution of the sensor {label}", path, _KIND)
-    )
-    old = calibration.find("f") is None and calibration.find("fx") is not None
-    expect(
-        value("f") > 0 and not old,
-        path,
-        _KIND,
-        f"a positive f of the sensor {label}",
-        "fx and fy, as old PhotoScan wrote them; export with a newer one" if old else "none",
-    )
-    f, b1, b2 = value("f"), value("b1"), value("b2")
-    k1, k2, k3, k4 = (value(tag) for tag in ("k1", "k2", "k3", "k4"))
-    p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))
-    pinhole = (f + b1, f, width / 2 + value("cx"), height / 2 + value("cy"))
-    kind = calibration.get("type") or sensor.get("type") or "frame"
-    model, params = "PINHOLE", tuple[float, ...]()
-    if kind == "fisheye":
-        model, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
-        readable = not any((p1, p2, p3, p4, b2))
-    else:
-        distorted = any((k1, k2, k3, p1, p2))
-        readable = kind == "frame" and not any((k4, p3, p4)) and not (b2 and distorted)
-        if distorted:
-            model, params = "FULL_OPENCV", (k1, k2, p2, p1, k3, 0.0, 0.0, 0.0)
-    expect(
-        readable,
-        path,
-        _KIND,
-        f"a frame camera with k1, k2, k3, p1, p2, b1, or a fisheye with k1 to k4 and b1, for the "
-        f"sensor {label}",
-        f"a {kind} camera with {_nonzero(calibration)}; export undistorted photographs with their "
-        "cameras, or align anew without the others",
-    )
-    lens = Lens(camera=number, model=model, params=(*pinhole, *params), width=width, height=height)
-    return lens, b2
-
-
-def _nonzero(calibration: ElementTree.Element) -> str:
-    tags = [one.tag for one in calibration if (one.text or "").strip() not in ("", "0", "0.0")]
-    return ", ".join(tags)

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pimper_torch.evidence.datasets.layout import expect, inside, numbers, read_text
+from pimper_torch.camera_files.layout import expect, inside, numbers, read_text
+from pimper_torch.camera_files.posed_camera import pinhole_lens, rigid_or_refuse
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
     mask_finder,
-    pinhole_lens,
-    rigid_or_refuse,
 )
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.decode import read_header

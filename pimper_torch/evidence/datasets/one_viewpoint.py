@@ -5,8 +5,8 @@ from pathlib import Path
 
 import torch
 
+from pimper_torch.camera_files.layout import expect, inside, numbers, read_text
 from pimper_torch.evidence.datasets.diligent import FLIP, directed_lights
-from pimper_torch.evidence.datasets.layout import expect, inside, numbers, read_text
 from pimper_torch.evidence.datasets.raster import read_photographs
 from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Capture, Truth, Views

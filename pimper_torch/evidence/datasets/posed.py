@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.camera_files.layout import expect
 from pimper_torch.errors import InputError, some
-from pimper_torch.evidence.datasets.layout import expect
-from pimper_torch.geometry.frames import rigid
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import SUFFIXES, decode, read_header
 from pimper_torch.io.meshes import read_mesh
@@ -22,8 +21,6 @@ from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
 from pimper_torch.sfm.undistort import pinhole_for, undistort
 
 _HALF = 0.5
-# Files round a rotation to some digits; more than this is a scale or a reflection.
-_MAX_FROM_ROTATION = 1e-2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -201,59 +198,19 @@ def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple
     return tuple(lenses)
 
 
-def pinhole_lens(
-    intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int], camera: int = 1
-) -> Lens:
-    """Give the lens of a pinhole's ``K``, but for its skew."""
-    fx, fy, cx, cy = (float(intrinsics[row, column]) for row, column in _PINHOLE)
-    return Lens(
-        camera=camera, model="PINHOLE", params=(fx, fy, cx, cy), width=size_px[0], height=size_px[1]
-    )
-
-
-_PINHOLE = ((0, 0), (1, 1), (0, 2), (1, 2))
-
-
-def rigid_or_refuse(
-    rotation: Float[Tensor, "3 3"],
-    translation: Float[Tensor, "3"],
-    what: str,
-    path: Path,
-    kind: str,
-) -> Float[Tensor, "4 4"]:
-    """Put a file's rotation and translation together, the rotation made exact.
-
-    Raises:
-        InputError: The matrix is further from a rotation than rounding explains.
-    """
-    U, _, Vh = torch.linalg.svd(rotation)
-    nearest = U @ Vh
-    off = float((rotation - nearest).abs().max())
-    mirrored = bool(torch.linalg.det(nearest) < 0)
-    expect(
-        off <= _MAX_FROM_ROTATION and not mirrored,
-        path,
-        kind,
-        f"a rotation in {what}",
-        "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation",
-    )
-    return rigid(nearest, translation)
-
-
 def image_files(folder: Path, kind: str) -> list[Path]:
     """List a folder's images in plain order of their names, as Python's ``sorted`` has it.
 
-    Data sets that number their cameras, not name them, mean this order: ``10`` before ``2``.
+    Data sets that number their cameras, not name them, mean this order: ``10`` before ``2``. Links
+    are followed wherever they lie.
 
     Raises:
-        InputError: No such folder, no images in it, or a link that leads out of it.
+        InputError: No such folder, or no images in it.
     """
     expect(folder.is_dir(), folder, kind, "a folder of images")
     paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
     paths = sorted(path for path in paths if not path.name.startswith(".") and path.is_file())
     expect(bool(paths), folder, kind, f"images ({', '.join(SUFFIXES)})")
-    outside = [path.name for path in paths if path.resolve().parent != folder.resolve()]
-    expect(not outside, folder, kind, "images, not links out of the folder", some(outside))
     return paths
 
 

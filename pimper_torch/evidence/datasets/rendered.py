@@ -8,15 +8,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.camera_files.layout import expect, inside
 from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.evidence.datasets.layout import expect, inside
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.maps import MAP_NAMES, unpack_maps
 from pimper_torch.evidence.scenes.write import FORMAT, FORMAT_VERSION
-from pimper_torch.io.arrays import read_npz
 from pimper_torch.io.decode import decode
 from pimper_torch.io.meshes import read_mesh
+from pimper_torch.numpy_files import read_npz
 from pimper_torch.progress import track
 from pimper_torch.radiometry import Linear, Srgb
 from pimper_torch.records import Cameras, Capture, Truth, Views

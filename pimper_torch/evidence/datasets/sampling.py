@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from pimper_torch.camera_files.layout import expect
 from pimper_torch.errors import some
-from pimper_torch.evidence.datasets.layout import expect
 
 
 def one_light_per_position(

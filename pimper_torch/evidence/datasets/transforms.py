@@ -1,7 +1,6 @@
 """NeRF's ``transforms.json``, of Blender, instant-ngp and nerfstudio; read and written."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -9,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.evidence.datasets.layout import (
-    expect,
-    first_of,
-    inside,
-    numbers,
-    objects,
-    read_json,
+from pimper_torch.camera_files.layout import expect, first_of, inside
+from pimper_torch.camera_files.transforms_json import (
+    FLIP,
+    KIND,
+    frame_camera,
+    read_frames,
+    stated_size,
 )
 from pimper_torch.evidence.datasets.pictures import (
     file_names,
@@ -23,18 +22,14 @@ from pimper_torch.evidence.datasets.pictures import (
     write_mask,
     write_picture,
 )
-from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble, rigid_or_refuse
+from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.io.decode import SUFFIXES, read_header
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.radiometry import FROM_FILES, Encoding
-from pimper_torch.records import Cameras, Capture, Lens, Mesh, Views
+from pimper_torch.records import Cameras, Capture, Mesh, Views
 
-_KIND = "a transforms.json set"
 _FILES = ("transforms.json", "transforms_train.json")
-_POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
-# OpenGL's camera has y up and looks along -z.
-_FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 
 
 def read_transforms(
@@ -47,13 +42,9 @@ def read_transforms(
 ) -> Capture:
     """Read the cameras of a ``transforms.json`` and the photographs it names.
 
-    ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
-    The focal length is ``fl_x``, ``fl_y`` in pixels, or follows from ``camera_angle_x``; the
-    principal point ``cx``, ``cy`` is the centre of the image unless given. All of these, and
-    ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may stand in the file
-    or in a frame. instant-ngp and nerfstudio take them from COLMAP and cast rays through
-    x + 0.5 (nerfstudio, "Data conventions" and ``Cameras.get_image_coords``), and Blender's
-    centre is that of the image's area: their pixels are ours. Lenses are undistorted.
+    Their meaning is that of
+    :func:`~pimper_torch.camera_files.transforms_json.read_transforms_cameras`. Lenses are
+    undistorted.
 
     The mask is ``mask_path`` where a frame has one, else the image's alpha channel.
 
@@ -70,17 +61,16 @@ def read_transforms(
     """
     given = Path(folder)
     path = given if given.is_file() else first_of([given / name for name in _FILES])
-    expect(path is not None, given, _KIND, f"a file {' or '.join(_FILES)}")
+    expect(path is not None, given, KIND, f"a file {' or '.join(_FILES)}")
     assert path is not None
-    whole = read_json(path, _KIND)
-    frames = objects(whole.get("frames"), "frames", path, _KIND)
+    frames = read_frames(path)
     images = [_image(frame, path) for frame in frames]
     photographs = [
-        _photograph({**whole, **frame}, image, name, path)
+        _photograph(frame, image, name, path)
         for frame, image, name in zip(frames, images, _names(images, path), strict=True)
     ]
     return assemble(
-        photographs, path, _KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
+        photographs, path, KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
     )
 
 
@@ -108,7 +98,7 @@ def write_transforms(
     refuse_skew(cameras, views.names, "transforms.json")
     files = file_names(views.names)
     world_from_cam = invert_rigid(cameras.cam_from_world.detach().cpu().double()).clone()
-    world_from_cam[:, :3, :3] *= _FLIP
+    world_from_cam[:, :3, :3] *= FLIP
     lenses, frames = [], []
     for index, file in enumerate(files):
         write_picture(views, index, folder / "images" / file)
@@ -147,9 +137,7 @@ def _said(cameras: Cameras, index: int) -> dict[str, float | int]:
 
 def _image(frame: Mapping[str, object], path: Path) -> Path:
     """Find the file of a frame, whose suffix may be left out."""
-    name = frame.get("file_path")
-    expect(isinstance(name, str) and name != "", path, _KIND, "a text as file_path", repr(name))
-    image = inside(path.parent, str(name).replace("\\", "/"), _KIND)
+    image = inside(path.parent, str(frame["file_path"]).replace("\\", "/"), KIND)
     if image.suffix.lower() in SUFFIXES:
         return image
     tried = [image.with_name(image.name + suffix) for suffix in (".png", *SUFFIXES)]
@@ -164,73 +152,17 @@ def _names(images: Sequence[Path], path: Path) -> list[str]:
 
 
 def _photograph(frame: Mapping[str, object], image: Path, name: str, path: Path) -> PosedPhotograph:
-    matrix = frame.get("transform_matrix")
-    expect(
-        isinstance(matrix, list) and len(matrix) in (3, 4),
-        path,
-        _KIND,
-        f"4 rows of 4 numbers as transform_matrix of {name}",
-        type(matrix).__name__,
-    )
-    rows = matrix[:3] if isinstance(matrix, list) else []
-    world_from_cam = numbers(rows, 12, f"transform_matrix of {name}", path, _KIND).reshape(3, 4)
-    pose = rigid_or_refuse(
-        world_from_cam[:, :3] * _FLIP,
-        world_from_cam[:, 3],
-        f"transform_matrix of {name}",
-        path,
-        _KIND,
-    )
+    size = stated_size(frame)
+    if size is None:
+        expect(image.is_file(), path, KIND, f"the photograph {image.name}", "no such file")
+        header = read_header(image)
+        size = header.width, header.height
+    camera = frame_camera(frame, name, size, path)
     mask = frame.get("mask_path")
     return PosedPhotograph(
         name=name,
         image=image,
-        mask=inside(path.parent, str(mask), _KIND) if mask else None,
-        lens=_lens(frame, image, name, path),
-        cam_from_world=invert_rigid(pose),
+        mask=inside(path.parent, str(mask), KIND) if mask else None,
+        lens=camera.lens,
+        cam_from_world=camera.cam_from_world,
     )
-
-
-def _lens(frame: Mapping[str, object], image: Path, name: str, path: Path) -> Lens:
-    def value(key: str, default: float = 0.0) -> float:
-        given = frame.get(key)
-        if given is None:
-            return default
-        return float(numbers(given, 1, f"{key} of {name}", path, _KIND))
-
-    if "w" in frame and "h" in frame:
-        width, height = value("w"), value("h")
-    else:
-        expect(image.is_file(), path, _KIND, f"the photograph {image.name}", "no such file")
-        header = read_header(image)
-        width, height = float(header.width), float(header.height)
-    focal = _focal(value("fl_x"), value("camera_angle_x"), width)
-    focal_y = _focal(value("fl_y"), value("camera_angle_y"), height)
-    expect(
-        focal > 0 or focal_y > 0,
-        path,
-        _KIND,
-        f"fl_x or camera_angle_x, in the file or for {name}",
-        "neither, or no positive one",
-    )
-    fx, fy = focal or focal_y, focal_y or focal
-    pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
-    k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = str(frame.get("camera_model") or "OPENCV")
-    kind, params = "PINHOLE", tuple[float, ...]()
-    if model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True:
-        kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
-    else:
-        expect(model in _POLYNOMIAL, path, _KIND, f"a camera_model of {_POLYNOMIAL}", model)
-        expect(k4 == 0, path, _KIND, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
-        if any((k1, k2, k3, p1, p2)):
-            kind, params = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-    return Lens(
-        camera=1, model=kind, params=(*pinhole, *params), width=round(width), height=round(height)
-    )
-
-
-def _focal(focal_px: float, angle: float, side_px: float) -> float:
-    if focal_px > 0 or not 0 < angle < math.pi:
-        return max(focal_px, 0.0)
-    return side_px / 2 / math.tan(angle / 2)

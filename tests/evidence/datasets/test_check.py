@@ -3,9 +3,9 @@ import torch
 import trimesh
 from torch.nn.functional import normalize
 
+from pimper_torch.camera_files.conventions import camera_mistakes
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.datasets.check import check_capture, require_consistent
-from pimper_torch.evidence.datasets.mistakes import camera_mistakes
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.geometry.surfaces import vertex_normals

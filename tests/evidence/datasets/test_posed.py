@@ -4,13 +4,13 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_torch.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
     image_files,
     mask_finder,
-    rigid_or_refuse,
     shrink,
 )
 from pimper_torch.geometry.projection import project
@@ -225,12 +225,19 @@ def test_images_are_listed_in_plain_order(tmp_path, paint):
     assert [path.name for path in image_files(tmp_path, "a toy")] == ["1.png", "10.png", "2.png"]
 
 
-def test_a_folder_with_links_out_of_it_is_refused(tmp_path, paint):
-    paint(tmp_path / "elsewhere.png", 100)
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set" / "a.png").symlink_to(tmp_path / "elsewhere.png")
-    with pytest.raises(InputError, match="links out of the folder"):
-        image_files(tmp_path / "set", "a toy")
+def test_links_to_images_are_followed_wherever_they_lie(tmp_path, paint):
+    """A link to a file, a link to a link, and a folder that is one."""
+    paint(tmp_path / "elsewhere" / "deep" / "0.png", 100)
+    folder = tmp_path / "set"
+    folder.mkdir()
+    (folder / "a.png").symlink_to(tmp_path / "elsewhere" / "deep" / "0.png")
+    (folder / "b.png").symlink_to("a.png")
+    (folder / "broken.png").symlink_to("nowhere.png")
+    (tmp_path / "whole").symlink_to(folder)
+    for given in (folder, tmp_path / "whole"):
+        assert [path.name for path in image_files(given, "a toy")] == ["a.png", "b.png"]
+    find = mask_finder(tmp_path / "whole", "a toy")
+    assert find(tmp_path / "a.jpg") == tmp_path / "whole" / "a.png"
 
 
 def test_masks_are_found_by_name(tmp_path, paint):

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from pimper_torch.camera_files.layout import expect, inside, numbers, objects, read_json
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.layout import expect, inside, numbers, objects, read_json
 
 
 def test_a_refusal_tells_where_what_was_needed_and_what_there_is(tmp_path):
@@ -12,7 +12,9 @@ def test_a_refusal_tells_where_what_was_needed_and_what_there_is(tmp_path):
     assert str(tmp_path) in str(refusal.value)
 
 
-@pytest.mark.parametrize("name", ["../x.png", "/etc/passwd", "a/../../x", "link/x.png", "a\0b"])
+@pytest.mark.parametrize(
+    "name", ["../x.png", "/etc/passwd", "a/../../x", "link/../../x.png", "..", "a\0b"]
+)
 def test_a_path_that_leads_out_of_the_folder_is_refused(tmp_path, name):
     folder = tmp_path / "set"
     folder.mkdir()
@@ -20,6 +22,21 @@ def test_a_path_that_leads_out_of_the_folder_is_refused(tmp_path, name):
     with pytest.raises(InputError, match="leads out of it"):
         inside(folder, name, "a toy")
     assert inside(folder, "a/../b.png", "a toy").resolve() == folder / "b.png"
+
+
+def test_links_in_the_folder_are_followed_and_not_left_by_dots(tmp_path):
+    folder, elsewhere = tmp_path / "set", tmp_path / "far" / "photographs"
+    folder.mkdir()
+    elsewhere.mkdir(parents=True)
+    (elsewhere / "x.png").touch()
+    (elsewhere.parent / "secret.png").touch()
+    (folder / "images").symlink_to(elsewhere)
+    (folder / "one.png").symlink_to(elsewhere / "x.png")
+    assert inside(folder, "images/x.png", "a toy").is_file()
+    assert inside(folder, "one.png", "a toy").is_file()
+    # To the system, images/.. is the folder that the link's end lies in.
+    assert (folder / "images" / ".." / "secret.png").is_file()
+    assert not inside(folder, "images/../secret.png", "a toy").exists()
 
 
 @pytest.mark.parametrize("value", ["1 2.5 -3e1", ["1", "2.5", "-30"], [[1, 2.5, -30]]])

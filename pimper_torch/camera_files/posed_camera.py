@@ -1,0 +1,75 @@
+"""A camera as a file has it: pose, lens and what its photograph is called."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.camera_files.layout import expect
+from pimper_torch.geometry.frames import rigid
+from pimper_torch.records import Lens, Record
+
+# Files round a rotation to some digits; more than this is a scale or a reflection.
+_MAX_FROM_ROTATION = 1e-2
+
+SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
+"""Gives width and height of photographs by their names in a file; none for those not there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PosedCamera(Record):
+    """One camera of a file.
+
+    Attributes:
+        name: Of its photograph, or path, as the file has it.
+        cam_from_world: Rigid, in float64; camera axes x right, y down, z forward.
+        lens: In our pixels (top-left centre at (0.5, 0.5)), for a size of its own.
+        skew_px: ``K[0, 1]``.
+    """
+
+    name: str
+    cam_from_world: Float[Tensor, "4 4"]
+    lens: Lens
+    skew_px: float = 0.0
+
+
+def pinhole_lens(
+    intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int], camera: int = 1
+) -> Lens:
+    """Give the lens of a pinhole's ``K``, but for its skew."""
+    fx, fy, cx, cy = (float(intrinsics[row, column]) for row, column in _PINHOLE)
+    return Lens(
+        camera=camera, model="PINHOLE", params=(fx, fy, cx, cy), width=size_px[0], height=size_px[1]
+    )
+
+
+_PINHOLE = ((0, 0), (1, 1), (0, 2), (1, 2))
+
+
+def rigid_or_refuse(
+    rotation: Float[Tensor, "3 3"],
+    translation: Float[Tensor, "3"],
+    what: str,
+    path: Path,
+    kind: str,
+) -> Float[Tensor, "4 4"]:
+    """Put a file's rotation and translation together, the rotation made exact.
+
+    Raises:
+        InputError: The matrix is further from a rotation than rounding explains.
+    """
+    U, _, Vh = torch.linalg.svd(rotation)
+    nearest = U @ Vh
+    off = float((rotation - nearest).abs().max())
+    mirrored = bool(torch.linalg.det(nearest) < 0)
+    expect(
+        off <= _MAX_FROM_ROTATION and not mirrored,
+        path,
+        kind,
+        f"a rotation in {what}",
+        "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation",
+    )
+    return rigid(nearest, translation)

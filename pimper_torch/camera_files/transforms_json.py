@@ -1,0 +1,152 @@
+"""Cameras of NeRF's ``transforms.json``, of Blender, instant-ngp and nerfstudio."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+
+from pimper_torch.camera_files.layout import expect, numbers, objects, read_json
+from pimper_torch.camera_files.posed_camera import PosedCamera, SizesOf, rigid_or_refuse
+from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.records import Lens
+
+KIND = "a transforms.json set"
+FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+"""OpenGL's camera has y up and looks along -z."""
+
+_POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+
+
+def read_frames(path: Path) -> list[dict[str, object]]:
+    """Give the frames, each with what the whole file says.
+
+    Raises:
+        InputError: The file has another structure, or a frame names no photograph.
+    """
+    whole = read_json(path, KIND)
+    frames = [{**whole, **frame} for frame in objects(whole.get("frames"), "frames", path, KIND)]
+    for frame in frames:
+        name = frame.get("file_path")
+        expect(isinstance(name, str) and name != "", path, KIND, "a text as file_path", repr(name))
+    return frames
+
+
+def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
+    """Read the cameras; a file that says no sizes takes those of the photographs.
+
+    ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
+    The focal length is ``fl_x``, ``fl_y`` in pixels, or follows from ``camera_angle_x``; the
+    principal point ``cx``, ``cy`` is the centre of the image unless given. All of these, and
+    ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may stand in the file
+    or in a frame. instant-ngp and nerfstudio take them from COLMAP and cast rays through
+    x + 0.5 (nerfstudio, "Data conventions" and ``Cameras.get_image_coords``), and Blender's
+    centre is that of the image's area: their pixels are ours.
+
+    Args:
+        path: The file.
+        sizes_of: Of photographs, by ``file_path``.
+
+    Returns:
+        In the file's order; without frames whose size nothing tells.
+
+    Raises:
+        InputError: The file has another structure.
+    """
+    frames = read_frames(path)
+    names = [str(frame["file_path"]) for frame in frames]
+    sizes = sizes_of(names) if any(stated_size(frame) is None for frame in frames) else None
+    cameras = []
+    for index, (frame, name) in enumerate(zip(frames, names, strict=True)):
+        size = stated_size(frame) or (sizes[index] if sizes else None)
+        if size is not None:
+            cameras.append(frame_camera(frame, name, size, path))
+    lenses = list(dict.fromkeys(camera.lens for camera in cameras))
+    return [
+        camera.replace(lens=camera.lens.replace(camera=1 + lenses.index(camera.lens)))
+        for camera in cameras
+    ]
+
+
+def stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
+    """Give a frame's width and height, where the file says them."""
+    sides = frame.get("w"), frame.get("h")
+    if not all(isinstance(side, int | float) and 0 < side < math.inf for side in sides):
+        return None
+    return round(float(str(sides[0]))), round(float(str(sides[1])))
+
+
+def frame_camera(
+    frame: Mapping[str, object], name: str, size_px: tuple[int, int], path: Path
+) -> PosedCamera:
+    """Read one frame.
+
+    Args:
+        frame: Of :func:`read_frames`.
+        name: Of its photograph, for messages too.
+        size_px: That the lens is for.
+        path: The file.
+
+    Raises:
+        InputError: It is no camera.
+    """
+    matrix = frame.get("transform_matrix")
+    expect(
+        isinstance(matrix, list) and len(matrix) in (3, 4),
+        path,
+        KIND,
+        f"4 rows of 4 numbers as transform_matrix of {name}",
+        type(matrix).__name__,
+    )
+    rows = matrix[:3] if isinstance(matrix, list) else []
+    world_from_cam = numbers(rows, 12, f"transform_matrix of {name}", path, KIND).reshape(3, 4)
+    pose = rigid_or_refuse(
+        world_from_cam[:, :3] * FLIP,
+        world_from_cam[:, 3],
+        f"transform_matrix of {name}",
+        path,
+        KIND,
+    )
+    return PosedCamera(
+        name=name,
+        lens=_lens(frame, name, size_px, path),
+        cam_from_world=invert_rigid(pose),
+    )
+
+
+def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], path: Path) -> Lens:
+    def value(key: str, default: float = 0.0) -> float:
+        given = frame.get(key)
+        if given is None:
+            return default
+        return float(numbers(given, 1, f"{key} of {name}", path, KIND))
+
+    width, height = size_px
+    focal = _focal(value("fl_x"), value("camera_angle_x"), width)
+    focal_y = _focal(value("fl_y"), value("camera_angle_y"), height)
+    expect(
+        focal > 0 or focal_y > 0,
+        path,
+        KIND,
+        f"fl_x or camera_angle_x, in the file or for {name}",
+        "neither, or no positive one",
+    )
+    fx, fy = focal or focal_y, focal_y or focal
+    pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
+    k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = str(frame.get("camera_model") or "OPENCV")
+    kind, params = "PINHOLE", tuple[float, ...]()
+    if model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True:
+        kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
+    else:
+        expect(model in _POLYNOMIAL, path, KIND, f"a camera_model of {_POLYNOMIAL}", model)
+        expect(k4 == 0, path, KIND, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
+        if any((k1, k2, k3, p1, p2)):
+            kind, params = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    return Lens(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)
+
+
+def _focal(focal_px: float, angle: float, side_px: float) -> float:
+    if focal_px > 0 or not 0 < angle < math.pi:
+        return max(focal_px, 0.0)
+    return side_px / 2 / math.tan(angle / 2)

@@ -1,0 +1,264 @@
+"""Points of cameras that are known: matched along their epipolar lines, cameras held fixed."""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pimper_torch.errors import caution
+from pimper_torch.geometry.local_frame import local_origin, to_local
+from pimper_torch.memory import release_memory
+from pimper_torch.parallel import side_by_side
+from pimper_torch.records import SparseScene, Views
+from pimper_torch.sfm.agreement import epipolar_geometry, undistorted_pixels
+from pimper_torch.sfm.binding import loaded, quiet, thread_count
+from pimper_torch.sfm.colmap import model_of, reconstruction_of
+from pimper_torch.sfm.features import FeatureSettings, find_features
+from pimper_torch.sfm.guided import NearEpipolarLines, guided_matches, read_features
+from pimper_torch.sfm.leave_out import leave_out_room
+from pimper_torch.sfm.matching import (
+    MatchSettings,
+    PhotographPair,
+    VerifiedPair,
+    all_pairs,
+    match_pairs,
+    photograph_numbers,
+    strongest,
+    verified_pairs,
+)
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.photograph_agreement import (
+    best_of,
+    explained,
+    pinholes_of,
+    require_agreement,
+    undistorted_pairs,
+)
+from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
+from pimper_torch.sfm.reprojection import observation_errors
+from pimper_torch.sfm.workspace import Workspace, workspace
+
+# Observed points of the median view below which points are triangulated, and below which depth maps
+# help, too. In a model of COLMAP's or our own a view sees 30 at least; the other is half of it.
+FEWEST_OBSERVED, FEW_OBSERVED = 15, 30
+# Angle between optical axes from which on photographs have nothing to match. A choice.
+_MAX_ANGLE_DEG = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TriangulationSettings:
+    """How points are found.
+
+    Attributes:
+        features: What counts as one.
+        matching: What counts as a match.
+        guided_pairs: Of each photograph, that are matched along epipolar lines.
+        tracks: How points are found again in every view; cameras are held fixed.
+    """
+
+    features: FeatureSettings
+    matching: MatchSettings
+    guided_pairs: int
+    tracks: TrackSettings
+
+
+def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED) -> bool:
+    """Tell whether most views observe fewer points."""
+    count = model.num_views if isinstance(model, SparseModel) else model.cameras.num_views
+    seen = torch.bincount(model.observation_view, minlength=count)
+    return float(seen.double().median()) < fewest
+
+
+def triangulate(
+    views: Views, models: Sequence[SparseModel], settings: TriangulationSettings, where: str
+) -> SparseModel:
+    """Triangulate what photographs show, with cameras held fixed.
+
+    Features are found and matched as in structure from motion. What an epipolar geometry of its own
+    verifies tells whether the cameras belong to the photographs. Then features are matched anew
+    along the cameras' epipolar lines, triangulated, and found again in every view by aligning
+    patches. On one thread where the order of sums tells, so that bits repeat.
+
+    Args:
+        views: The photographs.
+        models: Of them, in their order: cameras in the ways in which they may be meant; the one
+            that fits best is taken. Points that it has are replaced where more are found.
+        settings: How.
+        where: The cameras are, for messages.
+
+    Returns:
+        Poses and lenses bit for bit as given. With the points as they were where no more are
+        found, which a :class:`~pimper_torch.errors.PimperWarning` says.
+
+    Raises:
+        InputError: Cameras and photographs do not belong together.
+    """
+    lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
+    with workspace(views, thread_count(settings.matching.threads)) as space:
+        counts = find_features(space, settings.features, [None] * views.num_views, lenses)
+        release_memory()
+        if sum(count > 0 for count in counts) >= 2:
+            match_pairs(space, all_pairs(views.num_views), settings.matching)
+            leave_out_room(space.database, settings.matching)
+        verified = verified_pairs(space)
+        given = _way(models, verified, settings, where)
+        require_agreement(given, verified, settings.matching.max_error_px, where)
+        offset = local_origin(given.cam_from_world, given.points_world)
+        local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
+        _match_along_lines(space, local, verified, settings)
+        found = _triangulated(space, local, settings.matching.seed)
+    release_memory()
+    if len(found.points_world):
+        found = refine_tracks(views, found, settings.tracks, cameras=False)
+    points = found.points_world + found.points_world.new_tensor(offset)
+    found = _with_cameras_of(given, found.replace(points_world=points))
+    if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
+        _tell_nothing(found, where)
+        return given
+    _tell(found, where)
+    return found
+
+
+def _way(
+    models: Sequence[SparseModel],
+    verified: Sequence[VerifiedPair],
+    settings: TriangulationSettings,
+    where: str,
+) -> SparseModel:
+    """Choose between cameras of photographs as they stand, and as their files store them."""
+    if len(models) == 1:
+        return models[0]
+    best = best_of(models, verified, settings.matching.max_error_px)
+    if sum(pair.num_matches for pair in verified) < settings.matching.min_inliers:
+        caution(
+            f"{where}: EXIF turns photographs, and neither sizes nor matches tell whether its "
+            "cameras are of them before or after that; they are taken as after. If the result is "
+            "wrong, save the photographs turned, without EXIF's orientation.",
+            stacklevel=5,
+        )
+    elif best:
+        caution(
+            f"{where}: its cameras are of pictures that stand otherwise than the photographs, such "
+            "as the pixels that files store before EXIF turns them. They are turned with these, as "
+            "matches between photographs tell.",
+            stacklevel=5,
+        )
+    return models[best]
+
+
+def _match_along_lines(
+    space: Workspace,
+    model: SparseModel,
+    verified: Sequence[VerifiedPair],
+    settings: TriangulationSettings,
+) -> None:
+    """Replace what was verified by matches along the cameras' epipolar lines."""
+    matching = settings.matching
+    pairs = _pairs(model, verified, settings)
+    kinds = loaded().TwoViewGeometryConfiguration
+    with quiet(), loaded().Database.open(space.database) as stored:
+        image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
+        features = []
+        for number in range(model.num_views):
+            its = read_features(stored, image_of[number])
+            features.append(its.replace(pixels=undistorted_pixels(model, number, its.pixels)))
+
+        def matches(pair: PhotographPair) -> Tensor:
+            first, second = (features[number] for number in pair)
+            if not len(first.pixels) or not len(second.pixels):
+                return torch.zeros(0, 2, dtype=torch.long)
+            near = NearEpipolarLines(epipolar_geometry(model, pair), matching.max_error_px)
+            found = guided_matches(first, second, near, matching.max_ratio)
+            ends = VerifiedPair(
+                views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
+            )
+            return found[explained(pinholes_of(model), ends, matching.max_error_px)]
+
+        stored.clear_two_view_geometries()
+        for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
+            geometry = loaded().TwoViewGeometry()
+            geometry.config = kinds.CALIBRATED
+            geometry.F = epipolar_geometry(model, pair).numpy()
+            geometry.inlier_matches = found.numpy().astype(np.uint32)
+            stored.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
+
+
+def _pairs(
+    model: SparseModel, verified: Sequence[VerifiedPair], settings: TriangulationSettings
+) -> list[PhotographPair]:
+    """Choose pairs by matches that the cameras explain, then by the angle between their axes."""
+    axes = model.cam_from_world[:, 2, :3]
+    angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
+    cameras, limit = pinholes_of(model), settings.matching.max_error_px
+    weights = {
+        (first, second): 1 - float(angles[first, second]) / _MAX_ANGLE_DEG
+        for first, second in combinations(range(model.num_views), 2)
+        if float(angles[first, second]) < _MAX_ANGLE_DEG
+    }
+    for pair in undistorted_pairs(model, verified):
+        count = int(explained(cameras, pair, limit).sum())
+        if count:
+            weights[pair.views] = weights.get(pair.views, 0.0) + count
+    return strongest(weights, model.num_views, max(settings.guided_pairs, 1))
+
+
+def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseModel:
+    """Let COLMAP triangulate the matches in the database; names and cameras are the model's."""
+    pycolmap = loaded()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = seed
+    options.triangulation.random_seed = seed
+    options.extract_colors = False
+    options.ba_refine_focal_length = False
+    options.ba_refine_extra_params = False
+    lenses = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(model.lenses))
+    nothing = torch.zeros(0, dtype=torch.long)
+    bare = model.replace(
+        names=space.files,
+        lenses=lenses,
+        points_world=model.points_world[:0],
+        observation_point=nothing,
+        observation_view=nothing,
+        observation_pixels=model.observation_pixels[:0],
+    )
+    with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
+        cameras = reconstruction_of(bare, torch.zeros(0, 3, dtype=torch.uint8))
+        with pycolmap.Database.open(space.database) as stored:
+            for camera in cameras.cameras.values():
+                stored.update_camera(camera)
+        found = pycolmap.triangulate_points(
+            cameras, space.database, space.images, output, True, options
+        )
+    return _with_cameras_of(model, model_of(found))
+
+
+def _with_cameras_of(given: SparseModel, found: SparseModel) -> SparseModel:
+    return found.replace(
+        names=given.names,
+        lenses=given.lenses,
+        cam_from_world=given.cam_from_world,
+        background_from_view=given.background_from_view,
+    )
+
+
+def _tell(found: SparseModel, where: str) -> None:
+    caution(
+        f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
+        "were triangulated from the photographs with the cameras held fixed, observed "
+        f"{len(found.observation_point):,} times; median reprojection error "
+        f"{float(observation_errors(found).median()):.2f} px.",
+        stacklevel=4,
+    )
+
+
+def _tell_nothing(found: SparseModel, where: str) -> None:
+    caution(
+        f"{where}: hardly any of its views observes points, and {len(found.points_world)} could be "
+        "triangulated from features, which hardly match between the photographs.",
+        stacklevel=4,
+    )

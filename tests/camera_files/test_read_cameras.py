@@ -1,0 +1,255 @@
+"""One rig in the words of every program: the cameras that `--sparse` takes are the same."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.records import Cameras, Views
+from pimper_torch.sfm import colmap
+from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.undistort import pinholes_for
+
+WIDTH, HEIGHT, FOCAL = 64, 48, 90.0
+NAMES = ("10.png", "2.png", "a b.png")
+
+
+@pytest.fixture
+def rig() -> Cameras:
+    cameras = arc_cameras(3, width=WIDTH, height=HEIGHT, focal_px=FOCAL, distance=5.0)
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[:, :2, 2] += torch.tensor([1.5, -2.25], dtype=torch.float64)
+    return cameras.replace(intrinsics=intrinsics)
+
+
+def views_of(scale: float = 1.0, folder: Path | None = None) -> Views:
+    width, height = round(WIDTH * scale), round(HEIGHT * scale)
+    return Views(
+        images=torch.full((3, 1, height, width), 0.5),
+        sizes_px=torch.tensor([[width, height]] * 3),
+        names=NAMES,
+        focals_px=torch.full((3,), torch.nan),
+        folder=str(folder or ""),
+    )
+
+
+def of_colmap(rig: Cameras, folder: Path, *, text: bool = False) -> Path:
+    model = SparseModel(
+        names=NAMES,
+        lenses=colmap.pinhole_lenses(rig),
+        cam_from_world=rig.cam_from_world,
+        points_world=torch.zeros(0, 3, dtype=torch.float64),
+        observation_point=torch.zeros(0, dtype=torch.long),
+        observation_view=torch.zeros(0, dtype=torch.long),
+        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
+    )
+    path = folder / "model"
+    colmap.write_binary(model, torch.zeros(0, 3, dtype=torch.uint8), path)
+    if text:
+        colmap.reconstruction_of(model, torch.zeros(0, 3, dtype=torch.uint8)).write_text(str(path))
+        for binary in path.glob("*.bin"):
+            binary.unlink()
+    return path
+
+
+def of_transforms(rig: Cameras, folder: Path, *, sizes: bool = True) -> Path:
+    K = rig.intrinsics[0]
+    flip = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    whole = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2])}
+    whole |= {"cy": float(K[1, 2])} | ({"w": WIDTH, "h": HEIGHT} if sizes else {})
+    matrices = invert_rigid(rig.cam_from_world) @ flip
+    frames = [
+        {"file_path": f"./somewhere/{name}", "transform_matrix": matrix.tolist()}
+        for name, matrix in zip(NAMES, matrices, strict=True)
+    ]
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**whole, "frames": frames[::-1]}))
+    return path
+
+
+def of_metashape(rig: Cameras, folder: Path) -> Path:
+    K = rig.intrinsics[0]
+    cameras = "".join(
+        f'<camera id="{index}" sensor_id="0" label="{name.removesuffix(".png")}"><transform>'
+        + " ".join(map(repr, matrix.flatten().tolist()))
+        + "</transform></camera>"
+        for index, (name, matrix) in enumerate(
+            zip(NAMES, invert_rigid(rig.cam_from_world), strict=True)
+        )
+    )
+    path = folder / "cameras.xml"
+    path.write_text(
+        '<document version="2.0.0"><chunk label="1"><sensors><sensor id="0" type="frame">'
+        f'<resolution width="{WIDTH}" height="{HEIGHT}"/><calibration class="adjusted">'
+        f"<f>{float(K[0, 0])}</f><cx>{float(K[0, 2]) - WIDTH / 2}</cx>"
+        f"<cy>{float(K[1, 2]) - HEIGHT / 2}</cy></calibration></sensor></sensors>"
+        f"<cameras>{cameras}</cameras></chunk></document>"
+    )
+    return path
+
+
+def of_meshroom(rig: Cameras, folder: Path) -> Path:
+    K = rig.intrinsics[0]
+    center = [str(float(K[0, 2]) - 0.5 - WIDTH / 2), str(float(K[1, 2]) - 0.5 - HEIGHT / 2)]
+    intrinsic = {
+        "intrinsicId": "7",
+        "width": str(WIDTH),
+        "height": str(HEIGHT),
+        "sensorWidth": "36",
+        "focalLength": str(float(K[0, 0]) * 36 / WIDTH),
+        "pixelRatio": "1",
+        "type": "pinhole",
+        "principalPoint": center,
+        "distortionParams": "",
+    }
+    views, poses = [], []
+    for index, (name, pose) in enumerate(zip(NAMES, rig.cam_from_world, strict=True)):
+        place = {"viewId": str(index), "poseId": str(index), "intrinsicId": "7"}
+        views.append({**place, "path": f"C:\\theirs\\{name}"})
+        transform = {
+            "rotation": [repr(value) for value in pose[:3, :3].T.flatten().tolist()],
+            "center": [repr(value) for value in (-pose[:3, :3].T @ pose[:3, 3]).tolist()],
+        }
+        poses.append({"poseId": str(index), "pose": {"transform": transform}})
+    path = folder / "cameras.sfm"
+    whole = {"version": ["1", "2", "6"], "views": views, "intrinsics": [intrinsic], "poses": poses}
+    path.write_text(json.dumps(whole))
+    return path
+
+
+def of_sfm_json(rig: Cameras, folder: Path) -> Path:
+    return of_meshroom(rig, folder).rename(folder / "sfm.json")
+
+
+def saved(folder: Path, **arrays: object) -> Path:
+    path = folder / "cameras.npz"
+    np.savez(path, **{name: np.asarray(value) for name, value in arrays.items()})
+    return path
+
+
+def of_idr(rig: Cameras, folder: Path) -> Path:
+    K = rig.intrinsics.clone()
+    K[:, :2, 2] -= 0.5  # which counts centres from 0
+    order = np.argsort(NAMES)
+    world = rig.cam_from_world.clone()
+    world[:, :3] = 2.5 * K @ rig.cam_from_world[:, :3]
+    arrays = {f"world_mat_{rank}": world[view].numpy() for rank, view in enumerate(order)}
+    arrays |= {f"scale_mat_{rank}": np.eye(4) for rank in range(3)}
+    return saved(folder, **arrays)
+
+
+def of_matrices(rig: Cameras, folder: Path) -> Path:
+    pose = rig.cam_from_world
+    return saved(folder, K=rig.intrinsics[0], R=pose[:, :3, :3], t=pose[:, :3, 3])
+
+
+def of_named_poses(rig: Cameras, folder: Path) -> Path:
+    backwards = list(range(3))[::-1]
+    return saved(
+        folder,
+        intrinsics=rig.intrinsics[backwards],
+        cam_from_world=rig.cam_from_world[backwards],
+        names=NAMES[::-1],
+    )
+
+
+def of_projections(rig: Cameras, folder: Path) -> Path:
+    return saved(folder, P=-0.7 * rig.intrinsics @ rig.cam_from_world[:, :3])
+
+
+WAYS = [
+    of_colmap,
+    lambda rig, folder: of_colmap(rig, folder, text=True),
+    of_transforms,
+    of_metashape,
+    of_meshroom,
+    of_sfm_json,
+    of_idr,
+    of_matrices,
+    of_named_poses,
+    of_projections,
+]
+
+
+@pytest.mark.parametrize("write", WAYS)
+def test_every_file_gives_the_same_cameras(rig, write, tmp_path):
+    found = existing_model(views_of(), write(rig, tmp_path))
+    assert found.names == NAMES
+    order = torch.tensor(np.argsort(NAMES) if write in (of_matrices, of_projections) else range(3))
+    # Arrays without names go by the order of the names: those of the rig were written in another.
+    expected = rig.take(torch.argsort(order))
+    assert_close(found.cam_from_world, expected.cam_from_world, rtol=0, atol=1e-6)
+    assert_close(pinholes_for(found.lenses), expected.intrinsics, rtol=0, atol=1e-6)
+    assert [(lens.width, lens.height) for lens in found.lenses] == [(WIDTH, HEIGHT)] * 3
+
+
+@pytest.mark.parametrize("write", [of_colmap, of_metashape, of_meshroom, of_transforms])
+def test_cameras_follow_photographs_that_were_resized(rig, write, tmp_path):
+    found = existing_model(views_of(0.5), write(rig, tmp_path))
+    K = pinholes_for(found.lenses)
+    assert_close(K[:, :2], rig.intrinsics[:, :2] / 2, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "write", [of_matrices, of_idr, lambda rig, folder: of_transforms(rig, folder, sizes=False)]
+)
+def test_a_file_without_sizes_is_for_the_photographs_as_their_files_are(rig, write, tmp_path):
+    photographs = tmp_path / "photos"
+    photographs.mkdir()
+    for name in NAMES:
+        Image.new("L", (WIDTH, HEIGHT)).save(photographs / name)
+    found = existing_model(views_of(0.5, photographs), write(rig, tmp_path))
+    K = pinholes_for(found.lenses)
+    assert_close(K[:, :2], rig.intrinsics[:, :2] / 2, rtol=0, atol=1e-6)
+
+
+def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
+    K = rig.intrinsics.clone()
+    K[:, 0, 1] = 1e-3
+    existing_model(views_of(), of_matrices(rig.replace(intrinsics=K), tmp_path))
+    K[1, 0, 1] = 3.0
+    skewed = of_projections(rig.replace(intrinsics=K), tmp_path)
+    with pytest.raises(InputError, match=r"cameras\.npz: found a skew in 2\.png"):
+        existing_model(views_of(), skewed)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "told"),
+    [
+        ({"K": np.eye(3)}, "projections.*Found: K"),
+        ({}, "no arrays"),
+        ({"P": np.zeros((3, 3, 4))}, "no inverse"),
+        ({"P": np.zeros((3, 4, 3))}, "3x4 numbers a camera as P"),
+        ({"K": np.eye(3), "R": np.zeros((3, 3, 3)), "t": np.zeros((3, 3))}, "a rotation in"),
+        ({"K": -np.eye(3), "R": [np.eye(3)] * 3, "t": np.zeros((3, 3))}, "as K 0"),
+        ({"K": np.eye(3), "R": [np.eye(3)] * 3, "t": np.zeros((2, 3))}, "as many R as t"),
+        ({"K": np.eye(3), "R": [np.eye(3)] * 2, "t": np.zeros((2, 3))}, "3 photographs.*2 cameras"),
+        ({"K": np.eye(3), "cam_from_world": np.full((3, 3, 4), np.nan)}, "finite numbers"),
+        ({"world_mat_0": np.eye(4), "world_mat_1": np.eye(4)}, "3 photographs.*2 cameras"),
+    ],
+)
+def test_arrays_that_are_no_cameras_are_refused(arrays, told, tmp_path):
+    with pytest.raises(InputError, match=told):
+        existing_model(views_of(), saved(tmp_path, **arrays))
+
+
+@pytest.mark.parametrize("name", ["cameras.txt", "cameras.json", "cameras.xml", "cameras.npz"])
+def test_another_file_is_refused(name, tmp_path):
+    (tmp_path / name).write_text("nothing of the kind")
+    with pytest.raises(InputError, match=name.replace(".", r"\.")):
+        existing_model(views_of(), tmp_path / name)
+
+
+def test_two_cameras_of_one_photograph_are_refused(rig, tmp_path):
+    pose = rig.cam_from_world
+    path = saved(tmp_path, K=rig.intrinsics[0], cam_from_world=pose, names=["2.png"] * 3)
+    with pytest.raises(InputError, match=r"2\.png may be any of 2\.png, 2\.png"):
+        existing_model(views_of(), path)

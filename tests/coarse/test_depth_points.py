@@ -1,0 +1,82 @@
+"""Points of depth maps, of a ball whose light changes and whose surface is known."""
+
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d
+
+from pimper_torch.coarse.depth_points import depth_points
+from pimper_torch.errors import PimperWarning
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.io.tensors import scene_of
+from pimper_torch.records import SparseScene
+from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
+from tests.sfm.ball import cameras_on_an_arc, photographs
+
+
+@pytest.fixture(scope="module")
+def scene() -> SparseScene:
+    cameras = cameras_on_an_arc()
+    images = avg_pool2d(photographs(cameras).images.float(), 2)
+    K = scale_intrinsics(cameras.intrinsics, 0.5, 0.5)
+    return scene_of(images, K, cameras.cam_from_world)
+
+
+def test_points_lie_on_the_surface_before_the_views_that_show_them(scene):
+    assert lacks_points(scene)
+    with pytest.warns(PimperWarning, match="points were taken from depth maps"):
+        found = depth_points(scene)
+    assert not lacks_points(found, FEW_OBSERVED)
+    assert found.cameras is scene.cameras
+    assert bool((found.observed.sum(dim=1) >= 3).all())
+    off = (found.points_world.norm(dim=1) - 1).abs()  # a pixel is 0.01 on the ball
+    assert float(off.median()) < 0.005
+    assert float(off.quantile(0.9)) < 0.03
+    ahead = transform(found.cameras.cam_from_world, found.points_world)[..., 2] > 0
+    assert bool(ahead.mT[found.observed].all())
+    assert 0 < float(found.reprojection_errors_px.median()) < 0.5
+
+
+def test_masks_confine_them(scene):
+    height, width = scene.views.images.shape[-2:]
+    column = torch.arange(width).expand(height, width)
+    masks = (column > 0.4 * width).expand(scene.cameras.num_views, -1, -1)
+    with pytest.warns(PimperWarning, match="points were taken"):
+        found = depth_points(scene.replace(views=scene.views.replace(masks=masks)))
+    assert float(found.observation_pixels[:, 0].min()) > 0.39 * width
+
+
+def test_photographs_of_nothing_give_none_and_a_warning(scene):
+    blank = scene.replace(
+        views=scene.views.replace(images=torch.full_like(scene.views.images, 0.3))
+    )
+    with pytest.warns(PimperWarning, match="No points: features do not match"):
+        assert len(depth_points(blank).points_world) == 0
+
+
+def test_points_of_the_scene_itself_stay(scene):
+    own = torch.tensor([[0.0, 0.0, -1.0], [0.1, 0.0, -0.99]])
+    given = scene_of(
+        scene.views.images, scene.cameras.intrinsics, scene.cameras.cam_from_world, points_world=own
+    )
+    with pytest.warns(PimperWarning, match="points were taken"):
+        found = depth_points(given)
+    assert torch.equal(found.points_world[:2], own)
+    assert bool(found.observed[:2].all())
+
+
+@pytest.mark.parametrize("order", [[1, 2, 3, 4, 5, 0], [3, 0, 5, 1, 4, 2]])
+def test_cameras_of_other_photographs_give_none(scene, order):
+    cameras = scene.cameras.replace(cam_from_world=scene.cameras.cam_from_world[order])
+    wrong = scene.replace(cameras=cameras)
+    with pytest.warns(PimperWarning, match="No points"):
+        assert depth_points(wrong) is wrong
+
+
+def test_cameras_that_see_nothing_in_common_give_none(scene):
+    poses = scene.cameras.cam_from_world.clone()
+    poses[:, :2] *= torch.where(torch.arange(len(poses)) % 2 == 0, 1.0, -1.0)[:, None, None]
+    poses[:, 0, 3] += 1e4 * torch.arange(len(poses)) ** 2
+    apart = scene.replace(cameras=scene.cameras.replace(cam_from_world=poses))
+    with pytest.warns(PimperWarning, match="No points"):
+        assert depth_points(apart) is apart

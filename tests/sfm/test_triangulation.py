@@ -1,0 +1,185 @@
+"""Points of known cameras, on a ball whose surface is known."""
+
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn.functional import grid_sample
+
+from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.geometry.frames import invert_rigid, rigid
+from pimper_torch.geometry.local_frame import from_local
+from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
+from pimper_torch.records import Lens, Views
+from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
+from pimper_torch.sfm.matching import VerifiedPair
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.photograph_agreement import explained, pinholes_of
+from pimper_torch.sfm.reconstruct import ReconstructConfig
+from pimper_torch.sfm.reprojection import observation_errors
+from pimper_torch.sfm.triangulation import lacks_points, triangulate
+from tests.sfm.ball import cameras_on_an_arc, model_of, photographs, points_on_the_ball
+
+SETTINGS = ReconstructConfig(threads=1).triangulation
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return photographs(cameras_on_an_arc(), lit=False)
+
+
+@pytest.fixture
+def bare(generator) -> SparseModel:
+    """The cameras without points."""
+    model = model_of(cameras_on_an_arc(), points_on_the_ball(40, generator), generator, 0.2)
+    return without_points(model)
+
+
+def without_points(model: SparseModel) -> SparseModel:
+    return model.replace(
+        points_world=model.points_world[:0],
+        observation_point=model.observation_point[:0],
+        observation_view=model.observation_view[:0],
+        observation_pixels=model.observation_pixels[:0],
+    )
+
+
+def test_points_lie_on_the_surface_and_cameras_come_back_bit_for_bit(views, bare):
+    assert lacks_points(bare)
+    with pytest.warns(PimperWarning, match=r"model: hardly any.*points were triangulated.*px"):
+        found = triangulate(views, [bare], SETTINGS, "The model")
+    assert torch.equal(found.cam_from_world, bare.cam_from_world)
+    assert found.lenses == bare.lenses
+    assert found.names == bare.names
+    assert not lacks_points(found)
+    off = (found.points_world.norm(dim=1) - 1).abs()  # a pixel is 0.005 on the ball
+    assert len(off) > 100
+    assert float(off.median()) < 0.001
+    assert float(off.quantile(0.95)) < 0.01
+    assert float(observation_errors(found).median()) < 0.3
+    assert bool((torch.bincount(found.observation_point) >= 2).all())
+
+
+def test_the_number_of_threads_changes_no_bit(views, bare):
+    found = []
+    for threads in (1, 2):
+        settings = ReconstructConfig(threads=threads).triangulation
+        with pytest.warns(PimperWarning, match="were triangulated"):
+            found.append(triangulate(views, [bare], settings, "The model"))
+    assert torch.equal(found[0].points_world, found[1].points_world)
+    assert torch.equal(found[0].observation_pixels, found[1].observation_pixels)
+
+
+def bent(views: Views, lens: Lens) -> Views:
+    """Show what the lens would have taken of what a pinhole of its focal length took."""
+    K = pinhole_of(lens)
+    pixels = pixel_centers(lens.width, lens.height, like=K)
+    seen = undistort_pixels(lens, pixels.reshape(-1, 2)) * K.diagonal()[:2] + K[:2, 2]
+    grid = grid_from_pixels(seen.reshape(1, *pixels.shape), lens.width, lens.height)
+    grid = grid.to(views.images).expand(views.num_views, -1, -1, -1)
+    return views.replace(images=grid_sample(views.images, grid, align_corners=False))
+
+
+def test_matches_follow_the_lens(views, bare):
+    lens = bare.lenses[0].replace(params=(*bare.lenses[0].params[:3], 0.3))  # 10 px in the corners
+    model = bare.replace(lenses=(lens,) * bare.num_views)
+    with pytest.warns(PimperWarning, match="were triangulated"):
+        found = triangulate(bent(views, lens), [model], SETTINGS, "The model")
+    assert found.lenses == model.lenses
+    assert float((found.points_world.norm(dim=1) - 1).abs().median()) < 0.001
+    assert float(observation_errors(found).median()) < 0.3
+
+
+def test_georeferenced_cameras_give_the_points_of_those_near_the_origin(views, bare):
+    offset = torch.tensor([448231.25, 5411923.5, 312.125], dtype=torch.float64)
+    far = bare.replace(cam_from_world=from_local(bare.cam_from_world, tuple(offset.tolist())))
+    with pytest.warns(PimperWarning, match="were triangulated"):
+        found = triangulate(views, [far], SETTINGS, "The model")
+    assert torch.equal(found.cam_from_world, far.cam_from_world)
+    assert len(found.points_world) > 100
+    assert float(((found.points_world - offset).norm(dim=1) - 1).abs().median()) < 0.001
+    assert float(observation_errors(found).median()) < 0.3
+
+
+def axes(*signs: int) -> torch.Tensor:
+    return torch.diag(torch.tensor([*signs, 1], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (invert_rigid, r"poses take points from the camera to the world.*invert them"),
+        (lambda pose: axes(1, -1, -1) @ pose, r"as in OpenGL.*diag\(1, -1, -1, 1\)"),
+        (lambda pose: invert_rigid(pose) @ axes(1, -1, -1), "as in transforms.json"),
+        (lambda pose: rigid(pose[:, :3, :3].mT, pose[:, :3, 3]), "rotations are transposed"),
+        (
+            lambda pose: rigid(pose[:, :3, :3], invert_rigid(pose)[:, :3, 3]),
+            "last column holds the camera's centre",
+        ),
+        (lambda pose: axes(-1, -1, 1) @ pose, "photographs are turned by 180 degrees"),
+        (lambda pose: pose[[3, 0, 5, 1, 4, 2]], "No usual mistake of conventions explains it"),
+    ],
+)
+def test_cameras_that_photographs_contradict_are_refused_with_what_would_fit(
+    views, bare, wrong, told
+):
+    model = bare.replace(cam_from_world=wrong(bare.cam_from_world))
+    with pytest.raises(
+        InputError, match=r"The model: these cameras.*needed: at least 50%"
+    ) as refusal:
+        triangulate(views, [model], SETTINGS, "The model")
+    assert refusal.match(told)
+
+
+def test_photographs_without_texture_give_no_points_and_a_warning(views, bare):
+    blank = views.replace(images=torch.full_like(views.images, 0.3))
+    with pytest.warns(PimperWarning, match="0 could be triangulated from features"):
+        found = triangulate(blank, [bare], SETTINGS, "The model")
+    assert found is bare
+
+
+def test_points_that_there_are_stay_where_no_more_are_found(views, generator):
+    few = model_of(cameras_on_an_arc(), points_on_the_ball(5, generator), generator, 0.2)
+    assert lacks_points(few)
+    blank = views.replace(images=torch.full_like(views.images, 0.3))
+    with pytest.warns(PimperWarning, match="could be triangulated"):
+        assert triangulate(blank, [few], SETTINGS, "The model") is few
+    with pytest.warns(PimperWarning, match="were triangulated"):
+        more = triangulate(views, [few], SETTINGS, "The model")
+    assert len(more.points_world) > 10 * len(few.points_world)
+
+
+def test_of_two_ways_to_read_cameras_the_one_that_photographs_show_is_taken(views, bare):
+    over = bare.replace(cam_from_world=axes(-1, -1, 1) @ bare.cam_from_world)
+    with pytest.warns(PimperWarning) as told:
+        found = triangulate(views, [over, bare], SETTINGS, "The model")
+    assert "before EXIF turns them" in str(told[0].message)
+    assert torch.equal(found.cam_from_world, bare.cam_from_world)
+    blank = views.replace(images=torch.full_like(views.images, 0.3))
+    with pytest.warns(PimperWarning) as told:
+        assert triangulate(blank, [over, bare], SETTINGS, "The model") is over
+    assert "neither sizes nor matches tell" in str(told[0].message)
+
+
+def test_a_match_is_explained_on_the_line_and_before_both_cameras(generator):
+    model = model_of(cameras_on_an_arc(2), points_on_the_ball(30, generator), generator, 0.0)
+    cameras = pinholes_of(model)
+    pixels = [model.observation_pixels[model.observation_view == view] for view in (0, 1)]
+    pair = VerifiedPair(views=(0, 1), first=pixels[0], second=pixels[1])
+    assert bool(explained(cameras, pair, 1e-6).all())
+    lifted = pair.replace(second=pair.second + pair.second.new_tensor([0.0, 5.0]))
+    assert not bool(explained(cameras, lifted, 2.0).any())
+    behind = cameras.replace(cam_from_world=axes(-1, -1, -1) @ cameras.cam_from_world)
+    assert not bool(explained(behind, pair, 1e-6).any())
+    swapped = pair.replace(views=(1, 0), first=pair.second, second=pair.first)
+    assert bool(explained(cameras, swapped, 1e-6).all())
+
+
+def test_no_warning_is_left_out_where_settings_leave_tracks_as_features_found_them(views, bare):
+    settings = replace(SETTINGS, tracks=replace(SETTINGS.tracks, iterations=0))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = triangulate(views, [bare], settings, "The model")
+    assert [str(one.message).count("points were triangulated") for one in told] == [1]
+    assert torch.equal(found.cam_from_world, bare.cam_from_world)
