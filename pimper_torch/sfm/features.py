@@ -9,11 +9,16 @@ from typing import Any
 import numpy as np
 
 from pimper_torch.progress import track
+from pimper_torch.records import Views
 from pimper_torch.sfm.binding import loaded, quiet, thread_count
 from pimper_torch.sfm.workspace import Workspace
 
 # Photographs in which a thread finds features between two reports of progress.
 _PER_THREAD = 2
+
+
+# The side of photographs below which COLMAP 4.2's covariant detector reads past their end.
+SMALLEST_PX = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +40,12 @@ class FeatureSettings:
     max_features: int
     affine_shape: bool
     threads: int
+
+
+def too_small(views: Views) -> list[str]:
+    """List photographs in which features cannot be looked for: COLMAP's process ends there."""
+    small = (views.sizes_px < SMALLEST_PX).any(dim=1).tolist()
+    return [name for name, one in zip(views.names, small, strict=True) if one]
 
 
 def find_features(

@@ -23,7 +23,7 @@ from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
 from pimper_torch.sfm.doubt import doubt
 from pimper_torch.sfm.existing import existing_ways, follow_pictures, place, taken
-from pimper_torch.sfm.features import FeatureSettings, find_features
+from pimper_torch.sfm.features import SMALLEST_PX, FeatureSettings, find_features, too_small
 from pimper_torch.sfm.lenses import choose_lenses, sensor_turns
 from pimper_torch.sfm.mapping import MapSettings
 from pimper_torch.sfm.matching import MatchSettings
@@ -332,12 +332,18 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     Raises:
         ReconstructionError: Fewer than 3 views found their place, the model split, or nothing
             moves from photograph to photograph.
-        InputError: One camera is to be shared by photographs of unlike sizes.
+        InputError: One camera is to be shared by photographs of unlike sizes, or photographs are
+            too small to have features.
     """
     if views.num_views < 3:
         raise ReconstructionError(
             f"Structure from motion was given {views.num_views} photographs; at least 3 are "
             "needed, and 10 to 50 are usual. Add photographs from other viewpoints."
+        )
+    if small := too_small(views):
+        raise InputError(
+            f"{some(small)}: have sides of fewer than {SMALLEST_PX} pixels; needed: photographs "
+            "in which there are features, of some hundred pixels at least."
         )
     turns = (0,) * views.num_views if config.own_cameras else sensor_turns(views)
     lying = turned_views(views, [-quarters for quarters in turns])

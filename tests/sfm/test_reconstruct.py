@@ -265,3 +265,17 @@ def test_photographs_with_pixels_that_are_no_numbers_are_refused_by_name(views, 
     for model in (None, tmp_path):
         with pytest.raises(InputError, match=rf"photographs {views.names[1]} \(2 pixels\); needed"):
             Reconstruct()(odd, model)
+
+
+@pytest.mark.parametrize("size", [(8, 6), (64, 15)])
+def test_photographs_that_are_too_small_for_features_are_refused(size):
+    # COLMAP's detector would end the process.
+    width, height = size
+    views = Views(
+        images=torch.rand(3, 3, height, width, generator=torch.Generator().manual_seed(1)),
+        sizes_px=torch.tensor([size] * 3),
+        names=("a.png", "b.png", "c.png"),
+        focals_px=torch.full((3,), torch.nan),
+    )
+    with pytest.raises(InputError, match="have sides of fewer than 16 pixels"):
+        structure_from_motion(views, ReconstructConfig())
