@@ -32,13 +32,13 @@ _MIN_USABLE = 0.1
 _TELLING = 0.25
 # What programs add to the name of a mask.
 _MASK = re.compile(r"[ _.-]?mask((\.[A-Za-z]+)+)$", re.IGNORECASE)
-# What people take for photographs, and is none of SUFFIXES: images, camera raw, video.
+# What people take for photographs, and is none of SUFFIXES: images and camera raw; video.
 _PICTURES = re.compile(
     r"\.(gif|hei[cf]|avif|webp|bmp|jp2|jxl|psd|exr|hdr|p[pg]m"
-    r"|cr[23w]|n(ef|rw)|arw|sr2|dng|orf|raf|rw[2l]|pef|srw|3fr|iiq|raw|hif"
-    r"|mp4|mov|avi|mkv|m4v|webm|mts)",
+    r"|cr[23w]|n(ef|rw)|arw|sr2|dng|orf|raf|rw[2l]|pef|srw|3fr|iiq|raw|hif)",
     re.IGNORECASE,
 )
+_VIDEO = re.compile(r"\.(mp4|mov|avi|mkv|m4v|webm|mts)", re.IGNORECASE)
 
 _MORE = "HEIC and camera raw where no other is of the same name and their extras are installed"
 
@@ -152,6 +152,7 @@ def list_images(folder: Path | str) -> list[Path]:
     """
     folder = Path(folder)
     if not folder.is_dir():
+        _refuse_video([folder])
         found = "a file" if folder.exists() else "nothing"
         raise InputError(f"{folder}: found {found}; needed: a folder of images.")
     try:
@@ -161,6 +162,7 @@ def list_images(folder: Path | str) -> list[Path]:
     paths = _readable(entries)
     if not paths:
         _refuse_absent(entries)
+        _refuse_video(entries)
         content = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
         raise InputError(
             f"{folder}: no images; {content}. Read are files ending in {', '.join(SUFFIXES)}, "
@@ -199,6 +201,16 @@ def _refuse_absent(entries: Sequence[Path]) -> None:
             load_extra("heic" if is_heic(path) else "raw", path)
 
 
+def _refuse_video(entries: Sequence[Path]) -> None:
+    """Say what makes photographs of the first video."""
+    for path in sorted(entries):
+        if path.is_file() and _VIDEO.fullmatch(path.suffix):
+            raise InputError(
+                f"{path}: is a video; needed: a folder of images. `pimper frames {path} -o "
+                "photos/` chooses photographs out of it."
+            )
+
+
 def _tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
     """Warn of what looks like photographs and is not read, kind by kind with its count."""
     names = {path.name for path in read}
@@ -213,7 +225,8 @@ def _tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
         elif path.is_dir():
             kind = "folder of images" if _holds_images(path) else ""
         else:
-            kind = suffix[1:].upper() if _PICTURES.fullmatch(suffix) else ""
+            known = _PICTURES.fullmatch(suffix) or _VIDEO.fullmatch(suffix)
+            kind = suffix[1:].upper() if known else ""
         if kind:
             kinds[kind] += 1
             examples.append(path.name)

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
-
 # Of a frame: those of 16K are 15360 pixels wide.
 _MAX_SIDE_PX = 16_384
 

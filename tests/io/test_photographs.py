@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.io.photographs import load_views, read_mask
+from pimper_torch.io.photographs import list_images, load_views, read_mask
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import LINEAR, linear_from_srgb, srgb_from_linear
 
@@ -187,6 +187,13 @@ def test_reading_tells_how_far_it_has_come(photos):
     with listening(lambda done, total: heard.append((done, total))):
         load_views(photos)
     assert heard == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_video_is_refused_with_the_command_that_makes_photographs_of_it(tmp_path):
+    (tmp_path / "clip.MP4").write_bytes(b"ftyp")
+    for asked in (tmp_path, tmp_path / "clip.MP4"):
+        with pytest.raises(InputError, match=r"clip.MP4: is a video; .*`pimper frames .*clip.MP4"):
+            list_images(asked)
 
 
 def test_a_missing_folder_a_file_and_an_empty_folder_are_refused(tmp_path):
