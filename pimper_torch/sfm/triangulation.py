@@ -45,6 +45,8 @@ from pimper_torch.sfm.workspace import Workspace, workspace
 # Observed points of the median view below which points are triangulated, and below which depth maps
 # help, too. In a model of COLMAP's or our own a view sees 30 at least; the other is half of it.
 FEWEST_OBSERVED, FEW_OBSERVED = 15, 30
+# Shorter side of photographs below which features are not looked for: VLFeat crashes at 6 pixels.
+_SMALLEST_PX = 32
 # Angle between optical axes from which on photographs have nothing to match. A choice.
 _MAX_ANGLE_DEG = 60.0
 
@@ -97,6 +99,9 @@ def triangulate(
     Raises:
         InputError: Cameras and photographs do not belong together.
     """
+    if int(views.sizes_px.min()) < _SMALLEST_PX:
+        _tell_nothing(0, where)
+        return models[0]
     lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
     with workspace(views, thread_count(settings.matching.threads)) as space:
         counts = find_features(space, settings.features, [None] * views.num_views, lenses)
@@ -117,7 +122,7 @@ def triangulate(
     points = found.points_world + found.points_world.new_tensor(offset)
     found = _with_cameras_of(given, found.replace(points_world=points))
     if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
-        _tell_nothing(found, where)
+        _tell_nothing(len(found.points_world), where)
         return given
     _tell(found, where)
     return found
@@ -256,9 +261,9 @@ def _tell(found: SparseModel, where: str) -> None:
     )
 
 
-def _tell_nothing(found: SparseModel, where: str) -> None:
+def _tell_nothing(count: int, where: str) -> None:
     caution(
-        f"{where}: hardly any of its views observes points, and {len(found.points_world)} could be "
+        f"{where}: hardly any of its views observes points, and {count} could be "
         "triangulated from features, which hardly match between the photographs.",
         stacklevel=4,
     )
