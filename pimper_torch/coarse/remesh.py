@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.coarse.contradicted import contradicted, misfit_of
 from pimper_torch.coarse.inherit import fitted_normals, normal_weights, with_points
@@ -13,7 +12,7 @@ from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import corners_of, face_edges, vertex_fans
 from pimper_torch.geometry.visibility import ambient_occlusion
 from pimper_torch.linalg.sums import total
@@ -301,7 +300,7 @@ def departures(
         faces: The facets.
         surface: Their subdivided mesh.
     """
-    normals = normalize(face_normals(vertices, faces), dim=1)
+    normals = unit_face_normals(vertices, faces)
     centre = vertices[faces].mean(dim=1)
     offset = surface.vertices_world.to(vertices) - centre[surface.facet]
     distance = (offset * normals[surface.facet]).sum(dim=1).abs()

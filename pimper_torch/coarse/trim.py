@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.matching import Level
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import component_areas, face_normals, side_lengths
+from pimper_torch.geometry.surfaces import component_areas, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import dilated, face_components, face_pairs, graph_components
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import num_workers, side_by_side
@@ -61,7 +61,7 @@ def view_counts(
     """
     cameras = level.cameras
     centre = vertices[faces].mean(dim=1)
-    normals = normalize(face_normals(vertices, faces), dim=-1)
+    normals = unit_face_normals(vertices, faces)
     side = side_lengths(vertices[faces]).amax(dim=1)
     caster = RayCaster(vertices, faces)
 

@@ -31,6 +31,17 @@ def face_normals(
     return torch.linalg.cross(b - a, c - a)
 
 
+def unit_face_normals(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, "face 3"]:
+    """Give outward unit normals, whatever the unit of length; zero for a face without area."""
+    a, b, c = vertices[faces].unbind(dim=1)
+    ab, ac = b - a, c - a
+    longest = torch.stack([ab, ac]).detach().abs().amax(dim=(0, 2)).clamp_min(_least(vertices))
+    ab, ac = ab / longest[:, None], ac / longest[:, None]
+    return normalize(torch.linalg.cross(ab, ac), dim=1)
+
+
 def side_lengths(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"]:
     """Give the lengths of the faces' sides: from the last corner to the first, then on."""
     return (corners - corners.roll(1, dims=1)).norm(dim=-1)
@@ -41,6 +52,8 @@ def vertex_normals(
 ) -> Float[Tensor, "vertex 3"]:
     """Average the face normals round each vertex by area; unit."""
     per_face = face_normals(vertices, faces)
+    if len(per_face):  # areas in a large unit are too small for a length to be divided by
+        per_face = per_face / per_face.detach().abs().amax().clamp_min(_least(per_face))
     total = torch.zeros_like(vertices)
     for corner in range(3):
         total = total.index_add(0, faces[:, corner], per_face)
@@ -88,3 +101,7 @@ def barycentric(
     gamma = (torch.linalg.cross(b - a, points - a) * normal).sum(dim=1) / square
     found = torch.stack([1 - beta - gamma, beta, gamma], dim=1)
     return torch.where(flat[:, None], found.new_tensor([1.0, 0.0, 0.0]), found)
+
+
+def _least(values: Tensor) -> float:
+    return torch.finfo(values.dtype).tiny

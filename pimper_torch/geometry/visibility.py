@@ -13,12 +13,11 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.geometry.directions import cosine_fan
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
-from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.records import Cameras, Mesh, Record
 
 # How far above its face a ray starts, in fractions of the face's longest side.
@@ -208,7 +207,7 @@ def ambient_occlusion(
         num_rays: From each face's centre; the fraction is a multiple of one over them.
     """
     corners = vertices.detach()[faces]
-    normals = normalize(face_normals(vertices.detach(), faces), dim=1)
+    normals = unit_face_normals(vertices.detach(), faces)
     fan = cosine_fan(normals, torch.zeros_like(normals[:, 0]), num_rays)
     clearance = _CLEARANCE * side_lengths(corners).amax(dim=1, keepdim=True)
     start = (corners.mean(dim=1) + clearance * normals)[:, None]

@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
-from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
+from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals, vertex_normals
 from pimper_torch.geometry.topology import corners_of
 from pimper_torch.io.mesh_headers import impossible
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
@@ -248,7 +248,7 @@ def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
         offset_world: Told in the file's header; see ``SparseScene.offset_world``.
     """
     corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
-    normals = normalize(face_normals(mesh.vertices_world, mesh.faces).detach().cpu(), dim=1)
+    normals = unit_face_normals(mesh.vertices_world, mesh.faces).detach().cpu()
     kind = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
     triangles = np.zeros(len(corners), kind)
     triangles["normal"], triangles["corners"] = normals.numpy(), corners.numpy()

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_pairs, graph_components
 
 # Angle between the normals of neighbouring faces above which they lie on each other. A choice: at
@@ -82,7 +81,7 @@ class Faults:
         return (face_normals(vertices, self.faces) * self.along).sum(dim=1) < 0
 
     def _folded(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
-        normals = normalize(face_normals(vertices, self.faces), dim=1)
+        normals = unit_face_normals(vertices, self.faces)
         one, other = self.pairs.unbind(dim=1)
         fold = (normals[one] * normals[other]).sum(dim=1) < math.cos(math.radians(_FOLD_DEG))
         found = torch.zeros_like(normals[:, 0], dtype=torch.bool)

@@ -14,7 +14,7 @@ from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
-from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_components, face_edges
 from pimper_torch.paper.cloud import with_cloud
 from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
@@ -212,7 +212,7 @@ class Triangulate(Stage):
         """Triangulate, drop bridges, and peel off the border what shows no object."""
         pixels, _ = _project(vertices, cameras, reference)
         faces = delaunay(pixels)
-        normals = normalize(face_normals(vertices, faces), dim=-1)
+        normals = unit_face_normals(vertices, faces)
         to_camera = normalize(
             cameras.centers_world[reference] - vertices[faces].mean(dim=1), dim=-1
         )

@@ -13,7 +13,7 @@ from pimper_torch.failures import skipped
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
+from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
 from pimper_torch.patches.transfer import transfer
 from pimper_torch.records import Cameras, CoarseMesh, Failure, PatchSet, Surface, Templates
 from pimper_torch.stage import Stage
@@ -147,7 +147,7 @@ def facet_frames(
     z is the inward normal; x is the reference camera's x made orthogonal to it, so that a
     facet that faces the camera appears in its template as in the image.
     """
-    z = -normalize(face_normals(vertices, faces), dim=-1)
+    z = -unit_face_normals(vertices, faces)
     x_cam, y_cam = cam_from_world[0, :3].expand_as(z), cam_from_world[1, :3].expand_as(z)
     # Near the camera's own x axis the projection degenerates, and y serves instead.
     side = torch.where(((x_cam * z).sum(-1).abs() < 0.99)[:, None], x_cam, y_cam)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pimper_torch.errors import caution, some
+from pimper_torch.errors import caution
 from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
@@ -17,7 +17,7 @@ from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.agreement import epipolar_geometry, undistorted_pixels
 from pimper_torch.sfm.binding import loaded, quiet, thread_count
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
-from pimper_torch.sfm.features import SMALLEST_PX, FeatureSettings, find_features, too_small
+from pimper_torch.sfm.features import FeatureSettings, find_features, too_small
 from pimper_torch.sfm.guided import NearEpipolarLines, guided_matches, read_features
 from pimper_torch.sfm.leave_out import leave_out_room
 from pimper_torch.sfm.matching import (
@@ -97,12 +97,8 @@ def triangulate(
     Raises:
         InputError: Cameras and photographs do not belong together.
     """
-    if small := too_small(views):
-        caution(
-            f"{where}: its cameras see hardly any points, and none are triangulated, as "
-            f"{some(small)} have sides of fewer than {SMALLEST_PX} pixels.",
-            stacklevel=3,
-        )
+    if too_small(views):
+        _tell_nothing(0, where)
         return models[0]
     lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
     with workspace(views, thread_count(settings.matching.threads)) as space:
@@ -124,7 +120,7 @@ def triangulate(
     points = found.points_world + found.points_world.new_tensor(offset)
     found = _with_cameras_of(given, found.replace(points_world=points))
     if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
-        _tell_nothing(found, where)
+        _tell_nothing(len(found.points_world), where)
         return given
     _tell(found, where)
     return found
@@ -263,9 +259,9 @@ def _tell(found: SparseModel, where: str) -> None:
     )
 
 
-def _tell_nothing(found: SparseModel, where: str) -> None:
+def _tell_nothing(count: int, where: str) -> None:
     caution(
-        f"{where}: hardly any of its views observes points, and {len(found.points_world)} could be "
+        f"{where}: hardly any of its views observes points, and {count} could be "
         "triangulated from features, which hardly match between the photographs.",
         stacklevel=4,
     )

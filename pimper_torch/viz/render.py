@@ -10,7 +10,7 @@ from torch.nn.functional import avg_pool2d, normalize
 from pimper_torch.geometry.frames import rigid, rotate, transform
 from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.geometry.projection import project, rays_through
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import unit_face_normals, vertex_normals
 from pimper_torch.geometry.visibility import cast_view
 from pimper_torch.records import Cameras, Mesh
 
@@ -43,7 +43,7 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     )
     hits = cast_view(mesh, fine, 0)
     seen = hits.face >= 0
-    per_face = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
+    per_face = unit_face_normals(mesh.vertices_world, mesh.faces)
     shown = per_face[hits.face.clamp_min(0)]
     if not flat:
         smooth = vertex_normals(mesh.vertices_world, mesh.faces)

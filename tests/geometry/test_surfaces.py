@@ -3,11 +3,13 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.surfaces import (
     barycentric_2d,
     face_normals,
     normals_from_slopes,
     slopes_from_normals,
+    unit_face_normals,
     vertex_normals,
 )
 
@@ -69,6 +71,17 @@ def test_vertex_normals_weigh_faces_by_area(generator):
         [per_face[(v == FACES).any(dim=1)].sum(dim=0) for v in range(len(vertices))]
     )
     assert_close(found, expected / expected.norm(dim=1, keepdim=True))
+
+
+@pytest.mark.parametrize("unit", [1e-18, 1e-7, 1e12])
+def test_normals_do_not_depend_on_the_unit_of_length(unit):
+    vertices, faces = icosphere(3)
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-5)):
+        ball, scaled = vertices.to(dtype), (unit * vertices).to(dtype)
+        for normals in (vertex_normals, unit_face_normals):
+            assert_close(normals(scaled, faces), normals(ball, faces), rtol=0, atol=tolerance)
+    flat = torch.zeros(3, 3)
+    assert torch.equal(unit_face_normals(flat, torch.tensor([[0, 1, 2]])), torch.zeros(1, 3))
 
 
 def test_vertex_normals_of_a_ball_point_away_from_its_centre():

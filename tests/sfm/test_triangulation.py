@@ -139,6 +139,13 @@ def test_photographs_without_texture_give_no_points_and_a_warning(views, bare):
     assert found is bare
 
 
+def test_photographs_of_a_few_pixels_are_not_looked_at(views, bare):
+    """COLMAP's features end the process there."""
+    tiny = views.replace(images=views.images[..., :6, :8], sizes_px=torch.tensor([[8, 6]] * 6))
+    with pytest.warns(PimperWarning, match="0 could be triangulated from features"):
+        assert triangulate(tiny, [bare], SETTINGS, "The model") is bare
+
+
 def test_points_that_there_are_stay_where_no_more_are_found(views, generator):
     few = model_of(cameras_on_an_arc(), points_on_the_ball(5, generator), generator, 0.2)
     assert lacks_points(few)

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.evidence.datasets.evidence import (
     normals_of_depth,
@@ -16,7 +15,7 @@ from pimper_torch.evidence.datasets.evidence import (
 from pimper_torch.evidence.datasets.findings import Comparison, Finding
 from pimper_torch.evidence.datasets.mistakes import VECTOR_MISTAKES, VectorMistake
 from pimper_torch.evidence.datasets.raster import nearest
-from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.surfaces import unit_face_normals
 from pimper_torch.geometry.visibility import Hits, cast_view
 from pimper_torch.records import Cameras, Mesh, Truth, Views
 
@@ -253,7 +252,7 @@ def _fraction_facing(normals: Float[Tensor, "pixel 3"], toward: Float[Tensor, "p
 
 
 def _face_normals_hit(mesh: Mesh, hits: Hits) -> Float[Tensor, "height width 3"]:
-    normals = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
+    normals = unit_face_normals(mesh.vertices_world, mesh.faces)
     return torch.where((hits.face >= 0)[..., None], normals[hits.face.clamp_min(0)], 0)
 
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.surfaces import unit_face_normals
 from pimper_torch.geometry.topology import boundary_loops, face_components, face_edges, face_pairs
 from pimper_torch.records import Mesh, Record
 
@@ -81,7 +80,7 @@ def closedness(mesh: Mesh, *, fold_deg: float = 90.0) -> Closedness:
     upwards = (faces.roll(-2, dims=1) > faces.roll(-1, dims=1)).long() * 2 - 1
     balance = torch.zeros_like(sharing).index_add(0, index.flatten(), upwards.flatten())
     pairs, _ = face_pairs(faces)
-    normals = normalize(face_normals(vertices, faces), dim=1)
+    normals = unit_face_normals(vertices, faces)
     rotation = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(dim=1)
     border, loop = boundary_loops(faces)
     steps = (vertices[border[:, 0]] - vertices[border[:, 1]]).norm(dim=1)

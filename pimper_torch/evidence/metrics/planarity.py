@@ -14,7 +14,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
+from pimper_torch.geometry.surfaces import (
+    face_normals,
+    side_lengths,
+    unit_face_normals,
+    vertex_normals,
+)
 from pimper_torch.geometry.topology import face_components
 from pimper_torch.records import Mesh, Record
 
@@ -280,7 +285,7 @@ def _smoothed_face_normals(
     edge = float(side_lengths(corners).median())
     iterations = min(_MAX_ITERATIONS, round((length / max(edge, 1e-30)) ** 2))
     if iterations == 0:
-        return normalize(face_normals(vertices, faces), dim=1)
+        return unit_face_normals(vertices, faces)
     smooth = vertex_normals(vertices, faces)
     for _ in range(iterations):
         around = smooth[faces].sum(dim=1).repeat_interleave(3, dim=0)
