@@ -15,6 +15,9 @@ from pimper_torch.errors import InputError, caution
 # Of a frame: those of 16K are 15360 pixels wide.
 _MAX_SIDE_PX = 16_384
 
+# No list of other files leads out of this one.
+_LOCAL = {"protocol_whitelist": "file"}
+
 # Transfer characteristics of ITU-T H.273 whose light is not that of a display of standard range.
 _HIGH_RANGE = {16: "PQ (HDR10, Dolby Vision)", 18: "HLG"}
 
@@ -28,6 +31,11 @@ def luma_frames(path: Path) -> Iterator[UInt8[Tensor, "height width"]]:
     with _opened(path) as (container, stream):
         _warn_of_range(path, stream)
         for frame in container.decode(stream):
+            if (frame.width, frame.height) != (stream.width, stream.height):
+                raise InputError(
+                    f"{path}: changes its size from {stream.width} x {stream.height} to "
+                    f"{frame.width} x {frame.height}; needed: frames of one size."
+                )
             yield torch.from_numpy(frame.to_ndarray(format="gray"))
 
 
@@ -67,13 +75,16 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         found = "a folder" if path.is_dir() else "nothing"
         raise InputError(f"{path}: found {found}; needed: a video, such as .mp4 or .mov.")
     try:
-        # FFmpeg's lists of other files would lead out of this one.
-        with av.open(str(path), options={"protocol_whitelist": "file"}) as container:
+        with av.open(str(path), metadata_errors="replace", options=_LOCAL) as container:
             if container.format.name in ("hls", "dash", "concat"):
                 raise InputError(f"{path}: is a list of other files; needed: a video.")
             if not container.streams.video:
                 raise InputError(f"{path}: holds no pictures that move; needed: a video.")
             stream = container.streams.video[0]
+            if stream.codec_context is None:
+                raise InputError(
+                    f"{path}: FFmpeg knows no decoder for its pictures. Convert it to MP4 (H.264)."
+                )
             if max(stream.width, stream.height) > _MAX_SIDE_PX:
                 raise InputError(
                     f"{path}: is {stream.width} x {stream.height}; needed: {_MAX_SIDE_PX} pixels "

@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
 from dng import write_dng
 from heic_files import UPRIGHT
 
+from pimper_torch.camera_files.read_cameras import read_cameras
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.config import build, read_mapping, to_yaml
 from pimper_torch.evidence.datasets import (
@@ -52,6 +53,7 @@ from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.sfm.colmap import pinhole_lenses, read_model, reconstruction_of, write_binary
 from pimper_torch.sfm.existing import existing_model
 from pimper_torch.sfm.model import SparseModel
+from pimper_torch.video.read import luma_frames
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,8 @@ def make_seeds(root: Path) -> list[Seed]:
         *_models(root / "model"),
         *_tables(root / "table"),
         *_datasets(root / "dataset"),
+        *_camera_files(root / "cameras"),
+        *_videos(root / "video"),
         _rendered(root / "rendered"),
     ]
     with warnings.catch_warnings():
@@ -352,6 +356,55 @@ def _datasets(root: Path) -> list[Seed]:
     return [
         Seed(f"dataset {name}", root / name, files, read) for name, (read, files) in readers.items()
     ]
+
+
+def _camera_files(root: Path) -> list[Seed]:
+    """Write cameras that come with photographs of other folders, as `--sparse FILE` reads them."""
+    root.mkdir(parents=True)
+    _, views = _model()
+    cameras = arc_cameras(len(views.names), width=24, height=18, focal_px=30.0, distance=5.0)
+    K, poses = cameras.intrinsics.numpy(), cameras.cam_from_world.numpy()
+    np.savez(root / "turned.npz", K=K, R=poses[:, :3, :3], t=poses[:, :3, 3])
+    np.savez_compressed(root / "projections.npz", P=K @ poses[:, :3])
+    sizes = dict.fromkeys(views.names, (24, 18))
+    return [
+        Seed(
+            f"cameras {name}",
+            _alone(root, name),
+            (name,),
+            lambda at, name=name: read_cameras(
+                at / name, views.names, lambda names: [(24, 18)] * len(names)
+            ),
+        )
+        for name in ("turned.npz", "projections.npz")
+    ]
+
+
+def _videos(root: Path) -> list[Seed]:
+    if not find_spec("av"):
+        return []
+    import av
+
+    root.mkdir(parents=True)
+    seeds = []
+    for name in ("a.mp4", "a.mkv"):
+        with av.open(str(root / name), "w") as container:
+            stream = container.add_stream("mpeg4", rate=30)
+            stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+            for shift in range(8):
+                picture = np.roll(np.tile(_pixels(), (2, 2, 1))[:32, :48], shift, axis=1)
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+        seeds.append(
+            Seed(
+                f"video {name}",
+                _alone(root, name),
+                (name,),
+                lambda at, name=name: [*luma_frames(at / name)] and None,
+            )
+        )
+    return seeds
 
 
 def _rendered(root: Path) -> Seed:

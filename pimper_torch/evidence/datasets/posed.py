@@ -12,6 +12,7 @@ from pimper_torch.camera_files.layout import expect
 from pimper_torch.errors import InputError, some
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import SUFFIXES, decode, read_header
+from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
@@ -118,6 +119,7 @@ def read_views(
     headers = [read_header(one.image) for one in photographs]
     sizes = [shrunk_size(header, max_size_px) for header in headers]
     paths = [one.image for one in photographs]
+    tell_cautions(paths[0].parent, paths, headers, encoding)
     pictures = read_pictures(paths, headers, sizes, encoding)
     images = pictures.images
     masks = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
