@@ -366,7 +366,6 @@ def _camera_files(root: Path) -> list[Seed]:
     K, poses = cameras.intrinsics.numpy(), cameras.cam_from_world.numpy()
     np.savez(root / "turned.npz", K=K, R=poses[:, :3, :3], t=poses[:, :3, 3])
     np.savez_compressed(root / "projections.npz", P=K @ poses[:, :3])
-    sizes = dict.fromkeys(views.names, (24, 18))
     return [
         Seed(
             f"cameras {name}",
