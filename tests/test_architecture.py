@@ -45,6 +45,7 @@ ROOMS = [
     "fusion",
     "paper",
     "meshing",
+    "size",
     "reporting",
     "chains",
     "viz",
