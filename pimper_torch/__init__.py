@@ -59,12 +59,17 @@ if TYPE_CHECKING:
     from pimper_torch.silhouettes.find import FindSilhouettes
     from pimper_torch.single_view.integration import integrate_normal_map
     from pimper_torch.single_view.photometric_stereo.stereo import photometric_stereo
+    from pimper_torch.size.find import find_scale
+    from pimper_torch.size.given import CameraDistance, Mark, ScaleBar
+    from pimper_torch.size.scale import Scale
+    from pimper_torch.size.scaled import scaled
     from pimper_torch.stage import Given, Stage
     from pimper_torch.store.folders import user_cache
     from pimper_torch.sweep.sweep import Sweep
     from pimper_torch.viz.patches import by_facet, plot_in_view, plot_patch
 
 __all__ = [
+    "CameraDistance",
     "Cameras",
     "Chain",
     "CoarseMesh",
@@ -82,6 +87,7 @@ __all__ = [
     "Fuse",
     "Given",
     "InputError",
+    "Mark",
     "Mesh",
     "MeshFiles",
     "OutputError",
@@ -98,6 +104,8 @@ __all__ = [
     "Record",
     "Remesh",
     "Repair",
+    "Scale",
+    "ScaleBar",
     "Silhouettes",
     "SparseScene",
     "Stage",
@@ -110,6 +118,7 @@ __all__ = [
     "Warp",
     "__version__",
     "by_facet",
+    "find_scale",
     "integrate_normal_map",
     "load_chain",
     "load_config",
@@ -121,6 +130,7 @@ __all__ = [
     "plot_patch",
     "read_mesh",
     "save_record",
+    "scaled",
     "scene_of",
     "user_cache",
     "write_result",
@@ -188,6 +198,14 @@ _HOMES = {
     "pimper_torch.sfm.reconstruct": ("Reconstruct",),
     "pimper_torch.single_view.integration": ("integrate_normal_map",),
     "pimper_torch.single_view.photometric_stereo.stereo": ("photometric_stereo",),
+    "pimper_torch.size.find": ("find_scale",),
+    "pimper_torch.size.given": (
+        "CameraDistance",
+        "Mark",
+        "ScaleBar",
+    ),
+    "pimper_torch.size.scale": ("Scale",),
+    "pimper_torch.size.scaled": ("scaled",),
     "pimper_torch.stage": (
         "Given",
         "Stage",

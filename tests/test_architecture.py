@@ -65,7 +65,7 @@ SOLE_IMPORTERS = {
     "fcpw": {"geometry/nearest.py"},
     "kornia_rs": {"io/decode.py", "io/tiff.py"},
     "tifffile": {"io/tiff.py"},
-    "cv2": {"silhouettes/opencv.py", "video/quality.py"},
+    "cv2": {"silhouettes/opencv.py", "size/aruco.py", "video/quality.py"},
     "av": {"video/read.py"},
     "numba": {"kernels/switch.py"},
     "yaml": {"config.py"},

@@ -38,6 +38,7 @@ usage: pimper reconstruct PHOTOS -o OUT [options]
        pimper convert DATA -o OUT --source KIND --target KIND [options]
        pimper gamma PHOTOS [options]
        pimper frames VIDEO -o OUT [options]
+       pimper markers -o SHEET [options]
        pimper clean OUT
        pimper --version
 
@@ -54,6 +55,7 @@ albedo and light.
   convert       a data set of another layout, or to one
   gamma         the response of photographs from a fixed camera under several lights
   frames        photographs out of a video: sharp frames, equally far apart on the way
+  markers       a sheet to print and to photograph with an object, which tells its size
   clean         what runs into a folder kept to go on from, and what killed runs left
 
 `pimper COMMAND --help` tells the options, `--help-all` those of every stage, too.
@@ -73,6 +75,7 @@ _COMMANDS = {
     "convert": "pimper_torch.evidence.cli.convert",
     "gamma": "pimper_torch.single_view.cli.gamma",
     "frames": "pimper_torch.cli.frames",
+    "markers": "pimper_torch.cli.markers",
     "clean": "pimper_torch.cli.clean",
 }
 _READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}

@@ -12,6 +12,7 @@ import tyro
 from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.lengths import CameraDistances, Markers, ScaleBars
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
@@ -20,6 +21,7 @@ from pimper_torch.io.photographs import list_images
 from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.outputs.names import require_name
+from pimper_torch.size.given import Unit, measured_in, number_of
 
 # The demo keeps 0.5 GB. A choice: a few runs of twice as large photographs.
 MAX_KEPT = "8GB"
@@ -84,6 +86,12 @@ class InputOptions:
             object, as of walls and scenes. (default: auto)
         region: Box that the object is inside: smallest and largest corner in scene units, such as
             (-1,-1,0,1,1,2).
+        scale_bar: Two places in photographs, in pixels, and the length between them; again for
+            more.
+        camera_distance: Two photographs, and the length between their cameras; again for more.
+        markers: Markers printed by `pimper markers` tell the size; their sides in millimetres, if
+            others. With --sparse they are compared alone, unless their sides are given.
+        unit: Of lengths that are given, and of the result where its size is known.
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -92,6 +100,14 @@ class InputOptions:
     mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     object: Literal["auto", "masks", "everything"] | None = None
     region: tuple[float, ...] = ()
+    scale_bar: ScaleBars = ()
+    camera_distance: CameraDistances = ()
+    markers: Markers = "auto"
+    unit: Unit = "mm"
+
+    def __post_init__(self) -> None:
+        sound = isinstance(self.markers, str) or 0 < self.markers < float("inf")
+        require(sound, "markers", self.markers, "auto, off, or a length in millimetres above 0")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +122,7 @@ class Job:
 
 
 # What few people need: `--help-all` tells of it.
-_RARE = ("--kernels", "--scales", "--max-kept")
+_RARE = (*("--kernels", "--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),)
 
 # The skull's cranium and face both show in this photograph.
 SKULL = CommonOptions(reference="37")
@@ -194,8 +210,11 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
             for path in list_images(folder):
                 require_name(path, InputError)
     _refuse_few(job)
+    present = [path.name for path in list_images(job.photos)]
     for name in _references(job.config):
-        view_named(name, [path.name for path in list_images(job.photos)])
+        view_named(name, present)
+    for name in measured_in(job.inputs.scale_bar, job.inputs.camera_distance):
+        number_of(name, present)
     return job
 
 

@@ -10,6 +10,7 @@ from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output, stage
+from pimper_torch.cli.size import bars_in_files, sized, told_size
 from pimper_torch.doctor.examine import examine_views
 from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.io.meshes import read_mesh
@@ -19,6 +20,7 @@ from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import held_output
 from pimper_torch.outputs.marker import STAGES
 from pimper_torch.records import Reconstruction, Views
+from pimper_torch.size.scale import Scale
 from pimper_torch.store import Store
 from pimper_torch.viz.overview import headline
 
@@ -38,12 +40,18 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             views = _read(job)
             figure("photographs", views.num_views)
         _examine(job, views)
+        bars = bars_in_files(job, views)
         mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         result = make_chain(job.config, observer, _store(job))(
             views.to(common.device), job.inputs.sparse, mesh
         )
-        with stage(observer, "write"):
-            _write(job, result)
+        with stage(observer, "write") as figure:
+            result, scale = sized(job, bars, result)
+            if scale is not None:
+                figure("scale", scale.factor)
+            _write(job, result, scale)
+    if scale is not None:
+        output.remark(told_size(scale))
     _conclude(output, job, result)
 
 
@@ -77,7 +85,7 @@ def _examine(job: Job, views: Views) -> None:
             warnings.warn(f"{job.photos}: {finding}", PimperWarning, stacklevel=2)
 
 
-def _write(job: Job, result: Reconstruction) -> None:
+def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
     about: dict[str, object] = {
         "photographs": str(job.photos),
         "masks": _text(job.inputs.masks),
@@ -88,6 +96,7 @@ def _write(job: Job, result: Reconstruction) -> None:
         "preset": job.common.preset,
         "device": job.common.device,
         "torch": str(torch.__version__),
+        "scale": None if scale is None else scale.report(),
     }
     write_result(
         result,

@@ -27,7 +27,9 @@ RUNS = {
         "--faces all --max-memory 20GB --scales (0.5,) --kernels torch --on-failure fail "
         "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
-        "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj"
+        "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
+        "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
+        "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm"
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
@@ -70,6 +72,7 @@ RUNS = {
         "{photos} --max-size-px 48 --photographs.response linear --photographs.saturation 250 "
         "--photographs.black 2"
     ],
+    "markers": ["--out {out}.pdf --paper letter --side-mm 20 --overwrite"],
     "frames": ["{video} --out {out} --count 3 --overwrite"],
     "clean": ["{scene}"],
     "gamma": ["{photos} --mask {masks}/view_000.png --rank 3 --max-size-px 40"],

@@ -1,0 +1,70 @@
+"""``pimper markers``: a sheet to print, which tells the size of what is photographed with it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.output import Output
+from pimper_torch.outputs.files import file_written_whole, prepare_file
+from pimper_torch.size.sheet import SIDE_MM, Paper, layout
+from pimper_torch.viz.sheet import is_sheet, write_sheet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    out: Path
+    paper: Paper
+    side_mm: int
+    overwrite: bool
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``markers``.
+
+    Raises:
+        PimperError: Before anything is written.
+    """
+    job = checked(command, arguments)
+    with file_written_whole(job.out) as fresh:
+        write_sheet(fresh, job.side_mm, job.paper)
+    output.remark(
+        f"{job.out}: print it at 100 %, check its ruler, and photograph it with the object. "
+        "`pimper reconstruct` finds the markers by itself."
+    )
+    output.result({"sheet": job.out}, side_mm=job.side_mm)
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and refuse a file that is not ours.
+
+    Raises:
+        PimperError: The file, or a wrong argument.
+        SystemExit: ``--help`` was answered.
+    """
+
+    def markers(
+        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="SHEET")],
+        paper: Paper = "a4",
+        side_mm: int = SIDE_MM,
+        overwrite: Flag = False,
+    ) -> _Job:
+        """Write a sheet of markers as PDF, to be printed and photographed with an object.
+
+        Results are then in millimetres. The larger the markers, the farther they are recognised.
+
+        Args:
+            out: The file, such as sheet.pdf.
+            paper: Size of the sheet.
+            side_mm: Of the markers' black squares, 10 to 36 millimetres.
+            overwrite: Replace a former sheet.
+        """
+        return _Job(out=out, paper=paper, side_mm=side_mm, overwrite=overwrite)
+
+    job = read_arguments(markers, command, arguments)
+    layout(job.side_mm, job.paper)
+    prepare_file(job.out, job.overwrite, is_sheet)
+    return job

@@ -1,0 +1,151 @@
+"""The real size of a result, from the command line to the files."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pimper_torch.cli.main import main
+from pimper_torch.cli.options import parse
+from pimper_torch.cli.size import bars_in_files, told_size
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.io.photographs import load_views
+from pimper_torch.sfm.colmap import read_model
+from pimper_torch.size.given import Mark
+from pimper_torch.size.marks import place_of
+from pimper_torch.size.scale import Scale
+
+# The surface of the small result has a random confidence.
+UNSURE = "ignore:.*hardly determine the surface:pimper_torch.errors.PimperWarning"
+TURNED = {1: lambda picture: picture, 6: lambda picture: np.rot90(picture), 3: np.flip}
+
+
+def saved(folder, orientation):
+    """Write photographs twice as large as those of the result, as cameras turn them."""
+    folder.mkdir()
+    noise = np.random.default_rng(5).integers(0, 256, (80, 120), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    for name in "abcd":
+        stored = np.ascontiguousarray(TURNED[orientation](noise))
+        Image.fromarray(stored).save(folder / f"{name}.png", exif=exif)
+    return folder
+
+
+@pytest.fixture
+def photos(tmp_path):
+    return saved(tmp_path / "photos", 1)
+
+
+def line(photos, out, *more):
+    return ["reconstruct", str(photos), "-o", str(out), "--max-size-px", "60", *more]
+
+
+@pytest.mark.filterwarnings(UNSURE)
+@pytest.mark.parametrize("orientation", TURNED)
+def test_clicks_in_files_are_those_in_photographs_as_they_were_loaded(
+    orientation, reconstruction, tmp_path
+):
+    photos = saved(tmp_path / "photos", orientation)
+    more = ["--max-size-px", "60", "--scale-bar", "a,55,40", "c.png,66,50+b,60,45", "80"]
+    job = parse("reconstruct", [str(photos), "-o", "out", *more])
+    views = load_views(photos, max_size_px=60)
+    assert views.sizes_px[0].tolist() == [60, 40]
+    (bar,) = bars_in_files(job, views)
+    assert bar.first.pointers[0].size_px == (120, 80)
+    assert (str(bar.first), str(bar.second)) == ("a,55,40", "c.png,66,50+b,60,45")
+    wanted = place_of(Mark.read("a,27.5,20"), reconstruction)
+    torch.testing.assert_close(place_of(bar.first, reconstruction), wanted)
+
+
+@pytest.mark.filterwarnings(UNSURE)
+@pytest.mark.usefixtures("chain")
+def test_a_result_is_written_in_the_unit_of_its_scale_bar(photos, reconstruction, tmp_path):
+    out = tmp_path / "out"
+    bar = ["--scale-bar", "a,50,36", "b,70,44", "120", "--unit", "cm", "--faces", "all"]
+    assert main(line(photos, out, *bar)) == 0
+    told = json.loads((out / "summary.json").read_text())["scale"]
+    job = parse("reconstruct", line(photos, out, *bar)[1:])
+    (loaded,) = bars_in_files(job, load_views(photos, max_size_px=60))
+    ends = [place_of(mark, reconstruction) for mark in loaded.ends]
+    factor = 120 / float((ends[0] - ends[1]).norm())
+    assert told == {
+        "factor": pytest.approx(factor),
+        "unit": "cm",
+        "source": "scale bars",
+        "residual": None,
+        "count": 1,
+    }
+    mesh = read_mesh(out / "mesh.ply")
+    wanted = factor * reconstruction.mesh.vertices_world
+    torch.testing.assert_close(mesh.vertices_world, wanted.double(), rtol=1e-5, atol=1e-4)
+    model = read_model(out / "sparse")
+    pose = reconstruction.cameras.cam_from_world.double()
+    torch.testing.assert_close(
+        model.cam_from_world[:, :3, 3], factor * pose[:, :3, 3], rtol=1e-5, atol=1e-4
+    )
+    depth = np.load(out / "depth.npz")
+    np.testing.assert_allclose(depth["cam_from_world"][:3, 3], factor * pose[1, :3, 3], rtol=1e-5)
+    seen = depth["depth"][np.isfinite(depth["depth"])]
+    assert 0.8 < np.median(seen) / (6 * factor) < 1.2  # the cameras are 6 away
+
+
+@pytest.mark.usefixtures("chain")
+def test_without_anything_that_tells_it_the_size_is_said_to_be_unknown(photos, tmp_path):
+    assert main(line(photos, tmp_path / "out")) == 0
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["scale"] is None
+
+
+@pytest.mark.usefixtures("chain")
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["--scale-bar", "a,500,40", "b,60,40", "8"], "lies outside .* 120 x 80 pixels"),
+        (["--scale-bar", "a,50,40", "a,50,40", "8"], "a,50,40 to a,50,40: is 0 in the result"),
+        (["--scale-bar", "a,60,40", "b,60,40", "0"], "the length of a,60,40 to b,60,40 is 0"),
+        (["--scale-bar", "a,60,40", "b,60,40", "wide"], "--scale-bar: the length is 'wide'"),
+        (["--scale-bar", "a", "b,60,40", "8"], "'a' is no place in a photograph"),
+        (["--scale-bar", "e,60,40", "b,60,40", "8"], "'e': none of the photographs is named so"),
+        (["--camera-distance", "a", "e", "8"], "'e': none of the photographs is named so"),
+        (["--camera-distance", "a", "d", "8"], "d: has no place among the cameras"),
+        (["--camera-distance", "a", "b", "x"], "--camera-distance: the length is 'x'"),
+        (["--markers", "-3"], "markers is -3"),
+        (["--markers", "some"], "--markers is 'some'; needed: auto.off.MM"),
+    ],
+)
+def test_lengths_that_mean_nothing_are_refused(more, told, photos, tmp_path, capsys):
+    assert main(line(photos, tmp_path / "out", *more)) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert re.search(told, said), said
+    assert not (tmp_path / "out" / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("count", "told"),
+    [
+        (1, "Lengths are in m, by one camera distance."),
+        (3, "Lengths are in m, by 3 camera distances, which agree to 0.12%."),
+    ],
+)
+def test_what_tells_the_size_is_said(count, told):
+    scale = Scale(factor=2.0, unit="m", source="camera distances", residual=0.0012, count=count)
+    assert told_size(scale) == told
+
+
+def test_a_sheet_is_written_once_and_replaced_where_that_is_asked_for(tmp_path, capsys):
+    sheet = tmp_path / "sheet.pdf"
+    assert main(["markers", "-o", str(sheet)]) == 0
+    first = sheet.read_bytes()
+    assert first.startswith(b"%PDF-")
+    assert b"/MediaBox [ 0 0 595.27" in first  # 210 mm
+    assert main(["markers", "-o", str(sheet)]) == 2
+    assert main(["markers", "-o", str(sheet), "--overwrite"]) == 0
+    assert sheet.read_bytes() == first
+    sheet.write_text("of somebody else")
+    assert main(["markers", "-o", str(sheet), "--overwrite"]) == 2
+    assert "was not written by this command" in capsys.readouterr().err
+    assert main(["markers", "-o", str(tmp_path / "b.pdf"), "--side-mm", "9"]) == 2
+    assert "side_mm is 9; needed: 10 to 36 whole millimetres" in capsys.readouterr().err

@@ -1,0 +1,264 @@
+"""Printed markers in photographs: a sheet drawn by homographies, aliased as little as by a lens."""
+
+import io
+
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import pimper_torch as pt
+from pimper_torch.cli.options import bundled_photographs
+from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.silhouettes.opencv import shrunk, warped
+from pimper_torch.size import markers
+from pimper_torch.size.aruco import find_squares
+from pimper_torch.size.find import find_scale
+from pimper_torch.size.given import CameraDistance
+from pimper_torch.size.markers import Marker, find_markers, scale_of_markers
+from pimper_torch.size.sheet import MAX_SIDE_MM, MIN_SIDE_MM, PAPERS_MM, layout, side_of
+from pimper_torch.viz.sheet import draw_sheet
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
+FINE = 4  # of the pictures that are averaged
+DPI = 25.4 * 6
+MM = 0.01  # of a scene unit, by choice
+
+
+def picture_of(side_mm, paper="a4"):
+    """Draw a sheet as a printer does, six pixels a millimetre."""
+    file = io.BytesIO()
+    with matplotlib.rc_context({"path.snap": False}):  # edges stay between pixels
+        draw_sheet(side_mm, paper).savefig(file, format="png", dpi=DPI)
+    drawn = np.asarray(Image.open(file).convert("L"), dtype=np.float32) / 255
+    return torch.from_numpy(drawn.copy())
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    return picture_of(30)
+
+
+def world_from_picture(paper="a4"):
+    """Map pixels of a sheet to the plane z = 0, its centre at the origin and y up."""
+    width, height = PAPERS_MM[paper]
+    step = MM / 6
+    return torch.tensor(
+        [[step, 0, -MM * width / 2], [0, -step, MM * height / 2], [0, 0, 1]], dtype=torch.float64
+    )
+
+
+def photographed(picture, cameras, paper="a4"):
+    """Photograph a sheet that lies on a grey table: pixels are means of linear radiance."""
+    images = []
+    for K, pose in zip(cameras.intrinsics, cameras.cam_from_world, strict=True):
+        pinhole = scale_intrinsics(K, FINE, FINE) @ pose[:3]
+        pixels_from_picture = pinhole[:, [0, 1, 3]] @ world_from_picture(paper)
+        large = (FINE * WIDTH, FINE * HEIGHT)
+        seen = warped(picture, torch.linalg.inv(pixels_from_picture), large)
+        linear = (0.01 + 0.6 * seen).nan_to_num(nan=0.1)
+        images.append(shrunk(linear[None], WIDTH, HEIGHT).expand(3, -1, -1))
+    return torch.stack(images)
+
+
+def cameras_of(num_views=6, span_deg=70.0):
+    return arc_cameras(
+        num_views,
+        width=WIDTH,
+        height=HEIGHT,
+        focal_px=FOCAL,
+        distance=5.0,
+        span_deg=span_deg,
+        elevation_deg=20.0,
+    )
+
+
+def scene_of(images, cameras):
+    return pt.scene_of(images, cameras.intrinsics, cameras.cam_from_world)
+
+
+@pytest.fixture(scope="module")
+def scene(sheet):
+    cameras = cameras_of()
+    return scene_of(photographed(sheet, cameras), cameras)
+
+
+def test_a_photographed_sheet_tells_the_size(scene):
+    scale = scale_of_markers(scene)
+    assert scale.factor * MM == pytest.approx(1, rel=1e-3)
+    assert scale.residual < 1e-3
+    assert scale.count == 16
+    assert (scale.unit, scale.source) == ("mm", "markers")
+
+
+def test_markers_are_where_they_were_printed(scene):
+    printed = {one.code: one for one in layout(30)}
+    width, height = PAPERS_MM["a4"]
+    for marker in find_markers(scene):
+        on = printed[marker.code]
+        left, top = on.left_mm - width / 2, height / 2 - on.top_mm
+        corners = [(left, top), (left + 30, top), (left + 30, top - 30), (left, top - 30)]
+        wanted = MM * torch.tensor([[*corner, 0.0] for corner in corners], dtype=torch.float64)
+        off = (marker.corners_world - wanted).norm(dim=1) / MM
+        assert float(off.max()) < 0.1  # a seventh of a pixel
+
+
+def test_sides_that_a_printer_changed_can_be_told_and_units_chosen(scene):
+    plain = scale_of_markers(scene)
+    assert scale_of_markers(scene, side_mm=27.0).factor == pytest.approx(0.9 * plain.factor)
+    assert scale_of_markers(scene, unit="in").factor == pytest.approx(plain.factor / 25.4)
+
+
+def test_numbers_tell_the_sides_of_a_sheet():
+    assert side_of(layout(20)[0].code) == 20
+    cameras = cameras_of(3, 40.0)
+    scene = scene_of(photographed(picture_of(36, "letter"), cameras, "letter"), cameras)
+    assert scale_of_markers(scene).factor * MM == pytest.approx(1, rel=2e-3)
+
+
+@pytest.mark.parametrize("paper", PAPERS_MM)
+def test_markers_of_a_sheet_lie_on_it_apart_from_each_other_and_have_their_own_numbers(paper):
+    codes = []
+    for side in range(MIN_SIDE_MM, MAX_SIDE_MM + 1):
+        markers = layout(side, paper)
+        assert 10 <= len(markers) <= 16
+        assert all(side_of(one.code) == side for one in markers)
+        codes += [one.code for one in markers]
+        corners = torch.tensor([[one.left_mm, one.top_mm] for one in markers])
+        assert bool((corners >= 10).all())
+        assert bool((corners + side + 10 <= torch.tensor(PAPERS_MM[paper])).all())
+        apart = (corners[:, None] - corners).abs().amax(dim=-1).fill_diagonal_(torch.inf)
+        assert float(apart.min()) >= side + side / 8  # a cell of white
+    assert len(set(codes)) == len(codes)
+    with pytest.raises(pt.ConfigError, match="side_mm is 37; needed: 10 to 36 whole millimetres"):
+        layout(37, paper)
+
+
+def test_one_photograph_alone_tells_nothing(sheet):
+    cameras = cameras_of(2)
+    images = photographed(sheet, cameras)
+    images[1] = 0.2
+    assert scale_of_markers(scene_of(images, cameras)) is None
+
+
+def test_markers_that_stand_still_before_an_object_that_turns_are_left_out(sheet):
+    cameras = cameras_of()
+    still = photographed(sheet, cameras.take([0])).expand(6, -1, -1, -1)
+    assert scale_of_markers(scene_of(still, cameras)) is None
+
+
+def test_a_photograph_that_shows_a_marker_elsewhere_is_outvoted(sheet):
+    cameras = cameras_of()
+    images = photographed(sheet, cameras)
+    images[2] = images[2].roll(25, dims=2)
+    scale = scale_of_markers(scene_of(images, cameras))
+    assert scale.factor * MM == pytest.approx(1, rel=2e-3)
+
+
+def test_overexposed_paper_makes_no_marker_smaller(sheet):
+    """Blurred edges of saturated paper move into the black: 2 % of these markers."""
+    cameras = cameras_of()
+    images = photographed(sheet, cameras)
+    soft = torch.nn.functional.avg_pool2d(images, 3, stride=1, padding=1)
+    soft[[0, 2, 4, 5]] = (2.5 * soft[[0, 2, 4, 5]]).clamp(max=1)
+    scale = scale_of_markers(scene_of(soft, cameras))
+    assert scale.factor * MM == pytest.approx(1, rel=2e-3)
+    everywhere = scene_of((2.5 * soft).clamp(max=1), cameras)
+    assert scale_of_markers(everywhere) is None
+
+
+def partly_smaller(sheet, rows_mm):
+    """Print the sheet's upper part at three quarters."""
+    high, wide = sheet.shape
+    small = torch.ones_like(sheet)
+    part = shrunk(sheet[None], 3 * wide // 4, 3 * high // 4)[0]
+    small[: len(part), : part.shape[1]] = part
+    cut = 6 * rows_mm
+    return torch.cat([small[: 3 * cut // 4], torch.ones(cut - 3 * cut // 4, wide), sheet[cut:]])
+
+
+def test_a_marker_of_another_size_than_most_does_not_count(sheet):
+    cameras = cameras_of(4)
+    scene = scene_of(photographed(partly_smaller(sheet, 46), cameras), cameras)
+    assert len(find_markers(scene)) > 12
+    scale = scale_of_markers(scene)
+    assert scale.factor * MM == pytest.approx(1, rel=2e-3)
+    assert scale.count == 12
+
+
+def square(code, side):
+    corners = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
+    return Marker(code=code, corners_world=side * corners, num_views=3)
+
+
+@pytest.mark.parametrize(("wrong", "known"), [(1, True), (2, False)])
+def test_the_size_is_that_of_most_markers_or_none(scene, monkeypatch, wrong, known):
+    found = [square(320 + number, 2.0 if number < wrong else 3.0) for number in range(4)]
+    monkeypatch.setattr(markers, "find_markers", lambda _: found)
+    scale = scale_of_markers(scene)
+    assert (scale is not None) == known
+    assert scale is None or scale.factor == pytest.approx(10)
+
+
+def test_a_marker_that_is_on_no_sheet_tells_a_size_only_if_its_side_is_told(scene, monkeypatch):
+    monkeypatch.setattr(markers, "find_markers", lambda _: [square(586, 2.0)])
+    assert scale_of_markers(scene) is None
+    assert scale_of_markers(scene, side_mm=50.0).factor == pytest.approx(25)
+
+
+def test_a_number_that_stands_twice_in_a_photograph_is_left_out(sheet):
+    picture = (255 * sheet[:1000, :600]).to(torch.uint8)
+    once = find_squares(picture)
+    twice = find_squares(torch.cat([picture, picture], dim=1))
+    assert len(once) > 2
+    assert not twice
+
+
+def test_the_bundled_photographs_show_no_marker():
+    paths = sorted(bundled_photographs().glob("*.jpg"))[::4]
+    assert len(paths) > 4
+    for path in paths:
+        grey = torch.from_numpy(np.asarray(Image.open(path).convert("L")).copy())
+        assert not find_squares(grey)
+
+
+def result_of(reconstruction, scene):
+    return reconstruction.replace(scene=scene)
+
+
+def test_cameras_in_a_frame_of_their_own_are_not_scaled_by_markers_alone(
+    scene, reconstruction, recwarn
+):
+    result = result_of(reconstruction, scene)
+    assert find_scale(result, own_frame=True) is None
+    assert not recwarn.list  # 100 mm are no unit that people have, so nothing is contradicted
+    assert find_scale(result, own_frame=True, markers=30.0).factor * MM == pytest.approx(1, 2e-3)
+    assert find_scale(result, markers="off") is None
+
+
+def test_a_frame_that_is_nearly_in_a_unit_is_warned_of(scene, reconstruction):
+    poses = scene.cameras.cam_from_world.clone()
+    poses[:, :3, 3] *= 10.6  # 9.4 mm
+    off = scene.replace(cameras=scene.cameras.replace(cam_from_world=poses))
+    with pytest.warns(pt.PimperWarning, match=r"lengths in the frame .*\+6\.\d% off, if .* is cm"):
+        assert find_scale(result_of(reconstruction, off), own_frame=True) is None
+
+
+def test_markers_that_were_asked_for_and_are_not_there_are_missed(reconstruction):
+    with pytest.warns(pt.PimperWarning, match="No marker was found that two photographs show"):
+        assert find_scale(reconstruction, markers=25.0) is None
+    assert find_scale(reconstruction) is None
+
+
+def test_sources_that_disagree_are_told_and_the_most_accurate_is_taken(scene, reconstruction):
+    centers = scene.cameras.centers_world
+    true = float((centers[0] - centers[5]).norm()) / MM
+    result = result_of(reconstruction, scene)
+    near = [CameraDistance(first="000", second="005", length=1.01 * true)]
+    assert find_scale(result, camera_distances=near).source == "markers"
+    far = [CameraDistance(first="000", second="005", length=1.1 * true)]
+    with pytest.warns(pt.PimperWarning, match=r"markers and the camera distances .*by \+10"):
+        scale = find_scale(result, camera_distances=far)
+    assert scale.source == "markers"
