@@ -9,6 +9,7 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
+from pimper_torch.config import require
 from pimper_torch.outputs.files import file_written_whole, prepare_file
 from pimper_torch.size.sheet import SIDE_MM, Paper, layout
 from pimper_torch.viz.sheet import is_sheet, write_sheet
@@ -65,6 +66,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         return _Job(out=out, paper=paper, side_mm=side_mm, overwrite=overwrite)
 
     job = read_arguments(markers, command, arguments)
+    require(job.out.suffix.lower() == ".pdf", "SHEET", job.out.name, "a name ending in .pdf")
     layout(job.side_mm, job.paper)
     prepare_file(job.out, job.overwrite, is_sheet)
     return job

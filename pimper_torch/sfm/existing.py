@@ -78,6 +78,11 @@ def taken(views: Views, model: SparseModel) -> Views:
 def _model_of_file(views: Views, path: Path) -> SparseModel:
     """Read cameras that come without points."""
     cameras = read_cameras(path, views.names, lambda names: _stored_sizes(views, names, path))
+    if not cameras:
+        raise InputError(
+            f"{path}: has no camera of {some(views.names)}; needed: cameras of these "
+            "photographs, by their names."
+        )
     names = [camera.name.replace("\\", "/") for camera in cameras]
     skewed = [
         camera.name

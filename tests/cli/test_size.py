@@ -137,6 +137,8 @@ def test_what_tells_the_size_is_said(count, told):
 
 def test_a_sheet_is_written_once_and_replaced_where_that_is_asked_for(tmp_path, capsys):
     sheet = tmp_path / "sheet.pdf"
+    assert main(["markers", "-o", str(tmp_path / "sheet.png")]) == 2
+    assert "needed: a name ending in .pdf" in capsys.readouterr().err
     assert main(["markers", "-o", str(sheet)]) == 0
     first = sheet.read_bytes()
     assert first.startswith(b"%PDF-")

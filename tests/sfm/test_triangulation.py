@@ -1,5 +1,6 @@
 """Points of known cameras, on a ball whose surface is known."""
 
+import json
 import warnings
 from dataclasses import replace
 
@@ -7,12 +8,13 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
 from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
+from pimper_torch.sfm.existing import existing_model
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.photograph_agreement import explained, pinholes_of
@@ -190,3 +192,12 @@ def test_no_warning_is_left_out_where_settings_leave_tracks_as_features_found_th
         found = triangulate(views, [bare], settings, "The model")
     assert [str(one.message).count("points were triangulated") for one in told] == [1]
     assert torch.equal(found.cam_from_world, bare.cam_from_world)
+
+
+def test_a_file_that_has_no_camera_of_the_photographs_is_refused(views, tmp_path):
+    pose = torch.eye(4).tolist()
+    frames = [{"file_path": "../../etc/passwd", "transform_matrix": pose}]
+    whole = {"w": 80, "h": 60, "fl_x": 90.0, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(whole))
+    with pytest.raises((InputError, ReconstructionError), match="no camera of|holds 0 of"):
+        existing_model(views, tmp_path / "transforms.json")
