@@ -194,7 +194,9 @@ def _turned_over(
     over = upside_down(points)
     rooms = torch.stack([torch.eye(4).to(over), over])
     series = [
-        _taken(transform(room, points), replace(config, num_views=count), generator)
+        _taken(
+            transform(room, points), replace(config, num_views=count, turned_over=False), generator
+        )
         for room, count in zip(rooms, counts, strict=True)
     ]
     room_from_world = rooms.repeat_interleave(torch.tensor(counts), dim=0)
