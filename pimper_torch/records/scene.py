@@ -37,6 +37,11 @@ def no_maps() -> Float[Tensor, "0 3 3"]:
     return torch.zeros(0, 3, 3)
 
 
+def no_series() -> Int[Tensor, "0"]:
+    """Number no series."""
+    return torch.zeros(0, dtype=torch.long)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SparseScene(Record):
     """Cameras, undistorted photographs and a sparse cloud with its tracks.
@@ -59,6 +64,8 @@ class SparseScene(Record):
         offset_world: Added to this scene's coordinates, gives those of the model it was read from.
             Scenes far from that model's origin have one of their own, see
             :func:`~pimper_torch.geometry.local_frame.local_origin`.
+        series: Number of each view's series, where the object was moved on what it stands on
+            between several: in each its surroundings are elsewhere. Empty where it was not.
     """
 
     views: Views
@@ -73,6 +80,7 @@ class SparseScene(Record):
     doubt: str = ""
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
     offset_world: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    series: Int[Tensor, " divided"] = field(default_factory=no_series)
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List what does not belong together."""
@@ -91,6 +99,9 @@ class SparseScene(Record):
         if len(self.background_from_view) not in (0, cameras.num_views):
             needed = f"none, or one for each of {cameras.num_views} views"
             yield "background_from_view", f"are {len(self.background_from_view)}", needed
+        if len(self.series) not in (0, cameras.num_views):
+            needed = f"none, or one for each of {cameras.num_views} views"
+            yield "series", f"are {len(self.series)}", needed
         if count:
             pose, points = cameras.cam_from_world.detach(), self.points_world.detach()
             depth = pose[:, 2, :3] @ points.mT + pose[:, 2, 3:]

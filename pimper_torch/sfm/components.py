@@ -20,6 +20,11 @@ ADVICE = (
     "degrees in viewpoint: add photographs between those that did not register, or give an "
     "existing COLMAP model. Lowering `reconstruct.peak_threshold` finds fainter features."
 )
+JOINING = (
+    "What joins them: photographs of the object's sides from low down in every series, which "
+    "show the same surface, turned in steps of 15 degrees; more texture on the object; or masks "
+    "(`--masks`)."
+)
 MOVE = (
     "Where the object turned before a camera that stood still, give masks of the object "
     "(`--masks`), or put a plain cloth behind and below it, so that nothing at rest has features; "
@@ -111,6 +116,8 @@ def choose_component(
         raise ReconstructionError(
             f"Structure from motion split {len(names)} photographs into {1 + len(rivals)} models "
             f"that nothing ties together: {parts}. One model with at least {min_fraction:.0%} of "
-            f"the photographs is needed. {ADVICE} Or reconstruct one of the groups on its own."
+            f"the photographs is needed. {ADVICE} Where the object was turned over between the "
+            f"groups, its own features must tie them. {JOINING} Or reconstruct one of the groups "
+            "on its own."
         )
     return largest

@@ -62,11 +62,11 @@ def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
     pycolmap = loaded()
 
     with quiet(), pycolmap.Database.open(database) as stored:
-        matched = _read(stored)
-        verifier = _Verifier(matched=matched, options=_options(settings))
+        matched = read_matched(stored)
+        verifier = _Verifier(matched=matched, settings=settings)
         found = _shifted(matched, verifier, settings) or _at_rest(matched, verifier, settings)
         if found.rest.room:
-            geometries = _read_geometries(stored) | verifier.found
+            geometries = read_geometries(stored) | verifier.found
             _drop_features(stored, matched, found.rest)
             _drop_matches(stored, matched, found, geometries, settings.min_inliers)
             return found.rest.replace(maps=_maps(found, settings.min_inliers))
@@ -83,7 +83,16 @@ def _maps(found: "_Found", fewest: int) -> tuple[Float[Tensor, "3 3"], ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Matched:
+class Matched:
+    """What COLMAP's database holds of photographs and their matches before verification.
+
+    Attributes:
+        ids: Of the photographs in the database, in the order of their names.
+        cameras: COLMAP's, one a photograph.
+        keypoints: Pixels, one tensor a photograph.
+        pairs: Their matches.
+    """
+
     ids: tuple[int, ...]
     cameras: tuple[Any, ...]
     keypoints: Keypoints
@@ -100,12 +109,12 @@ class _Found:
     still_px: float
 
 
-def _at_rest(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found:
+def _at_rest(matched: Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found:
     maps = tuple(torch.eye(3, dtype=torch.float64) for _ in matched.keypoints)
     return _find(matched.keypoints, maps, track(matched.pairs), verifier, settings, STILL_PX)
 
 
-def _shifted(matched: _Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found | None:
+def _shifted(matched: Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found | None:
     """Find a room that shifts before a camera that stays in its place, if there is one."""
     maps = reference_from_photographs(
         matched.keypoints,
@@ -150,7 +159,8 @@ def _find(
     return _Found(rest=rest, maps=maps, keypoints=keypoints, still_px=still_px)
 
 
-def _read(stored: Any) -> _Matched:  # noqa: ANN401 - pycolmap has no types before it is loaded
+def read_matched(stored: Any) -> Matched:  # noqa: ANN401 - pycolmap has no types before it is loaded
+    """Read features and matches."""
     pycolmap = loaded()
 
     images = sorted(stored.read_all_images(), key=lambda image: image.name)
@@ -159,8 +169,8 @@ def _read(stored: Any) -> _Matched:  # noqa: ANN401 - pycolmap has no types befo
     pairs = []
     for pair_id, rows in zip(*stored.read_all_matches(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        pairs.append(Pair(first=number[first], second=number[second], matches=_indices(rows)))
-    return _Matched(
+        pairs.append(Pair(first=number[first], second=number[second], matches=indices(rows)))
+    return Matched(
         ids=tuple(image.image_id for image in images),
         cameras=tuple(cameras[image.camera_id] for image in images),
         keypoints=[
@@ -175,29 +185,35 @@ def _read(stored: Any) -> _Matched:  # noqa: ANN401 - pycolmap has no types befo
 class _Verifier:
     """COLMAP's verification of matches; keeps the geometries."""
 
-    matched: _Matched
-    options: Any
+    matched: Matched
+    settings: MatchSettings
     found: dict[tuple[int, int], Any] = field(default_factory=dict)
 
     def __call__(self, pair: Pair) -> Bool[Tensor, " match"]:
-        pycolmap = loaded()
-
-        matched, ends = self.matched, (pair.first, pair.second)
-        cameras = [matched.cameras[end] for end in ends]
-        pixels = [matched.keypoints[end].double().numpy() for end in ends]
-        geometry = pycolmap.estimate_two_view_geometry(
-            cameras[0],
-            pixels[0],
-            cameras[1],
-            pixels[1],
-            pair.matches.numpy().astype(np.uint32),
-            self.options,
-        )
-        self.found[matched.ids[pair.first], matched.ids[pair.second]] = geometry
-        return _among(pair.matches, _indices(geometry.inlier_matches))
+        ids = self.matched.ids[pair.first], self.matched.ids[pair.second]
+        geometry = self.found[ids] = verified_again(self.matched, pair, self.settings, _TRIALS)
+        return among(pair.matches, indices(geometry.inlier_matches))
 
 
-def _read_geometries(stored: Any) -> dict[tuple[int, int], Any]:  # noqa: ANN401 - see _read
+def verified_again(matched: Matched, pair: Pair, settings: MatchSettings, trials: int) -> Any:  # noqa: ANN401 - see read_matched
+    """Find COLMAP's geometry of some of a pair's matches, within so many trials of RANSAC."""
+    pycolmap = loaded()
+
+    ends = pair.first, pair.second
+    cameras = [matched.cameras[end] for end in ends]
+    pixels = [matched.keypoints[end].double().numpy() for end in ends]
+    return pycolmap.estimate_two_view_geometry(
+        cameras[0],
+        pixels[0],
+        cameras[1],
+        pixels[1],
+        pair.matches.numpy().astype(np.uint32),
+        _options(settings, trials),
+    )
+
+
+def read_geometries(stored: Any) -> dict[tuple[int, int], Any]:  # noqa: ANN401 - see read_matched
+    """Read the geometries of verified pairs, by the numbers of their images."""
     pycolmap = loaded()
 
     return {
@@ -206,7 +222,7 @@ def _read_geometries(stored: Any) -> dict[tuple[int, int], Any]:  # noqa: ANN401
     }
 
 
-def _drop_features(stored: Any, matched: _Matched, rest: StaticBackground) -> None:  # noqa: ANN401 - see _read
+def _drop_features(stored: Any, matched: Matched, rest: StaticBackground) -> None:  # noqa: ANN401 - see read_matched
     pycolmap = loaded()
 
     descriptors = [stored.read_descriptors(image) for image in matched.ids]
@@ -220,8 +236,8 @@ def _drop_features(stored: Any, matched: _Matched, rest: StaticBackground) -> No
 
 
 def _drop_matches(
-    stored: Any,  # noqa: ANN401 - see _read
-    matched: _Matched,
+    stored: Any,  # noqa: ANN401 - see read_matched
+    matched: Matched,
     found: _Found,
     geometries: dict[tuple[int, int], Any],
     fewest: int,
@@ -241,28 +257,29 @@ def _drop_matches(
         stored.write_matches(*ids, kept(pair))
         if ids in geometries:
             geometry = geometries[ids]
-            inliers = kept(pair.replace(matches=_indices(geometry.inlier_matches)))
+            inliers = kept(pair.replace(matches=indices(geometry.inlier_matches)))
             if len(inliers) >= fewest:
                 geometry.inlier_matches = inliers
                 stored.write_two_view_geometry(*ids, geometry)
 
 
-def _options(settings: MatchSettings) -> Any:  # noqa: ANN401 - see _read
+def _options(settings: MatchSettings, trials: int) -> Any:  # noqa: ANN401 - see read_matched
     pycolmap = loaded()
 
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = settings.min_inliers
     options.ransac.max_error = settings.max_error_px
     options.ransac.random_seed = settings.seed
-    options.ransac.max_num_trials = _TRIALS
+    options.ransac.max_num_trials = trials
     return options
 
 
-def _indices(rows: Any) -> Int[Tensor, "match 2"]:  # noqa: ANN401 - see _read
+def indices(rows: Any) -> Int[Tensor, "match 2"]:  # noqa: ANN401 - see read_matched
+    """Turn COLMAP's matches into rows of a tensor."""
     return torch.from_numpy(np.array(rows).astype(np.int64)).reshape(-1, 2)
 
 
-def _among(matches: Int[Tensor, "match 2"], some: Int[Tensor, "some 2"]) -> Bool[Tensor, " match"]:
+def among(matches: Int[Tensor, "match 2"], some: Int[Tensor, "some 2"]) -> Bool[Tensor, " match"]:
     """Mark the matches that are among some of them."""
     width = 1 + int(matches.max()) if len(matches) else 1
     keys, chosen = (rows[:, 0] * width + rows[:, 1] for rows in (matches, some))

@@ -10,7 +10,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError, some
 from pimper_torch.file_names import match_files
 from pimper_torch.records import Lens, Record, pairs_table
-from pimper_torch.records.scene import no_maps
+from pimper_torch.records.scene import no_maps, no_series
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -28,6 +28,8 @@ class SparseModel(Record):
         background_from_view: Maps from pixels of each photograph, before undistortion, to those
             where the background is at rest before which the object turns; NaN where a view shows
             too little of it. Empty without such a background.
+        series: Number of each view's series, where the object was moved between several; empty
+            where it was not.
     """
 
     names: tuple[str, ...]
@@ -38,6 +40,7 @@ class SparseModel(Record):
     observation_view: Int[Tensor, " observation"]
     observation_pixels: Float[Tensor, "observation 2"]
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
+    series: Int[Tensor, " divided"] = field(default_factory=no_series)
 
     @property
     def num_views(self) -> int:
@@ -91,6 +94,7 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
         background_from_view=model.background_from_view[list(chosen)]
         if len(model.background_from_view)
         else model.background_from_view,
+        series=model.series[list(chosen)] if len(model.series) else model.series,
     )
 
 

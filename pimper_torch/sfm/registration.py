@@ -23,6 +23,7 @@ from pimper_torch.sfm.matching import (
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel, drop_weak_views
+from pimper_torch.sfm.tie_series import tie_series
 from pimper_torch.sfm.workspace import Workspace
 
 # Distances that verify a match, at which it still agrees with a model: the lens is the model's.
@@ -61,6 +62,8 @@ class Registration:
             the matches in those that agrees.
         background: Map from each file's pixels to those where a static background is at rest, NaN
             where the file shows too little of it; none without a static background.
+        around: Matches of the surroundings on which the object was moved between series of files;
+            none where it was not.
     """
 
     models: tuple[SparseModel, ...]
@@ -68,6 +71,7 @@ class Registration:
     missing: tuple[str, ...]
     misplaced: Mapping[str, float]
     background: Mapping[str, Float[Tensor, "3 3"]] = field(default_factory=dict)
+    around: tuple[VerifiedPair, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -88,6 +92,8 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     """Match all pairs and grow a model; repeat thoroughly what stays unregistered or contradicts.
 
     Features of a room at rest, before which an object turns, are left out after the first matching.
+    Where the object was moved between two series of photographs, only matches of the object are
+    kept between these, see :mod:`pimper_torch.sfm.moved_object`.
 
     The thorough pass matches along epipolar lines: pairs of missing photographs, or all where
     some are misplaced. Then it starts the mapper several times, with other random numbers, and at
@@ -106,8 +112,9 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     pairs = all_pairs(len(space.files))
     match_pairs(space, pairs, settings.matching)
     background = _leave_out_room(space, settings)
+    around = () if background else tie_series(space.database, settings.matching)[1]
     found = _registered(space, pairs, settings)
-    return replace(found, background=background)
+    return replace(found, background=background, around=around)
 
 
 def _registered(

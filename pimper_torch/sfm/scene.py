@@ -59,6 +59,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         unregistered=tuple(name for name in views.names if name not in model.names),
         background_from_view=_undistorted_maps(model, intrinsics).to(like),
         offset_world=offset,
+        series=model.series.to(like.device),
     )
 
 

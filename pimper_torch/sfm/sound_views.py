@@ -58,7 +58,7 @@ def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
     index = kept.nonzero()[:, 0].tolist()
     observed = kept.to(scene.observation_view.device)[scene.observation_view]
     number = kept.long().cumsum(dim=0).to(scene.observation_view.device) - 1
-    maps, names = scene.background_from_view, scene.views.names
+    maps, series, names = scene.background_from_view, scene.series, scene.views.names
     left_out = tuple(name for name, keep in zip(names, kept.tolist(), strict=True) if not keep)
     return scene.replace(
         views=scene.views.take(index),
@@ -69,6 +69,7 @@ def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
         lenses=tuple(scene.lenses[view] for view in index) if scene.lenses else (),
         unregistered=(*scene.unregistered, *left_out),
         background_from_view=maps[kept.to(maps.device)] if len(maps) else maps,
+        series=series[kept.to(series.device)] if len(series) else series,
     )
 
 

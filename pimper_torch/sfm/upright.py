@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.geometry.supporting_plane import fixation, supporting_plane
-from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.model import SparseModel, select_views
 
 # How far people hold a camera from level. A choice: one turned by a quarter counts as 1 in 900.
 _ROLL = math.radians(3.0)
@@ -56,7 +56,13 @@ def upright(model: SparseModel) -> SparseModel:
 
 
 def up_direction(model: SparseModel) -> Float[Tensor, "3"]:
-    """Give the direction that is up in a model's world, unit."""
+    """Give the direction that is up in a model's world, unit.
+
+    Where the object was turned over between series of photographs, it is that of the first.
+    """
+    if len(model.series):
+        first = (model.series == model.series[0]).nonzero()[:, 0]
+        model = select_views(model, first.tolist())
     level = level_up(model.cam_from_world)
     tracked = model.points_world[model.observed.sum(dim=1) >= _FEWEST_VIEWS]
     eyes = invert_rigid(model.cam_from_world)[:, :3, 3]

@@ -14,6 +14,7 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
+from pimper_torch.silhouettes.by_series import by_series
 from pimper_torch.silhouettes.cues import cues_of
 from pimper_torch.silhouettes.cuts import cut_from, cuts_of
 from pimper_torch.silhouettes.opencv import signed_distance
@@ -51,6 +52,21 @@ class CorrectSilhouettes(Stage):
         """
         if silhouettes.source != "found":
             return silhouettes
+
+        def of_some(part: SparseScene, views: tuple[int, ...]) -> Silhouettes:
+            some = torch.tensor(views, device=silhouettes.inside.device)
+            return self._corrected(
+                part,
+                silhouettes.replace(
+                    inside=silhouettes.inside[some], reliable=silhouettes.reliable[some]
+                ),
+                mesh,
+            )
+
+        return by_series(scene, of_some)
+
+    def _corrected(self, scene: SparseScene, silhouettes: Silhouettes, mesh: Mesh) -> Silhouettes:
+        """Correct silhouettes of photographs between which the object was not moved."""
         cues = cues_of(scene, self.config, self.details)
         size = cues.pictures.grey.shape[1:]
         before = interpolate(silhouettes.inside.cpu()[:, None], size, mode="area")[:, 0] > 0.5

@@ -8,6 +8,7 @@ from pimper_torch.errors import InputError, caution
 from pimper_torch.failures import skipped
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
+from pimper_torch.silhouettes.by_series import by_series
 from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import cut_in_iterations
 from pimper_torch.silhouettes.probabilities import silhouettes_of
@@ -37,7 +38,8 @@ class FindSilhouettes(Stage):
         Returns:
             Everything where that is asked for. Where silhouettes cannot be reliable, everything
             above the plane that the object stands on, or everything where none is found, with a
-            :class:`~pimper_torch.errors.PimperWarning` that says why.
+            :class:`~pimper_torch.errors.PimperWarning` that says why. Where the object was moved
+            between series of photographs, each series is looked at by itself.
 
         Raises:
             InputError: Masks are asked for, and none are given.
@@ -54,7 +56,11 @@ class FindSilhouettes(Stage):
                 "`silhouettes.object` is masks, but the photographs come without any. Give a "
                 "folder of masks, or let silhouettes be found: `silhouettes.object` auto."
             )
-        cues = cues_of(scene, config, self.details)
+        return by_series(scene, lambda part, _: self._found(part))
+
+    def _found(self, scene: SparseScene) -> Silhouettes:
+        """Find silhouettes in photographs between which the object was not moved."""
+        cues = cues_of(scene, self.config, self.details)
         cuts = None
         if cues.agreement is not None or cues.has_points:
             cuts = cut_in_iterations(cues, self.details)

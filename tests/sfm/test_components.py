@@ -28,6 +28,8 @@ def test_a_split_in_halves_is_refused_with_sizes_names_and_advice():
     assert "9 photographs (00.jpg" in message
     assert "7 photographs (09.jpg" in message
     assert "add photographs between" in message
+    assert "turned over" in message
+    assert "sides from low down in every series" in message
 
 
 @pytest.mark.parametrize("parts", [[], [NAMES[:2]], [NAMES[:2], NAMES[2:4]]])

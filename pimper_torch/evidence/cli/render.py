@@ -18,9 +18,9 @@ _RARE = tuple(
     f"--{name}"
     for name in [
         *("processes", "elevation-deg", "sway-deg", "fill", "no-fixed-point-light"),
-        *("no-fixed-room", "no-fixed-table", "no-constant-light", "pan-jitter-px"),
-        *("crop-jitter-px", "point-light-distance", "irradiance", "flash", "bounces"),
-        *("read-noise", "shot-noise", "supersample", "up", "rotation-deg"),
+        *("no-fixed-room", "no-fixed-table", "no-constant-light", "no-turned-over"),
+        *("pan-jitter-px", "crop-jitter-px", "point-light-distance", "irradiance"),
+        *("flash", "bounces", "read-noise", "shot-noise", "supersample", "up", "rotation-deg"),
     ]
 )
 

@@ -66,7 +66,7 @@ def read_rendered(
     truth = Truth(
         mesh=read_mesh(folder / "truth" / "mesh.ply"),
         surroundings=None
-        if settings.fixed_table
+        if settings.fixed_table or settings.turned_over
         else read_mesh(folder / "truth" / "surroundings.ply"),
         lights_world=lights,
         point_lights_world=point_lights,

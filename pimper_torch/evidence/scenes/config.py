@@ -34,6 +34,9 @@ class SceneConfig:
             camera; only with the turntable. Else there is nothing beyond the table.
         fixed_table: The table stands still before the camera, too, and the object alone turns;
             only with the turntable. Else it turns with the object.
+        turned_over: For the second half of the photographs the object lies upside down on its
+            table, so that they show its underside. The world is the object's frame in both halves;
+            not where something else stands still before the camera.
         pan_jitter_px: The camera pans and tilts on its tripod between photographs, so that the
             picture of what stands still shifts by up to so many pixels from where it is meant to
             be; the object stays in the picture, smaller.
@@ -80,6 +83,7 @@ class SceneConfig:
     constant_light: bool = False
     fixed_room: bool = False
     fixed_table: bool = False
+    turned_over: bool = False
     pan_jitter_px: float = 0.0
     crop_jitter_px: float = 0.0
     light: Literal["point", "directional"] = "point"
@@ -138,6 +142,12 @@ class SceneConfig:
                 fixed,
                 f"path turntable instead of {self.path}, for what stands still before the camera",
             )
+        require(
+            not self.turned_over or (self.num_views >= 2 and not self._at_rest),
+            "turned_over",
+            self.turned_over,
+            "2 views or more, and no environment, fixed_point_light, fixed_room or fixed_table",
+        )
         widest = 0.3 * min(self.width, self.height)
         needed = (
             f"0 or more, and both jitters together at most {widest:.0f}, 0.3 of the tighter side"
@@ -185,6 +195,12 @@ class SceneConfig:
         if self.environment is not None:
             return self.environment
         return "none" if self.conductor == "none" else "constant"
+
+    @property
+    def _at_rest(self) -> bool:
+        """Whether something stands still in the room while the object does not."""
+        fixed = self.fixed_point_light or self.fixed_room or self.fixed_table
+        return fixed or self.surrounded != "none"
 
     @property
     def jitter_px(self) -> float:

@@ -37,6 +37,19 @@ def rotated_about(
     return rigid(rotation, foot.expand(len(azimuths), 3))
 
 
+def upside_down(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "4 4"]:
+    """Give ``room_from_world`` that turns an object over about the x axis, onto the same table.
+
+    Args:
+        points_world: Of the object, which stands on z = 0. The centre of their box stays, when the
+            lowest of them is at 0.
+    """
+    lowest, highest = points_world.aminmax(dim=0)
+    shift = (lowest + highest) * points_world.new_tensor([0.0, 1.0, 1.0])
+    shift[2] = highest[2]
+    return rigid(torch.diag(shift.new_tensor([1.0, -1.0, -1.0])), shift)
+
+
 def fixed_light(light_room: Lights, world_from_room: Float[Tensor, "view 4 4"]) -> Lights:
     """Leave one light at its place in the room.
 

@@ -28,7 +28,13 @@ from pimper_torch.evidence.scenes.lights import Lights, lights_round
 from pimper_torch.evidence.scenes.meshes import join
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.objects import RECIPES, TABLES
-from pimper_torch.evidence.scenes.room import fixed_light, room, rotated_about, turntable
+from pimper_torch.evidence.scenes.room import (
+    fixed_light,
+    room,
+    rotated_about,
+    turntable,
+    upside_down,
+)
 from pimper_torch.evidence.scenes.scene_object import (
     SceneObject,
     albedo_at_vertices,
@@ -36,6 +42,7 @@ from pimper_torch.evidence.scenes.scene_object import (
     transferred,
 )
 from pimper_torch.evidence.scenes.textures import Uniform
+from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Cameras, Mesh
@@ -57,7 +64,7 @@ class Scene:
         objects: At rest in the world: the object's first, then its table, if that turns along.
         cameras: One a photograph; float64.
         lights: One a photograph.
-        fixed: Objects that are at rest before the camera while the object turns, in the frame of
+        fixed: Objects that are at rest while the object turns or is turned over, in the frame of
             :mod:`pimper_torch.evidence.scenes.room`.
         world_from_room: Where that frame is in each photograph.
     """
@@ -121,6 +128,38 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     objects = recipe(generator) if recipe else (_read_object(name_or_path, config, generator),)
     objects = tuple(_finished(item, config) for item in objects)
     points = join(*(item.mesh for item in objects)).vertices_world
+    if config.turned_over:
+        return _turned_over(str(name_or_path), objects, points, config, generator)
+    taken = _taken(points, config, generator)
+    world_from_room = rotated_about(taken.target, taken.azimuths)
+    reach = float((points - taken.target)[:, :2].norm(dim=-1).amax())
+    environments = _environments(config, world_from_room)
+    turning, fixed = _surroundings(config, generator, taken.target, _MARGIN * reach)
+    return Scene(
+        name=str(name_or_path),
+        config=config,
+        objects=(*objects, *turning),
+        cameras=taken.cameras,
+        lights=taken.lights.replace(environments=environments),
+        fixed=fixed,
+        world_from_room=world_from_room,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Taken:
+    """Cameras and lights round an object, what they look at, and where they stand round it."""
+
+    cameras: Cameras
+    lights: Lights
+    target: Float[Tensor, " 3"]
+    azimuths: Float[Tensor, " view"]
+
+
+def _taken(
+    points: Float[Tensor, "point 3"], config: SceneConfig, generator: torch.Generator
+) -> _Taken:
+    """Place cameras and lights round an object on the table."""
     lowest, highest = points.amin(dim=0), points.amax(dim=0)
     toward = _toward(config, generator)
     focal_px = _FOCAL * config.width
@@ -132,21 +171,52 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
         height=config.height - 2 * config.jitter_px,
         fill=config.fill,
     )
-    eyes = target + distance * toward
-    poses = look_at(eyes, target, target.new_tensor(UP))
+    poses = look_at(target + distance * toward, target, target.new_tensor(UP))
     azimuths = torch.atan2(toward[:, 0], -toward[:, 1])
-    world_from_room = rotated_about(target, azimuths)
-    lights = _lights(config, generator, azimuths, target, (lowest, highest))
-    reach = float((points - target)[:, :2].norm(dim=-1).amax())
-    environments = _environments(config, world_from_room)
-    turning, fixed = _surroundings(config, generator, target, _MARGIN * reach)
-    return Scene(
-        name=str(name_or_path),
-        config=config,
-        objects=(*objects, *turning),
+    return _Taken(
         cameras=_shifted(pinholes(poses, focal_px, config.width, config.height), config),
-        lights=lights.replace(environments=environments),
-        fixed=fixed,
+        lights=_lights(config, generator, azimuths, target, (lowest, highest)),
+        target=target,
+        azimuths=azimuths,
+    )
+
+
+def _turned_over(
+    name: str,
+    objects: tuple[SceneObject, ...],
+    points: Float[Tensor, "point 3"],
+    config: SceneConfig,
+    generator: torch.Generator,
+) -> Scene:
+    """Photograph an object on its table, and as often when it was turned over there."""
+    second = config.num_views // 2
+    counts = config.num_views - second, second
+    over = upside_down(points)
+    rooms = torch.stack([torch.eye(4).to(over), over])
+    series = [
+        _taken(
+            transform(room, points), replace(config, num_views=count, turned_over=False), generator
+        )
+        for room, count in zip(rooms, counts, strict=True)
+    ]
+    room_from_world = rooms.repeat_interleave(torch.tensor(counts), dim=0)
+    world_from_room = invert_rigid(room_from_world)
+    cameras = Cameras.cat([one.cameras for one in series])
+    lights = [one.lights for one in series]
+    positions = torch.cat([one.positions_world for one in lights])
+    return Scene(
+        name=name,
+        config=config,
+        objects=objects,
+        cameras=cameras.replace(cam_from_world=cameras.cam_from_world @ room_from_world),
+        lights=Lights(
+            positions_world=transform(world_from_room, positions[:, None])[:, 0],
+            irradiance=torch.cat([one.irradiance for one in lights]),
+            ambient=torch.cat([one.ambient for one in lights]),
+            target_world=lights[0].target_world,  # the box's centre, which stays where it is
+            flash=torch.cat([one.flash for one in lights]),
+        ),
+        fixed=(TABLES[config.table](generator),),
         world_from_room=world_from_room,
     )
 

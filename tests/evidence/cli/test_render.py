@@ -48,6 +48,17 @@ def test_a_room_and_a_point_light_stand_still_on_demand_and_only_where_the_objec
     assert all(settings[name] for name in ("fixed_point_light", "fixed_room", "fixed_table"))
 
 
+def test_an_object_is_turned_over_on_demand_and_not_before_a_room(ball, tmp_path, capsys):
+    turned = ("--turned-over", "--path", "turntable", "--num-views", "2")
+    assert render(ball, tmp_path / "out", "--fixed-room", *turned) == 2
+    assert "turned_over is True; needed: 2 views or more" in capsys.readouterr().err
+    assert render(ball, tmp_path / "out", *turned) == 0
+    capture = read_rendered(tmp_path / "out")
+    assert capture.truth.surroundings is None  # elsewhere in the second half
+    below = capture.cameras.centers_world[:, 2] < capture.truth.mesh.vertices_world[:, 2].mean()
+    assert below.tolist() == [False, True]
+
+
 def test_one_albedo_a_patterned_table_and_a_constant_light_on_demand(ball, tmp_path):
     options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--rotation-deg", "30")
     assert render(ball, tmp_path / "out", "--constant-light", *options) == 0

@@ -52,6 +52,26 @@ def test_all_but_the_object_and_its_shadow_is_the_same_in_every_photograph(egg):
     assert_close(scene.objects_in(0)[0].mesh.vertices_world, scene.object_mesh.vertices_world)
 
 
+def test_an_object_turned_over_is_where_the_cameras_see_it_and_shows_its_underside(egg):
+    scene = build_scene(egg, settings(num_views=6, turned_over=True, table="patterned"))
+    points = scene.object_mesh.vertices_world
+    frames = [photograph(scene, view) for view in range(6)]
+    for view, frame in enumerate(frames):
+        pixels, _ = project(points, scene.cameras.cam_from_world[view], scene.cameras.intrinsics[0])
+        rows = frame.foreground.nonzero()[:, 0].double()
+        assert_close(pixels[:, 1].amin(), rows.min(), atol=1.5, rtol=0)  # a pixel is found so
+        (table,) = scene.objects_in(view)[len(scene.objects) :]
+        heights = table.mesh.vertices_world[:, 2]
+        level = points[:, 2].max() if view >= 3 else points[:, 2].min()
+        assert_close(heights, torch.full_like(heights, level), atol=1e-9, rtol=0)
+    eyes = scene.cameras.centers_world
+    middle = (points[:, 2].min() + points[:, 2].max()) / 2
+    assert ((eyes[:, 2] < middle) == torch.tensor([False] * 3 + [True] * 3)).all()
+    # The lamp is on the camera's side of the table, and lights what the camera sees.
+    assert ((scene.lights.positions_world[:, 2] < middle) == (eyes[:, 2] < middle)).all()
+    assert all((frame.lit & frame.foreground).any() for frame in frames)
+
+
 def test_a_turning_table_is_where_the_true_cameras_see_it_and_the_room_is_not(egg):
     scene = build_scene(egg, settings(fixed_point_light=True, fixed_room=True))
     first, second = photograph(scene, 0), photograph(scene, 1)

@@ -1,0 +1,90 @@
+"""Tie series of photographs between which the object was moved by the object, in COLMAP's database.
+
+See :mod:`pimper_torch.sfm.moved_object`.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm.leave_out import (
+    Matched,
+    among,
+    indices,
+    read_geometries,
+    read_matched,
+    verified_again,
+)
+from pimper_torch.sfm.matching import MatchSettings, PhotographPair, VerifiedPair
+from pimper_torch.sfm.moved_object import MovedObject, Rows, find_moved_object
+from pimper_torch.sfm.static_background import Pair
+
+_TRIALS = 1000  # of RANSAC: enough where two thirds of the matches are right
+
+
+def tie_series(
+    database: Path, settings: MatchSettings
+) -> tuple[MovedObject, tuple[VerifiedPair, ...]]:
+    """Find series between which the object was moved, and keep between them what is the object's.
+
+    Args:
+        database: With features, matches and verified pairs. Where nothing was moved it stays as it
+            is.
+        settings: What counts as a match.
+
+    Returns:
+        The series, and the matches of the surroundings, within series and between.
+    """
+    with quiet(), loaded().Database.open(database) as stored:
+        matched = read_matched(stored)
+        number = {image: index for index, image in enumerate(matched.ids)}
+        geometries = {
+            (number[first], number[second]): geometry
+            for (first, second), geometry in read_geometries(stored).items()
+            if len(geometry.inlier_matches) >= settings.min_inliers
+        }
+        verified = {pair: indices(one.inlier_matches) for pair, one in geometries.items()}
+        outside = {
+            (pair.first, pair.second): pair.matches[
+                ~among(pair.matches, verified[pair.first, pair.second])
+            ]
+            for pair in matched.pairs
+            if (pair.first, pair.second) in verified
+        }
+        seconds: dict[PhotographPair, Any] = {}
+
+        def verify(pair: PhotographPair, rows: Rows) -> Rows:
+            one = Pair(first=pair[0], second=pair[1], matches=rows)
+            seconds[pair] = verified_again(matched, one, settings, _TRIALS)
+            return indices(seconds[pair].inlier_matches)
+
+        found = find_moved_object(
+            matched.keypoints,
+            _sizes(matched),
+            verified,
+            {pair: rows for pair, rows in outside.items() if pair in verified},
+            verify,
+            max_error_px=settings.max_error_px,
+            fewest=settings.min_inliers,
+        )
+        for pair, rows in found.tying.items():
+            if not torch.equal(rows, verified[pair]):
+                ids = matched.ids[pair[0]], matched.ids[pair[1]]
+                stored.update_two_view_geometry(*ids, seconds[pair])
+        for pair in found.dropped:
+            stored.delete_two_view_geometry(matched.ids[pair[0]], matched.ids[pair[1]])
+    pixels = [one.double() for one in matched.keypoints]
+    around = tuple(
+        VerifiedPair(
+            views=pair, first=pixels[pair[0]][rows[:, 0]], second=pixels[pair[1]][rows[:, 1]]
+        )
+        for pair, rows in found.around.items()
+        if len(rows)
+    )
+    return found, around
+
+
+def _sizes(matched: Matched) -> torch.Tensor:
+    return torch.tensor([(one.width, one.height) for one in matched.cameras]).float()

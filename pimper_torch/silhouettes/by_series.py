@@ -1,0 +1,46 @@
+"""Silhouettes of an object that was moved between series of photographs: each series by itself.
+
+In the object's frame its surroundings are elsewhere in every series, and so is the plane that it
+stands on.
+"""
+
+from collections.abc import Callable
+
+import torch
+
+from pimper_torch.records import Silhouettes, SparseScene
+from pimper_torch.sfm.sound_views import with_views
+
+
+def by_series(
+    scene: SparseScene, find: Callable[[SparseScene, tuple[int, ...]], Silhouettes]
+) -> Silhouettes:
+    """Find silhouettes in the views of each series, and put them side by side.
+
+    Args:
+        scene: With series or without.
+        find: Gives silhouettes of some views: their scene, and their numbers.
+
+    Returns:
+        Of all views. Everything, where those of one series are everything.
+    """
+    if not len(scene.series):
+        return find(scene, tuple(range(scene.views.num_views)))
+    chosen = [scene.series == number for number in sorted(set(scene.series.tolist()))]
+    views = [one.nonzero()[:, 0] for one in chosen]
+    found = [find(part(scene, one.tolist()), tuple(one.tolist())) for one in views]
+    if any(one.source == "everything" for one in found):
+        return Silhouettes.everything(scene.views)
+    order = torch.cat(views).argsort()
+    return found[0].replace(
+        inside=torch.cat([one.inside for one in found])[order],
+        reliable=torch.cat([one.reliable for one in found])[order],
+    )
+
+
+def part(scene: SparseScene, views: list[int]) -> SparseScene:
+    """Give the scene of some views, as if the object had stood there alone."""
+    kept = torch.zeros(scene.views.num_views, dtype=torch.bool)
+    kept[views] = True
+    some = with_views(scene, kept)
+    return some.replace(series=some.series[:0])

@@ -1,0 +1,37 @@
+"""Two rigid bodies before cameras: an object, and the table that it is moved on."""
+
+import torch
+
+from pimper_torch.evidence.scenes.cameras import look_at, turntable_directions
+from pimper_torch.evidence.scenes.room import upside_down
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.projection import project
+
+K = torch.tensor([[400.0, 0, 160], [0, 400, 120], [0, 0, 1]]).double()
+
+
+def poses(num_views, elevation_deg=25.0):
+    toward = turntable_directions(num_views, elevation_deg=elevation_deg)
+    target = toward.new_tensor([0.0, 0.0, 0.5])
+    return look_at(target + 4.5 * toward, target, toward.new_tensor([0.0, 0.0, 1.0]))
+
+
+def bodies(generator, num_object=60, num_table=90):
+    """Give points of a unit box that stands on z = 0, and of the table round it."""
+    own = torch.rand(num_object, 3, generator=generator, dtype=torch.float64)
+    own = own - own.new_tensor([0.5, 0.5, 0.0])
+    own[0], own[1] = own.new_tensor([-0.5, -0.5, 0.0]), own.new_tensor([0.5, 0.5, 1.0])
+    table = 3 * torch.rand(num_table, 3, generator=generator, dtype=torch.float64) - 1.5
+    table[:, 2] = 0
+    return own, table
+
+
+def photographed(series, generator, **counts):
+    """Give pixels of all points in every view: the object's first, turned over in series 1."""
+    own, table = bodies(generator, **counts)
+    over = transform(upside_down(own), own)
+    cameras = poses(len(series) // 2).repeat(2, 1, 1) if 1 in series else poses(len(series))
+    placed = [torch.cat([over if one else own, table]) for one in series]
+    return [
+        project(points, camera, K)[0] for points, camera in zip(placed, cameras, strict=True)
+    ], len(own)

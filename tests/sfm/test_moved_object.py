@@ -1,0 +1,125 @@
+from itertools import combinations
+
+import pytest
+import torch
+
+from pimper_torch.sfm.moved_object import clusters, find_moved_object, object_votes, series_of
+from tests.sfm.moved import photographed
+
+SIZE = torch.tensor([320.0, 240.0])
+SERIES = (0,) * 6 + (1,) * 6
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(46)
+
+
+def matched(series, num_object, num_points, same_side=2):
+    """Match every feature between neighbours; between series the table is the larger body."""
+    every = torch.arange(num_points)[:, None].repeat(1, 2)
+    own, table = every[:num_object], every[num_object:]
+    verified, outside = {}, {}
+    half = len(series) // 2
+    for first, second in combinations(range(len(series)), 2):
+        apart = abs(first % half - second % half)
+        if min(apart, half - apart) < same_side:
+            one = series[first] == series[second]
+            verified[first, second] = every if one else table
+            outside[first, second] = every[:0] if one else own
+    return verified, outside
+
+
+def found(series, keypoints, num_object, **changes):
+    verified, outside = matched(series, num_object, len(keypoints[0]))
+    settings = {"max_error_px": 2.0, "fewest": 15} | changes
+    return find_moved_object(
+        keypoints,
+        SIZE.expand(len(series), 2),
+        verified,
+        outside,
+        lambda pair, rows: rows,
+        **settings,
+    )
+
+
+def test_series_are_told_apart_and_tied_by_the_object_alone(generator):
+    keypoints, num_object = photographed(SERIES, generator)
+    moved = found(SERIES, keypoints, num_object)
+    assert moved.moved
+    assert tuple(moved.series.tolist()) == SERIES
+    pairs, _ = matched(SERIES, num_object, len(keypoints[0]))
+    between = {pair for pair in pairs if SERIES[pair[0]] != SERIES[pair[1]]}
+    assert set(moved.tying) == between
+    assert all(int(rows.max()) < num_object for rows in moved.tying.values())
+
+
+def test_the_object_is_the_body_in_the_middle_though_it_shows_more_features(generator):
+    keypoints, num_object = photographed(SERIES, generator, num_object=150)
+    verified, outside = matched(SERIES, num_object, len(keypoints[0]))
+    for pair in verified:
+        if SERIES[pair[0]] != SERIES[pair[1]]:  # the first geometry is that of most matches
+            verified[pair], outside[pair] = outside[pair], verified[pair]
+    moved = find_moved_object(
+        keypoints,
+        SIZE.expand(12, 2),
+        verified,
+        outside,
+        lambda pair, rows: rows,
+        max_error_px=2.0,
+        fewest=15,
+    )
+    assert tuple(moved.series.tolist()) == SERIES
+    assert all(int(rows.max()) < num_object for rows in moved.tying.values())
+
+
+def test_a_rigid_scene_is_one_series_though_a_second_geometry_fits_what_the_first_leaves(generator):
+    keypoints, num_object = photographed((0,) * 12, generator)
+    moved = found(SERIES, keypoints, num_object)  # matched as if there were two
+    assert not moved.moved
+    assert not moved.tying
+    assert not moved.dropped
+
+
+def test_few_pairs_of_two_bodies_are_no_evidence(generator):
+    keypoints, _ = photographed(SERIES, generator)
+    assert not found(SERIES, keypoints, 29).moved  # fewer than a second body needs
+
+
+def test_a_pair_that_shows_the_table_alone_does_not_tie_series(generator):
+    keypoints, num_object = photographed(SERIES, generator)
+    verified, outside = matched(SERIES, num_object, len(keypoints[0]))
+    outside[0, 6] = outside[0, 6][:0]
+    moved = find_moved_object(
+        keypoints,
+        SIZE.expand(12, 2),
+        verified,
+        outside,
+        lambda pair, rows: rows,
+        max_error_px=2.0,
+        fewest=15,
+    )
+    assert moved.dropped == ((0, 6),)
+    assert (0, 6) not in moved.tying
+
+
+def test_features_learn_from_their_matches_which_body_they_are_of(generator):
+    keypoints, num_object = photographed(SERIES, generator)
+    verified, outside = matched(SERIES, num_object, len(keypoints[0]))
+    seconds = {pair: outside[pair] for pair in [(0, 6), (1, 7), (2, 8)]}
+    verified = {pair: rows for pair, rows in verified.items() if SERIES[pair[0]] == SERIES[pair[1]]}
+    verified |= {pair: matched(SERIES, num_object, 150)[0][pair] for pair in seconds}
+    votes = object_votes(keypoints, SIZE.expand(12, 2), verified, seconds)
+    assert all(bool((one[:num_object] > 0).all()) for one in votes)
+    assert all(bool((one[num_object:] < 0).all()) for one in votes)
+    # Views 3 to 5 and 9 to 11 show no pair of two bodies, and are joined by their neighbours.
+    assert tuple(series_of(12, verified, seconds, votes).tolist()) == SERIES
+
+
+def test_clusters_leave_a_view_that_more_repels_than_attracts():
+    weight = torch.zeros(5, 5, dtype=torch.float64)
+    for first, second, value in [(0, 1, 9.0), (3, 4, 9.0), (1, 2, 5.0), (2, 3, 4.0), (0, 3, -20.0)]:
+        weight[first, second] = weight[second, first] = value
+    assert clusters(weight).tolist() == [0, 0, 0, 1, 1]
+    weight[0, 2] = weight[2, 0] = -6.0
+    assert clusters(weight).tolist() == [0, 0, 1, 1, 1]

@@ -1,0 +1,97 @@
+from itertools import combinations
+
+import pytest
+import torch
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.evidence.scenes.room import upside_down
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.projection import project
+from pimper_torch.records import Lens
+from pimper_torch.sfm.matching import VerifiedPair
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.series import largest_series, series_apart, series_in, with_series
+from tests.sfm.moved import K, bodies, poses
+
+LENS = Lens(camera=1, model="PINHOLE", params=(400.0, 400.0, 160.0, 120.0), width=320, height=240)
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(46)
+
+
+def model_of(counts, generator, *, moved=True):
+    """Give a model in the table's frame; points are seen by views within 50 degrees."""
+    own, table = bodies(generator, num_object=400, num_table=400)
+    cameras = torch.cat([poses(count) for count in counts])
+    series = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+    toward = -cameras[:, 2, :3]
+    near = torch.nn.functional.normalize(toward[:, :2], dim=1)
+    placed, seen = [table], [torch.ones(400, len(cameras), dtype=torch.bool)]
+    for number in range(len(counts) if moved else 1):
+        points = transform(upside_down(own), own) if number == 1 else own
+        outward = torch.nn.functional.normalize(points[:, :2], dim=1)
+        facing = outward @ near.mT > 0.64
+        placed.append(points)
+        seen.append(facing & (series == number) if moved else facing)
+    points, observed = torch.cat(placed), torch.cat(seen)
+    point, view = observed.nonzero(as_tuple=True)
+    pixels = project(points, cameras, K.expand(len(cameras), 3, 3))[0]
+    return SparseModel(
+        names=tuple(f"{view:02d}.jpg" for view in range(len(cameras))),
+        lenses=(LENS,) * len(cameras),
+        cam_from_world=cameras,
+        points_world=points,
+        observation_point=point,
+        observation_view=view,
+        observation_pixels=pixels[view, point],
+    )
+
+
+def test_views_that_see_the_object_at_two_places_are_two_series(generator):
+    model = model_of((12, 10), generator)
+    assert series_apart(model).tolist() == [0] * 12 + [1] * 10
+
+
+def test_views_that_share_the_object_are_one_series(generator):
+    model = model_of((12, 10), generator, moved=False)
+    assert series_apart(model).tolist() == [0] * 22
+    assert largest_series(model) is model
+
+
+def test_the_larger_series_is_kept_with_a_warning_that_names_the_other_and_what_joins(generator):
+    with pytest.warns(PimperWarning, match="10 of 22 photographs") as told:
+        kept = largest_series(model_of((12, 10), generator))
+    assert kept.names == tuple(f"{view:02d}.jpg" for view in range(12))
+    assert "12.jpg, 13.jpg" in str(told[0].message)
+    assert "low down" in str(told[0].message)
+
+
+def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generator):
+    model = model_of((6, 6), generator)
+    own, table = bodies(generator, num_object=400, num_table=80)
+    pixels = project(table, model.cam_from_world, K.expand(12, 3, 3))[0]
+    over = torch.eye(4).double().repeat(12, 1, 1)
+    over[6:] = upside_down(own)
+    model = model.replace(cam_from_world=model.cam_from_world @ over)  # in the object's frame
+    pairs = [(a, b) for a, b in combinations(range(12), 2) if (b - a) % 6 < 2]
+    around = [VerifiedPair(views=(a, b), first=pixels[a], second=pixels[b]) for a, b in pairs]
+    assert series_in(model, model.names, around).tolist() == [0] * 6 + [1] * 6
+    names = (*model.names[6:], "other.jpg", *model.names[:6])  # numbers are of all photographs
+    moved = [
+        one.replace(views=tuple(names.index(model.names[view]) for view in one.views))
+        for one in around
+    ]
+    assert series_in(model, names, moved).tolist() == [0] * 6 + [1] * 6
+
+
+def test_series_are_noted_and_named_and_views_of_a_series_that_is_hardly_there_left_out(generator):
+    model = model_of((12, 10), generator)
+    with pytest.warns(PimperWarning, match=r"between 2 series .*12 \(00.jpg.*10 \(12.jpg"):
+        noted = with_series(model, torch.tensor([0] * 12 + [1] * 10), model.names)
+    assert noted.series.tolist() == [0] * 12 + [1] * 10
+    with pytest.warns(PimperWarning, match=r"2 of 22 photographs .* 20.jpg, 21.jpg\. "):
+        alone = with_series(model, torch.tensor([0] * 20 + [1] * 2), model.names)
+    assert alone.num_views == 20
+    assert len(alone.series) == 0

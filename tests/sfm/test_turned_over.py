@@ -1,0 +1,25 @@
+import pytest
+import torch
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.evidence.scenes.config import SceneConfig
+from pimper_torch.evidence.scenes.scene import build_scene
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from tests.sfm.test_turntable import center_errors, photographs
+
+
+@pytest.mark.slow
+def test_series_between_which_an_object_was_turned_over_are_registered_on_it_without_masks():
+    settings = {"num_views": 24, "width": 320, "height": 240, "path": "turntable"}
+    scene = build_scene(
+        "mug", SceneConfig(**settings, elevation_deg=20.0, table="patterned", turned_over=True)
+    )
+    views = photographs(scene, list(range(24))).replace(masks=None)
+    with pytest.warns(PimperWarning, match="between 2 series of photographs: 12 .*; 12 "):
+        found = Reconstruct(ReconstructConfig(threads=1))(views)
+    assert found.views.names == scene.names
+    assert found.series.tolist() == [0] * 12 + [1] * 12
+    assert center_errors(found, scene).median() < 0.005
+    up = torch.tensor([0.0, 1.0, 0.0])
+    down = -found.cameras.cam_from_world[:, 1, :3]
+    assert ((down @ up > 0) == torch.tensor([True] * 12 + [False] * 12)).all()

@@ -1,0 +1,47 @@
+import torch
+
+from pimper_torch.records import Silhouettes
+from pimper_torch.silhouettes.by_series import by_series
+
+
+def numbered(part, views):
+    """Write each view's number into its silhouette."""
+    inside = torch.tensor(views).float()[:, None, None] * torch.ones_like(part.views.images[:, 0])
+    return Silhouettes(inside=inside, reliable=torch.tensor(views) > 2, source="found")
+
+
+def test_silhouettes_of_each_series_come_back_in_the_order_of_the_views(staged):
+    scene = staged.scene
+    count = scene.views.num_views
+    series = torch.arange(count) % 2
+    asked = []
+
+    def find(part, views):
+        assert len(part.series) == 0
+        assert part.views.names == tuple(scene.views.names[view] for view in views)
+        asked.append(views)
+        return numbered(part, views)
+
+    found = by_series(scene.replace(series=series), find)
+    assert asked == [tuple(range(0, count, 2)), tuple(range(1, count, 2))]
+    assert found.inside[:, 0, 0].tolist() == list(range(count))
+    assert found.reliable.tolist() == [view > 2 for view in range(count)]
+    assert found.source == "found"
+
+
+def test_without_series_all_views_are_looked_at_together(staged):
+    scene = staged.scene
+    found = by_series(scene, lambda part, views: numbered(part, views))
+    assert found.inside[:, 0, 0].tolist() == list(range(scene.views.num_views))
+
+
+def test_everything_in_one_series_is_everything_in_all(staged):
+    scene = staged.scene
+
+    def find(part, views):
+        return numbered(part, views) if 0 in views else Silhouettes.everything(part.views)
+
+    series = torch.arange(scene.views.num_views) % 2
+    found = by_series(scene.replace(series=series), find)
+    assert found.source == "everything"
+    assert len(found.inside) == scene.views.num_views
