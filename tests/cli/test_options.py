@@ -47,7 +47,8 @@ RUNS = {
         "--pan-jitter-px 2 --crop-jitter-px 1",
         "{ball} -o {out} {tiny} --path turntable --no-fixed-point-light --no-fixed-room "
         "--no-fixed-table --constant-light",
-        "{ball} -o {out} {tiny} --no-constant-light",
+        "{ball} -o {out} {tiny} --no-constant-light --turned-over --table patterned",
+        "{ball} -o {out} {tiny} --no-turned-over",
     ],
     "evaluate": [
         "{true_mesh} {scene} -o {out}.json --truth-layout rendered --samples 500 --seed 2 --views "

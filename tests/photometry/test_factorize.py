@@ -248,6 +248,7 @@ def test_information_is_the_inverse_variance_that_noise_makes(scene, generator, 
     assert ratio == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_radiance_of_lit_samples_only(scene, generator):
     true = scene()
     first = true.seen.buckets[0]

@@ -122,6 +122,7 @@ def test_every_other_photograph_zoomed_as_exif_says_is_of_a_lens_of_its_own():
     assert_close(found, focals.to(found), rtol=0.05, atol=0)  # an arc tells it from distance badly
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_held_upright_for_some_photographs_is_one_lens():
     cameras = cameras_on_an_arc()
     plain = photographs(cameras)

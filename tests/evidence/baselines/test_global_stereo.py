@@ -51,6 +51,7 @@ def test_one_matrix_recovers_a_sphere_where_the_model_holds(photographed, compar
     assert found.mesh.albedo.shape == (len(found.mesh.vertices_world), 3)
 
 
+@pytest.mark.slow
 def test_one_matrix_sees_relief_that_the_facets_do_not(photographed, compared, bumps):
     truth, scene, coarse = photographed(bumps)
     # It ends in one of two minima, by the processor's rounding: 4.0 degrees and 1.8 % on one, 7.7

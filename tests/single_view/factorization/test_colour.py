@@ -27,6 +27,7 @@ def normals_error(shading, truth):
     return cosine.clamp(-1, 1).acos().rad2deg().median()
 
 
+@pytest.mark.slow
 def test_normals_colours_and_coloured_lights_come_back(coloured):
     given, radiance, tinted, shading, chroma = coloured
     found = solve_in_colour(given, radiance, solve_variable_projection, 60, 1e-10, iterations=30)
@@ -59,6 +60,7 @@ def test_a_gray_surface_in_gray_light_is_the_gray_problem(problem):
     assert_close(found.shading, alone.shading, rtol=0, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_channel_that_is_dark_says_nothing(coloured):
     given, radiance, _, shading, _ = coloured
     dark = radiance.clone()

@@ -52,6 +52,7 @@ def test_gains_of_views_are_absorbed_by_the_lights():
     assert_close(found.gamma, 1.8, rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
 def test_gamma_does_not_depend_on_the_unit_of_the_values():
     encoded = noisy(shaded() ** (1 / 1.8), 0.005)
     found = estimate_gamma(encoded, everywhere(encoded), rank=3)
