@@ -1,6 +1,6 @@
 """Where every view shows the object."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -9,6 +9,11 @@ from torch import Tensor
 
 from pimper_torch.records.record import Record
 from pimper_torch.records.views import Views
+
+
+def no_planes() -> Float[Tensor, "0 4"]:
+    """List no planes."""
+    return torch.zeros(0, 4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -20,31 +25,32 @@ class Silhouettes(Record):
         reliable: True for views whose silhouette agrees with the hull of the others.
         source: ``masks`` that a person gave, ``found`` in the photographs, or ``everything``: no
             view constrains the object.
-        plane_world: The object is where this has a positive product with ``(x, y, z, 1)``: above
-            the plane that it stands on. ``None`` where silhouettes tell, or no plane is known.
+        planes_world: The object is where each has a positive product with ``(x, y, z, 1)``: above
+            the plane that it stands on, one for each series between which it was moved. None
+            where silhouettes tell, or no plane is known.
     """
 
     inside: Float[Tensor, "view height width"]
     reliable: Bool[Tensor, " view"]
     source: Literal["masks", "found", "everything"]
-    plane_world: Float[Tensor, "4"] | None = None
+    planes_world: Float[Tensor, "plane 4"] = field(default_factory=no_planes)
 
     @classmethod
     def everything(
-        cls, views: Views, plane_world: Float[Tensor, "4"] | None = None
+        cls, views: Views, planes_world: Float[Tensor, "plane 4"] | None = None
     ) -> "Silhouettes":
         """Give silhouettes that leave nothing out.
 
         Args:
             views: The photographs.
-            plane_world: What lies below it is not the object.
+            planes_world: What lies below one of them is not the object.
         """
         reliable = torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device)
         return cls(
             inside=views.inside.float(),
             reliable=reliable,
             source="everything",
-            plane_world=None if plane_world is None else plane_world.to(views.images),
+            planes_world=(no_planes() if planes_world is None else planes_world).to(views.images),
         )
 
     @property

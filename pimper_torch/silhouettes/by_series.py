@@ -22,7 +22,7 @@ def by_series(
         find: Gives silhouettes of some views: their scene, and their numbers.
 
     Returns:
-        Of all views. Everything, where those of one series are everything.
+        Of all views. Where those of one series are everything, everything above every known plane.
     """
     if not len(scene.series):
         return find(scene, tuple(range(scene.views.num_views)))
@@ -30,7 +30,8 @@ def by_series(
     views = [one.nonzero()[:, 0] for one in chosen]
     found = [find(part(scene, one.tolist()), tuple(one.tolist())) for one in views]
     if any(one.source == "everything" for one in found):
-        return Silhouettes.everything(scene.views)
+        planes = torch.cat([one.planes_world for one in found])
+        return Silhouettes.everything(scene.views, planes)
     order = torch.cat(views).argsort()
     return found[0].replace(
         inside=torch.cat([one.inside for one in found])[order],

@@ -37,7 +37,7 @@ class Contours(Record):
 
     @classmethod
     def none(cls, silhouettes: Silhouettes, cameras: Cameras) -> "Contours":
-        """Give contours without rays; the hull holds everything, or what is above a plane."""
+        """Give contours without rays; the hull holds everything, or what is above planes."""
         like = cameras.cam_from_world
         rays = ContourRays(
             view=torch.zeros(0, dtype=torch.long, device=like.device),
@@ -46,8 +46,8 @@ class Contours(Record):
             normals_world=like.new_zeros(0, 3),
             sigma_px=like.new_zeros(0),
         )
-        hull, plane = Everywhere.of(cameras), silhouettes.plane_world
-        if plane is not None:
+        hull = Everywhere.of(cameras)
+        for plane in silhouettes.planes_world:
             hull = hull.above(plane[:3], -plane[3])
         return cls(silhouettes=silhouettes, rays=rays, cameras=cameras, hull=hull)
 

@@ -72,13 +72,13 @@ class FindSilhouettes(Stage):
             return Silhouettes.everything(scene.views, self._top(cues))
         return _believed(silhouettes_of(cuts, scene.views, self.details), scene.views.names)
 
-    def _top(self, cues: Cues) -> Float[Tensor, "4"] | None:
+    def _top(self, cues: Cues) -> Float[Tensor, "plane 4"] | None:
         """Give the upper side of the supporting plane, as thick as its points are rough."""
         if cues.plane is None:
             return None
         thickness = self.details.plane.tolerance * cues.fixation.distance
         height = cues.plane.offset + thickness
-        return torch.cat([cues.plane.normal_world, -height.reshape(1)])
+        return torch.cat([cues.plane.normal_world, -height.reshape(1)])[None]
 
     def _doubt(self, agreement: Agreement) -> str:
         """Say why silhouettes are unreliable, or nothing."""

@@ -120,8 +120,8 @@ class Everywhere(Hull):
             origin_world=self.origin_world,
             spacing=self.spacing,
             distance=self.distance,
-            normal_world=normal_world.to(self.origin_world),
-            offset=offset.to(self.origin_world),
+            normals_world=normal_world.to(self.origin_world)[None],
+            offsets=offset.to(self.origin_world)[None],
         )
 
     def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -131,24 +131,33 @@ class Everywhere(Hull):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class HalfSpace(Everywhere):
-    """What is above a plane, where silhouettes tell nothing.
+    """What is above planes, where silhouettes tell nothing.
 
-    Points of the plane are as deep inside as all others, and shape the surface with them; surface
-    on the plane is not held.
+    Points of the planes are as deep inside as all others, and shape the surface with them; surface
+    on a plane is not held.
 
     Attributes:
-        normal_world: Of the plane, unit, into the half space.
-        offset: The plane is where the normal's product with a point is this.
+        normals_world: Of the planes, unit, into the half spaces.
+        offsets: A plane is where its normal's product with a point is this.
     """
 
-    normal_world: Float[Tensor, "3"]
-    offset: Float[Tensor, ""]
+    normals_world: Float[Tensor, "plane 3"]
+    offsets: Float[Tensor, " plane"]
+
+    def above(self, normal_world: Float[Tensor, "3"], offset: Float[Tensor, ""]) -> "HalfSpace":
+        """Keep what is above one more plane."""
+        more = Everywhere.above(self, normal_world, offset)
+        return self.replace(
+            normals_world=torch.cat([self.normals_world, more.normals_world]),
+            offsets=torch.cat([self.offsets, more.offsets]),
+        )
 
     def holds(
         self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
     ) -> Bool[Tensor, "*batch"]:
-        """Mark points above the plane; the tolerance is of silhouettes."""
-        return points_world @ self.normal_world.to(points_world) > self.offset.to(points_world)
+        """Mark points above the planes; the tolerance is of silhouettes."""
+        heights = points_world @ self.normals_world.to(points_world).mT
+        return (heights > self.offsets.to(points_world)).all(dim=-1)
 
 
 def visual_hull(

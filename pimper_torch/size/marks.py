@@ -211,11 +211,10 @@ def _beside(
 
 def ground(scene: SparseScene, silhouettes: Silhouettes) -> Plane | None:
     """Give the plane that the object stands on: the silhouettes', else that of the cloud."""
-    found = silhouettes.plane_world
-    if found is not None:
-        normal = found[:3].detach().cpu()
-        length = normal.norm()
-        return Plane(normal_world=normal / length, offset=-found[3].detach().cpu() / length)
+    if len(silhouettes.planes_world):
+        found = silhouettes.planes_world[0].detach().cpu()  # of the first series, whose up is up
+        length = found[:3].norm()
+        return Plane(normal_world=found[:3] / length, offset=-found[3] / length)
     cameras = scene.cameras.detach().to("cpu")
     points = scene.points_world.detach()[well_tracked(scene)].cpu()
     distance = float(fixation(cameras.cam_from_world).distance)

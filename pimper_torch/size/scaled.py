@@ -42,7 +42,7 @@ POWERS: Mapping[type[Record], Mapping[str, int]] = {
 POSES: Mapping[type[Record], str] = {Cameras: "cam_from_world", Templates: "patch_from_world"}
 """Rigid transforms, whose shift is a length."""
 
-LAST: Mapping[type[Record], str] = {Depths: "transform", Silhouettes: "plane_world"}
+LAST: Mapping[type[Record], str] = {Depths: "transform", Silhouettes: "planes_world"}
 """Vectors of which the last entry alone is a length."""
 
 # What stages tell as scene units.

@@ -45,3 +45,15 @@ def test_everything_in_one_series_is_everything_in_all(staged):
     found = by_series(scene.replace(series=series), find)
     assert found.source == "everything"
     assert len(found.inside) == scene.views.num_views
+
+
+def test_everything_is_what_is_above_the_planes_of_all_series(staged):
+    scene = staged.scene
+    series = torch.arange(scene.views.num_views) % 2
+
+    def find(part, views):
+        plane = torch.tensor([[0.0, 0.0, 1.0, float(views[0])]])
+        return Silhouettes.everything(part.views, plane)
+
+    found = by_series(scene.replace(series=series), find)
+    assert found.planes_world[:, 3].tolist() == [0.0, 1.0]

@@ -52,11 +52,16 @@ def test_silhouettes_that_leave_nothing_out_constrain_nothing(cameras):
 
 def test_above_a_plane_is_held_and_its_points_are_used(cameras):
     plane = torch.tensor([0.0, 0.0, 1.0, -0.25]).double()
-    silhouettes = silhouettes_of(ball, cameras).replace(source="everything", plane_world=plane)
+    silhouettes = silhouettes_of(ball, cameras).replace(
+        source="everything", planes_world=plane[None]
+    )
     contours = TraceContours()(silhouettes, cameras)
     assert not contours.confine
     points = torch.tensor([[5.0, -3, 0.3], [5.0, -3, 0.2], [0.0, 0, 1e6]]).double()
     assert contours.hull.holds(points, 1.0).tolist() == [True, False, True]
+    both = torch.stack([plane, torch.tensor([0.0, 0.0, -1.0, 10.0]).double()])
+    between = TraceContours()(silhouettes.replace(planes_world=both), cameras)
+    assert between.hull.holds(points, 1.0).tolist() == [True, False, False]
     assert (contours.hull.depth_of(points) > 0).all()
 
 

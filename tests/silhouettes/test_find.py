@@ -104,9 +104,9 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
     assert silhouettes.source == "everything"
     # The ball stands on z = 0; what is a few hundredths thick is the table.
     table = torch.tensor([[0.5, 0.5, 0.0, 1.0], [0.5, -0.5, 0.05, 1.0], [0.0, 0.0, -1.0, 1.0]])
-    assert ((table @ silhouettes.plane_world) > 0).tolist() == [False, True, False]
+    assert ((table @ silhouettes.planes_world[0]) > 0).tolist() == [False, True, False]
     meant = FindSilhouettes(SilhouetteConfig(object="everything"))(staged.scene)
-    assert meant.plane_world is None
+    assert len(meant.planes_world) == 0
 
 
 def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):

@@ -58,7 +58,7 @@ def test_a_place_in_two_photographs_may_be_anywhere(ball):
 def test_the_tip_of_the_object_is_told_from_the_table_behind_it(ball):
     """A surface ends a little inside of what it shows: one click beside it is the surface."""
     plane = torch.tensor([0.0, 1.0, 0.0, 1.0])  # y = -1 and above
-    ball = ball.replace(silhouettes=Silhouettes.everything(ball.scene.views, plane))
+    ball = ball.replace(silhouettes=Silhouettes.everything(ball.scene.views, plane[None]))
     eye = ball.cameras.to(torch.float64).centers_world[2]
     toward = eye / eye.norm()
     down = torch.linalg.cross(direction(1, 0, 0), toward)
@@ -94,7 +94,7 @@ def test_where_the_silhouette_shows_the_object_the_table_is_not_taken(ball):
     plane = torch.tensor([0.0, 1.0, 0.0, 1.0])
     inside = torch.ones(5, 480, 640)
     silhouettes = Silhouettes(
-        inside=inside, reliable=torch.ones(5) > 0, source="masks", plane_world=plane
+        inside=inside, reliable=torch.ones(5) > 0, source="masks", planes_world=plane[None]
     )
     place = Mark.read("IMG_2,320,470")
     with pytest.raises(InputError, match=r"IMG_2,320,470: the silhouette says .*surface is"):

@@ -139,10 +139,10 @@ def test_variances_and_planes_are_scaled_as_what_they_are():
         inside=ones,
         reliable=torch.zeros(1, dtype=torch.bool),
         source="everything",
-        plane_world=torch.tensor([0.0, 1.0, 0.0, -2.0]),
+        planes_world=torch.tensor([[0.0, 1.0, 0.0, -2.0]]),
     )
     on = torch.tensor([5.0, 2.0, 1.0])
-    plane = scaled(silhouettes, 10.0).plane_world
+    plane = scaled(silhouettes, 10.0).planes_world[0]
     assert float(plane[:3] @ (10 * on) + plane[3]) == 0
 
 
