@@ -92,7 +92,7 @@ def test_masks_keep_the_rest_out():
 
 def test_what_lies_below_the_supporting_plane_gets_no_facets(whole, round_about):
     plane = torch.tensor([0.0, 0.6, 0.8, -0.2])
-    silhouettes = Silhouettes.everything(round_about.views, plane)
+    silhouettes = Silhouettes.everything(round_about.views, plane[None])
     contours = Contours.none(silhouettes, round_about.cameras)
     mesh = CoarseSurface(*SETTINGS)(round_about, contours).mesh
     side = 0.15  # of a facet
