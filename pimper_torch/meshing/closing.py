@@ -71,7 +71,7 @@ def closed(mesh: Mesh) -> Closed:
 
     film = mesh.vertices_world[source]
     if mesh.albedo is not None:
-        film = torch.cat([film, mesh.albedo[source].to(film)], dim=1)
+        film = torch.cat([film, _known(mesh.albedo)[source].to(film)], dim=1)
     film = _stretched(film, added, count) if fresh else film
     vertices, everything = film[:, :3], torch.cat([faces, added])
     normals = mesh.normals_world
@@ -81,12 +81,21 @@ def closed(mesh: Mesh) -> Closed:
         vertices_world=vertices,
         faces=everything,
         normals_world=normals,
-        albedo=None if mesh.albedo is None else film[:, 3:].to(mesh.albedo),
+        albedo=None
+        if mesh.albedo is None
+        else torch.cat([mesh.albedo[source], film[len(source) :, 3:].to(mesh.albedo)]),
         confidence=continued(mesh.confidence, 0.0),
         expected_error=continued(mesh.expected_error, extent),
     )
     measured = torch.arange(len(everything), device=faces.device) < len(faces)
     return Closed(mesh=whole, measured=measured, borders=len(cycles))
+
+
+def _known(albedo: Float[Tensor, "vertex channel"]) -> Float[Tensor, "vertex channel"]:
+    """Give vertices whose albedo no photograph tells the mean of the others'."""
+    known = albedo.isfinite()
+    mean = torch.where(known, albedo, 0).sum(dim=0) / known.sum(dim=0).clamp_min(1)
+    return torch.where(known, albedo, mean)
 
 
 def border_cycles(faces: Int[Tensor, "face 3"]) -> list[list[int]]:

@@ -65,6 +65,18 @@ def test_what_was_measured_stays_and_caps_say_that_they_are_not():
     assert_close(found.mesh.albedo[count:], torch.full_like(found.mesh.albedo[count:], 0.4))
 
 
+def test_a_border_whose_albedo_no_photograph_tells_is_closed_too():
+    mesh = ball(above=0.7)
+    unknown = torch.tensor(border_cycles(mesh.faces)[0][:5])
+    albedo = mesh.albedo.clone()
+    albedo[unknown] = torch.nan
+    found = closed(mesh.replace(albedo=albedo)).mesh
+    count = len(mesh.vertices_world)
+    assert torch.equal(found.albedo[:count].isnan(), albedo.isnan())
+    assert_close(found.albedo[count:], torch.full_like(found.albedo[count:], 0.4))
+    assert torch.equal(found.vertices_world, closed(mesh).mesh.vertices_world)
+
+
 def test_a_closed_mesh_comes_back():
     vertices, faces = icosphere(2)
     found = closed(Mesh(vertices_world=vertices, faces=faces))

@@ -30,16 +30,19 @@ def matched(series, num_object, num_points, same_side=2):
     return verified, outside
 
 
-def found(series, keypoints, num_object, **changes):
-    verified, outside = matched(series, num_object, len(keypoints[0]))
-    settings = {"max_error_px": 2.0, "fewest": 15} | changes
+def found(series, keypoints, num_object):
+    return found_in(keypoints, *matched(series, num_object, len(keypoints[0])))
+
+
+def found_in(keypoints, verified, outside):
     return find_moved_object(
         keypoints,
-        SIZE.expand(len(series), 2),
+        SIZE.expand(len(keypoints), 2),
         verified,
         outside,
         lambda pair, rows: rows,
-        **settings,
+        max_error_px=2.0,
+        fewest=15,
     )
 
 
@@ -60,15 +63,7 @@ def test_the_object_is_the_body_in_the_middle_though_it_shows_more_features(gene
     for pair in verified:
         if SERIES[pair[0]] != SERIES[pair[1]]:  # the first geometry is that of most matches
             verified[pair], outside[pair] = outside[pair], verified[pair]
-    moved = find_moved_object(
-        keypoints,
-        SIZE.expand(12, 2),
-        verified,
-        outside,
-        lambda pair, rows: rows,
-        max_error_px=2.0,
-        fewest=15,
-    )
+    moved = found_in(keypoints, verified, outside)
     assert tuple(moved.series.tolist()) == SERIES
     assert all(int(rows.max()) < num_object for rows in moved.tying.values())
 
@@ -90,15 +85,7 @@ def test_a_pair_that_shows_the_table_alone_does_not_tie_series(generator):
     keypoints, num_object = photographed(SERIES, generator)
     verified, outside = matched(SERIES, num_object, len(keypoints[0]))
     outside[0, 6] = outside[0, 6][:0]
-    moved = find_moved_object(
-        keypoints,
-        SIZE.expand(12, 2),
-        verified,
-        outside,
-        lambda pair, rows: rows,
-        max_error_px=2.0,
-        fewest=15,
-    )
+    moved = found_in(keypoints, verified, outside)
     assert moved.dropped == ((0, 6),)
     assert (0, 6) not in moved.tying
 
