@@ -11,8 +11,8 @@ from torch import Tensor
 
 from pimper_torch.doctor.sharpness import edge_blur_px
 from pimper_torch.errors import InputError
-from pimper_torch.io.decode import read_header
-from pimper_torch.io.photographs import shrunk_size
+from pimper_torch.io.decode import Header, read_header
+from pimper_torch.io.photographs import shrunk_focals, shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_radiance
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED, Encoding
@@ -94,17 +94,23 @@ def read_all(
         black=encoding.black,
     )
 
-    def read(path: Path) -> Photograph | InputError:
+    def read(path: Path) -> tuple[Photograph, Header] | InputError:
         try:
             header = read_header(path)
             size = shrunk_size(header, max_size_px)
             image = read_pictures([path], [header], [size], plain).images[0]
         except InputError as error:
             return error
-        scale = max(size) / max(header.width, header.height)
-        return summarize(path.name, image, header.focal_px * scale)
+        return summarize(path.name, image, math.nan), header
 
-    return list(side_by_side(read, paths))
+    results = list(side_by_side(read, paths))
+    pairs = [result for result in results if not isinstance(result, InputError)]
+    sizes = [(photograph.width, photograph.height) for photograph, _ in pairs]
+    focals = iter(shrunk_focals([header for _, header in pairs], sizes).tolist())
+    return [
+        result if isinstance(result, InputError) else result[0].replace(focal_px=next(focals))
+        for result in results
+    ]
 
 
 def of_views(views: Views) -> list[Photograph]:

@@ -1,9 +1,8 @@
 """One image file to its samples, at full depth and the right way up."""
 
 import io
-import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.extras import is_heic, is_raw
+from pimper_torch.io.focal_lengths import FocalLength, focal_from_exif
 from pimper_torch.io.heic import read_heic, read_heic_head
 from pimper_torch.io.icc import read_profile
 from pimper_torch.io.profiles import (
@@ -46,10 +46,7 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two hold published 
 # more than 32 million has less than a bit in 25 samples: pictures made to exhaust memory do.
 MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
-# Diagonal of the 36 mm x 24 mm frame, to which CIPA DCG-001 relates the 35 mm equivalent.
-_FRAME_DIAGONAL_MM = math.hypot(36, 24)
 _FULL_SCALE = {np.dtype(kind): int(np.iinfo(kind).max) for kind in (np.uint8, np.uint16)}
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's FocalPlaneResolutionUnit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -60,7 +57,7 @@ class Header(Record):
         width: Pixels, the right way up.
         height: Pixels, the right way up.
         orientation: EXIF's number, 1 to 8; 1 is upright.
-        focal_px: NaN where the file does not say.
+        focal: See :mod:`pimper_torch.io.focal_lengths`.
         channels: 1 or 3; alpha not counted.
         deep: True for 16-bit samples in several channels, which Pillow would cut to 8.
         full: Level that is full scale, 255 or 65535, or less of 16 bits where a TIFF says so.
@@ -75,7 +72,7 @@ class Header(Record):
     width: int
     height: int
     orientation: int
-    focal_px: float
+    focal: FocalLength
     channels: int
     deep: bool
     full: int = 255
@@ -146,7 +143,7 @@ def read_header(path: Path | str) -> Header:
             width=width,
             height=height,
             orientation=orientation,
-            focal_px=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), width, height),
+            focal=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), width, height),
             channels=1 if grey else 3,
             deep=deep,
             full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,
@@ -170,7 +167,7 @@ def _header_of_heic(path: Path) -> Header:
         width=head.width,
         height=head.height,
         orientation=1,
-        focal_px=focal_from_exif(head.exif.get_ifd(ExifTags.IFD.Exif), head.width, head.height),
+        focal=focal_from_exif(head.exif.get_ifd(ExifTags.IFD.Exif), head.width, head.height),
         channels=channels,
         deep=head.full > _FULL_SCALE[np.dtype(np.uint8)],
         full=head.full,
@@ -189,7 +186,12 @@ def _header_of_raw(path: Path) -> Header:
         width=width,
         height=height,
         orientation=head.orientation,
-        focal_px=focal_from_exif(head.exif.get_ifd(ExifTags.IFD.Exif), width, height),
+        # Digital zoom crops what a camera develops, not what its sensor sees.
+        focal=focal_from_exif(
+            {**head.exif.get_ifd(ExifTags.IFD.Exif), ExifTags.Base.DigitalZoomRatio: 1},
+            width,
+            height,
+        ),
         channels=1 if head.gray else 3,
         deep=True,
         full=_FULL_SCALE[np.dtype(np.uint16)],
@@ -262,33 +264,6 @@ def write_deep_png(samples: np.ndarray, path: Path | str) -> None:
     kornia_rs.io.write_image_png_u16(str(path), samples, mode="rgb")
 
 
-def focal_from_exif(tags: Mapping[int, object], width: int, height: int) -> float:
-    """Give the focal length in pixels of an image of this size; NaN where EXIF is silent.
-
-    From the 35 mm equivalent, which survives resizing, by the diagonal of the frame; else
-    from the focal length and the resolution of the focal plane, corrected for a resize
-    since the camera wrote ``PixelXDimension``.
-
-    >>> focal_from_exif({0xA405: 50}, width=3600, height=2400)
-    5000.0
-    """
-    equivalent = _positive(tags.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    if equivalent:
-        return equivalent / _FRAME_DIAGONAL_MM * math.hypot(width, height)
-    focal_mm = _positive(tags.get(ExifTags.Base.FocalLength))
-    resolution = _positive(tags.get(ExifTags.Base.FocalPlaneXResolution))
-    unit = tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)
-    unit_mm = _MM_PER_UNIT.get(unit) if isinstance(unit, int) else None
-    if not (focal_mm and resolution and unit_mm):
-        return math.nan
-    taken = max(
-        _positive(tags.get(ExifTags.Base.ExifImageWidth)),
-        _positive(tags.get(ExifTags.Base.ExifImageHeight)),
-    )
-    resized = max(width, height) / taken if taken else 1.0
-    return focal_mm * resolution / unit_mm * resized
-
-
 def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
     """Turn rows and columns so that an image of this EXIF orientation stands upright."""
     if orientation >= 5:
@@ -298,15 +273,6 @@ def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
     if orientation in (2, 3, 6, 7):
         array = array[:, ::-1]
     return np.ascontiguousarray(array)
-
-
-def _positive(value: object) -> float:
-    """Read a number of EXIF; 0 where it is absent, zero, infinite or nonsense."""
-    try:
-        number = float(value)  # type: ignore[arg-type]  # anything may stand in a file
-    except (TypeError, ValueError, ZeroDivisionError):
-        return 0.0
-    return number if 0 < number < math.inf else 0.0
 
 
 def _orientation(exif: Image.Exif) -> tuple[int, list[str]]:

@@ -17,6 +17,7 @@ from pimper_torch.file_names import match_files
 from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header
 from pimper_torch.io.extras import installed_suffixes, is_heic, is_raw, load_extra
 from pimper_torch.io.file_cautions import tell_cautions
+from pimper_torch.io.focal_lengths import focals_px
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.io.turned_masks import choose_ways, mask_ways
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
@@ -127,13 +128,7 @@ def load_views(
         sizes_px=torch.tensor(sizes),
         names=names,
         masks=drawn if has_masks else None,
-        focals_px=torch.tensor(
-            [
-                header.focal_px * max(size) / max(header.width, header.height)
-                for header, size in zip(headers, sizes, strict=True)
-            ],
-            dtype=torch.float32,
-        ),
+        focals_px=shrunk_focals(headers, sizes),
         orientations=torch.tensor([header.orientation for header in headers]),
         folder=_named_path(folder),
     )
@@ -286,6 +281,18 @@ def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
         return header.width, header.height
     factor = max_size_px / longer
     return max(1, round(header.width * factor)), max(1, round(header.height * factor))
+
+
+def shrunk_focals(
+    headers: Sequence[Header], sizes: Sequence[tuple[int, int]]
+) -> Float[Tensor, " view"]:
+    """Compute focal lengths in pixels of photographs shrunk to these sizes; NaN where unknown."""
+    scales = [
+        max(size) / max(header.width, header.height)
+        for header, size in zip(headers, sizes, strict=True)
+    ]
+    focals = focals_px([header.focal for header in headers])
+    return torch.tensor(focals, dtype=torch.float32) * torch.tensor(scales)
 
 
 def _match_masks(paths: list[Path], folder: Path) -> list[Path]:

@@ -11,10 +11,12 @@ from PIL import Image
 from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
+from pimper_torch.doctor.photograph import read_all
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.photographs import list_images, load_views, read_mask
 from pimper_torch.progress import listening
-from pimper_torch.radiometry import LINEAR, linear_from_srgb, srgb_from_linear
+from pimper_torch.radiometry import FROM_FILES, LINEAR, linear_from_srgb, srgb_from_linear
+from pimper_torch.sfm.lenses import choose_lenses
 
 
 def save(path, array, **options):
@@ -92,6 +94,21 @@ def test_orientation_and_focal_length_come_from_exif(photos, pixels):
     upright = np.rot90(pixels, -1).copy()
     assert_close(views.images[1, :, :12, :8], linear_from_srgb(as_planes(upright)))
     assert views.focals_px[1].item() == pytest.approx(5000 / 3600 * 12)
+
+
+def test_photographs_of_unlike_digital_zooms_share_no_lens(tmp_path, pixels):
+    """A camera whose 35 mm equivalent leaves the digital zoom out."""
+    for number, zoom in enumerate([1, 1, 2, 2]):
+        exif = Image.Exif()
+        exif[274] = 1
+        exif.get_ifd(0x8769).update({0x920A: 4.0, 0xA404: float(zoom), 0xA405: 28})
+        save(tmp_path / f"{number}.png", pixels, exif=exif)
+    wide = 28 / np.hypot(36, 24) * np.hypot(12, 8)
+    views = load_views(tmp_path)
+    assert views.focals_px.tolist() == pytest.approx([wide, wide, 2 * wide, 2 * wide])
+    assert choose_lenses(views) == [0, 0, 1, 1]
+    photographs = read_all(list_images(tmp_path), FROM_FILES, max_size_px=6)
+    assert [one.focal_px for one in photographs] == pytest.approx((views.focals_px / 2).tolist())
 
 
 def as_planes(array):

@@ -14,7 +14,7 @@ from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import SUFFIXES, decode, read_header
 from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import shrunk_size
+from pimper_torch.io.photographs import shrunk_focals, shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Record, Truth, Views
@@ -132,16 +132,12 @@ def read_views(
         else:
             drawn = None if mask is None else _read_mask(mask)
             masks[index, :high, :wide] = resized_mask(drawn, wide, high)
-    focals = [
-        header.focal_px * max(size) / max(header.width, header.height)
-        for header, size in zip(headers, sizes, strict=True)
-    ]
     return Views(
         images=images,
         sizes_px=torch.tensor(sizes),
         names=tuple(one.name for one in photographs),
         masks=masks if has_masks else None,
-        focals_px=torch.tensor(focals, dtype=torch.float32),
+        focals_px=shrunk_focals(headers, sizes),
     )
 
 
