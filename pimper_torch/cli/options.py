@@ -1,7 +1,7 @@
 """The options of every command, and the settings of every stage as options."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -13,9 +13,10 @@ from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.lengths import CameraDistances, Markers, ScaleBars
+from pimper_torch.cli.option import options_of
 from pimper_torch.coarse.reference import view_named
-from pimper_torch.config import require
-from pimper_torch.errors import InputError
+from pimper_torch.config import presets, require
+from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.photographs import list_images
 from pimper_torch.memory import bytes_of
@@ -138,7 +139,27 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         ConfigError: No such preset, unknown or wrong arguments, or an impossible setting.
         SystemExit: ``--help`` was answered.
     """
-    preset = load_config(_preset(arguments))
+    name = _preset(arguments)
+    _refuse_others(command, arguments, name)
+    verb = _command(command, load_config(name))
+    job = read_arguments(verb, command, arguments, levels=True, rare=_RARE)
+    silhouettes = job.config.silhouettes
+    if job.inputs.object:
+        silhouettes = dataclasses.replace(silhouettes, object=job.inputs.object)
+    if job.inputs.region:
+        silhouettes = dataclasses.replace(silhouettes, region=tuple(map(float, job.inputs.region)))
+    config = dataclasses.replace(job.config, silhouettes=silhouettes)
+    if named := job.common.reference:
+        surface = dataclasses.replace(config.coarse_surface, reference=named)
+        config = dataclasses.replace(config, coarse_surface=surface)
+        if isinstance(config, PublishedConfig):
+            triangulate = dataclasses.replace(config.triangulate, reference=named)
+            config = dataclasses.replace(config, triangulate=triangulate)
+    return dataclasses.replace(job, config=config)
+
+
+def _command(name: str, preset: Config) -> Callable[..., Job]:
+    """Make the command whose parameters are the options that a preset leaves open."""
     settings: Any = type(preset)  # each chain has its own
 
     def reconstruct(
@@ -173,26 +194,28 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
         """
         return Job(photos=bundled_photographs(), out=out, common=common, config=config)
 
-    verb = reconstruct if command == "reconstruct" else demo
-    job = read_arguments(verb, command, arguments, levels=True, rare=_RARE)
-    silhouettes = job.config.silhouettes
-    if job.inputs.object:
-        silhouettes = dataclasses.replace(silhouettes, object=job.inputs.object)
-    if job.inputs.region:
-        silhouettes = dataclasses.replace(silhouettes, region=tuple(map(float, job.inputs.region)))
-    job = dataclasses.replace(job, config=dataclasses.replace(job.config, silhouettes=silhouettes))
-    if job.common.reference:
-        named = job.common.reference
-        config = job.config
-        config = dataclasses.replace(
-            config, coarse_surface=dataclasses.replace(config.coarse_surface, reference=named)
-        )
-        if isinstance(config, PublishedConfig):
-            config = dataclasses.replace(
-                config, triangulate=dataclasses.replace(config.triangulate, reference=named)
+    return reconstruct if name == "reconstruct" else demo
+
+
+def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
+    """Refuse an option that this preset lacks and others have.
+
+    Raises:
+        ConfigError: Names the option and the presets that have it.
+    """
+
+    def options(name: str) -> set[str]:
+        every = options_of(_command(command, load_config(name)))
+        return {name for option in every for name in option.names}
+
+    written = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
+    for option in sorted(written - options(preset)):
+        having = [name for name in presets() if option in options(name)]
+        if having:
+            raise ConfigError(
+                f"{option} is no option of the preset {preset}, but of {', '.join(having)}. Leave "
+                f"it out, or choose `--preset {having[0]}`."
             )
-        job = dataclasses.replace(job, config=config)
-    return job
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:

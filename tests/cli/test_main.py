@@ -172,6 +172,8 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
     ("arguments", "told"),
     [
         (["--preset", "papre"], "Did you mean `paper`?"),
+        (["--preset", "paper", "--max-memory=1GB"], "option of the preset paper, but of default"),
+        (["--triangulate.reference", "9"], "is no option of the preset default, but of "),
         (["--preset", "nowhere/mine.yaml"], "there is no such file"),
         (["--reconstruct.starts", "-1"], "starts is -1; needed: 0 or more"),
         (["--max-size-px", "-3"], "max_size_px is -3; needed: 0, or 32 pixels at least"),
