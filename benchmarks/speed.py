@@ -20,7 +20,6 @@ own, and prints the exponents of time and memory in the samples.
 import argparse
 import json
 import math
-import os
 import resource
 import statistics
 import subprocess
@@ -38,6 +37,7 @@ from PIL import Image
 
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, parse
+from pimper_torch.cores import usable_cores
 from pimper_torch.evidence.bench.machine import this_machine
 from pimper_torch.evidence.bench.memory import peak_memory
 from pimper_torch.evidence.scenes.config import SceneConfig
@@ -215,7 +215,7 @@ def photographs(target: str, renderings: Path) -> str:
     if target in SCENES and not Path(target).is_dir():
         folder = renderings / target
         if not folder.is_dir():
-            render_scene(target, folder, SceneConfig(), processes=os.cpu_count() or 1)
+            render_scene(target, folder, SceneConfig(), processes=usable_cores())
         target = str(folder)
     return str(Path(target) / "photos") if (Path(target) / "photos").is_dir() else target
 

@@ -23,6 +23,7 @@ ROOMS = [
     "errors",
     "config",
     "progress",
+    "cores",
     "file_names",
     "numpy_files",
     "kernels",

@@ -24,6 +24,7 @@ from typing import TextIO
 from pimper_torch.cli.faults import limit, write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import exit_code, stoppable
+from pimper_torch.cores import usable_cores
 from pimper_torch.errors import InputError, PimperError, PimperWarning
 from pimper_torch.outputs.names import require_name
 
@@ -154,7 +155,7 @@ def _limit_arenas() -> None:
     fourth run in one process memory grew by 2.0 %, with two of them by 0.2.
     """
     with suppress(OSError, AttributeError):  # other systems have no such function
-        ctypes.CDLL("libc.so.6").mallopt(_ARENAS, os.cpu_count() or 1)
+        ctypes.CDLL("libc.so.6").mallopt(_ARENAS, usable_cores())
 
 
 def _run(command: str, arguments: list[str], output: Output, supervised: bool) -> int:
@@ -164,6 +165,8 @@ def _run(command: str, arguments: list[str], output: Output, supervised: bool) -
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Pages of 2 MB where the system has them: a fifth of the demo's time went into 4 kB ones.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+    if usable_cores() < (os.cpu_count() or 1):  # OpenMP knows of affinity, not of quotas
+        os.environ.setdefault("OMP_NUM_THREADS", str(usable_cores()))
     _limit_arenas()
     from pimper_torch.cli.light import light
 

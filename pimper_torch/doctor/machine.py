@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from pimper_torch.cores import usable_cores
 from pimper_torch.doctor.findings import Finding
 from pimper_torch.io.version import versions
 
@@ -32,7 +33,7 @@ def machine() -> Iterator[Finding]:
     yield Finding(
         check="device",
         severity="ok",
-        found=f"{device}, {torch.get_num_threads()} threads on {os.cpu_count()} processors",
+        found=f"{device}, {torch.get_num_threads()} threads on {usable_cores()} processors",
     )
     free, total = available_gb(), total_gb()
     if free is None or total is None:

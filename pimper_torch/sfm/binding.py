@@ -1,6 +1,5 @@
 """The one place that loads pycolmap: when a function needs it, so that imports stay light."""
 
-import os
 import signal
 import sys
 import threading
@@ -50,8 +49,3 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         pycolmap.logging.minloglevel = level
-
-
-def thread_count(threads: int) -> int:
-    """Tell how many threads COLMAP runs: as many as given, or with -1 one a core."""
-    return threads if threads > 0 else (os.cpu_count() or 1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pimper_torch.progress import track
 from pimper_torch.records import Views
-from pimper_torch.sfm.binding import loaded, quiet, thread_count
+from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.workspace import Workspace
 
 # Photographs in which a thread finds features between two reports of progress.
@@ -31,7 +31,7 @@ class FeatureSettings:
         edge_threshold: Ratio of curvatures.
         max_features: In a photograph.
         affine_shape: Adapt features to slanted surfaces.
-        threads: -1 for all cores.
+        threads: At least 1.
     """
 
     camera_model: str
@@ -87,7 +87,7 @@ def find_features(
         _import(space, reader, lenses)
         with pycolmap.Database.open(space.database) as stored:
             _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
-        step = _PER_THREAD * thread_count(settings.threads)
+        step = _PER_THREAD * settings.threads
         starts = range(0, len(space.files), step)
         for start in track(starts):
             pycolmap.extract_features(

@@ -35,7 +35,7 @@ class MatchSettings:
         max_error_px: Distance from the epipolar line.
         min_inliers: Verified matches below which a pair does not count.
         seed: Of everything random.
-        threads: -1 for all cores.
+        threads: At least 1.
     """
 
     max_ratio: float

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.cores import usable_cores
 from pimper_torch.errors import (
     InputError,
     OutputError,
@@ -18,7 +19,6 @@ from pimper_torch.errors import (
 )
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.binding import thread_count
 from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
 from pimper_torch.sfm.doubt import doubt
@@ -128,6 +128,11 @@ class ReconstructConfig:
         require_at_most(self, peak_threshold=1.0, edge_threshold=1e6, max_error_px=1e6)
 
     @property
+    def num_threads(self) -> int:
+        """Threads of features and matches, at least 1."""
+        return self.threads or usable_cores()
+
+    @property
     def features(self) -> FeatureSettings:
         """What counts as a feature."""
         return FeatureSettings(
@@ -136,7 +141,7 @@ class ReconstructConfig:
             edge_threshold=self.edge_threshold,
             max_features=self.max_features,
             affine_shape=self.affine_shape,
-            threads=self.threads or -1,
+            threads=self.num_threads,
         )
 
     @property
@@ -148,7 +153,7 @@ class ReconstructConfig:
                 max_error_px=self.max_error_px,
                 min_inliers=_MIN_MATCHES,
                 seed=self.seed,
-                threads=self.threads or -1,
+                threads=self.num_threads,
             ),
             mapping=MapSettings(
                 min_inliers=_MIN_POINTS,
@@ -350,7 +355,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     lying = turned_views(views, [-quarters for quarters in turns])
     lenses = choose_lenses(lying, shared=config.shared_camera, own=config.own_cameras)
     release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
-    with workspace(lying, thread_count(config.threads or -1)) as space:
+    with workspace(lying, config.num_threads) as space:
         counts = find_features(space, config.features, _known_focals(views), lenses)
         _require_features(counts, views.names)
         release_memory()

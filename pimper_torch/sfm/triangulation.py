@@ -15,7 +15,7 @@ from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.agreement import epipolar_geometry, undistorted_pixels
-from pimper_torch.sfm.binding import loaded, quiet, thread_count
+from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
 from pimper_torch.sfm.features import FeatureSettings, find_features, too_small
 from pimper_torch.sfm.guided import NearEpipolarLines, guided_matches, read_features
@@ -101,7 +101,7 @@ def triangulate(
         _tell_nothing(0, where)
         return models[0]
     lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
-    with workspace(views, thread_count(settings.matching.threads)) as space:
+    with workspace(views, settings.matching.threads) as space:
         counts = find_features(space, settings.features, [None] * views.num_views, lenses)
         release_memory()
         if sum(count > 0 for count in counts) >= 2:

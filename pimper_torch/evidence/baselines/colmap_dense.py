@@ -14,6 +14,7 @@ from typing import Literal
 import torch
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.cores import usable_cores
 from pimper_torch.errors import MissingProgramError, ReconstructionError
 from pimper_torch.evidence.baselines.exchange import (
     estimate_of,
@@ -25,7 +26,6 @@ from pimper_torch.evidence.baselines.exchange import (
 from pimper_torch.evidence.baselines.external import (
     Deadline,
     Program,
-    all_cores,
     run_program,
     workspace,
 )
@@ -121,7 +121,7 @@ class ColmapDense(Stage):
         """
         config = self.config
         program = COLMAP.find(config.program)
-        threads = all_cores(config.threads)
+        threads = config.threads or usable_cores()
         with workspace("colmap", config.keep_in) as folder:
             names = write_photographs(scene, folder / "images", ".png")
             write_pinhole_model(scene, names, folder / "sparse")

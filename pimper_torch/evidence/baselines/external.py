@@ -187,11 +187,6 @@ def last_lines(printed: str) -> str:
     return "".join(["\nIts last lines:", *(f"\n  {line}" for line in lines)])
 
 
-def all_cores(threads: int) -> int:
-    """Read 0 threads as one for every core."""
-    return threads or os.cpu_count() or 1
-
-
 def _stop(process: subprocess.Popen[bytes]) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)

@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.cores import usable_cores
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.evidence.baselines.exchange import (
     estimate_of,
@@ -16,7 +17,6 @@ from pimper_torch.evidence.baselines.exchange import (
 from pimper_torch.evidence.baselines.external import (
     Deadline,
     Program,
-    all_cores,
     run_program,
     workspace,
 )
@@ -121,7 +121,7 @@ class _Run:
     def __init__(self, found: dict[Program, Path], folder: Path, config: OpenMvsConfig) -> None:
         self._found, self._folder, self._config = found, folder, config
         self._deadline = Deadline(config.max_minutes)
-        self._threads = all_cores(config.threads)
+        self._threads = config.threads or usable_cores()
         self._done = 0
 
     def surface(self) -> Mesh:

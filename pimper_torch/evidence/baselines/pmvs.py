@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.config import require, require_at_most
+from pimper_torch.cores import usable_cores
 from pimper_torch.evidence.baselines.exchange import (
     estimate_of,
     read_surface,
@@ -17,7 +18,6 @@ from pimper_torch.evidence.baselines.exchange import (
 from pimper_torch.evidence.baselines.external import (
     Deadline,
     Program,
-    all_cores,
     run_program,
     workspace,
 )
@@ -107,7 +107,7 @@ class Pmvs(Stage):
         """
         config = self.config
         program = PMVS2.find(config.program)
-        threads = all_cores(config.threads)
+        threads = config.threads or usable_cores()
         with workspace("pmvs", config.keep_in) as folder:
             # PPM: read by every build of PMVS2, and without loss, unlike JPEG.
             write_photographs(scene, folder / "visualize", ".ppm")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from pimper_torch.cores import usable_cores
 from pimper_torch.records import Record
 
 
@@ -56,7 +57,7 @@ def this_machine() -> Machine:
     """Describe the machine that this runs on."""
     return Machine(
         cpu=_cpu(),
-        cores=_cores(),
+        cores=usable_cores(),
         memory_gb=round(_memory_bytes() / 2**30, 1),
         gpu=torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
         system=f"{platform.system()} {platform.machine()}",
@@ -72,12 +73,6 @@ def _cpu() -> str:
         text = ""
     named = re.search(r"^model name\s*:\s*(.+)$", text, flags=re.MULTILINE)
     return named[1].strip() if named else platform.processor() or platform.machine()
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _memory_bytes() -> int:

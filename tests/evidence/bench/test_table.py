@@ -2,7 +2,6 @@ import dataclasses
 import io
 import json
 import math
-import os
 import platform
 import re
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from pimper_torch.cores import usable_cores
 from pimper_torch.errors import InputError, MissingProgramError, OutputError, ReconstructionError
 from pimper_torch.evidence.bench.machine import Machine, this_machine
 from pimper_torch.evidence.bench.rows import (
@@ -299,7 +299,7 @@ def test_a_missing_program_is_told_from_a_failure():
 
 def test_this_machine_is_described():
     machine = this_machine()
-    assert machine.cores == len(os.sched_getaffinity(0))
+    assert machine.cores == usable_cores()
     memory_kib = re.search(r"MemTotal: +(\d+) kB", Path("/proc/meminfo").read_text())[1]
     assert machine.memory_gb == pytest.approx(int(memory_kib) / 2**20, abs=0.06)  # one decimal
     assert f"torch {torch.__version__}" in machine.versions
