@@ -25,7 +25,8 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """
     job = checked(command, arguments)
     freed = clean_output(job.out)
-    output.remark(f"{job.out}: {freed / 1e6:.1f} MB freed.")
+    outcome = f"{freed / 1e6:.1f} MB freed" if freed else "nothing to remove"
+    output.remark(f"{job.out}: {outcome}.")
     output.result({"folder": job.out}, freed_bytes=freed)
 
 

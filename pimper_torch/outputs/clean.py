@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pimper_torch.errors import OutputError
 from pimper_torch.outputs.marker import STAGES, read_marker
-from pimper_torch.outputs.stages import is_ours, locked, remove_stages
+from pimper_torch.outputs.stages import is_ours, kept, locked, remove_stages
 from pimper_torch.outputs.workspace import finish, leftovers, remove_leftovers, restore
 
 
@@ -21,8 +21,8 @@ def require_cleanable(folder: Path | str) -> None:
     if target.exists() and not target.is_dir():
         raise OutputError(f"{folder}: is a file; needed: the folder of a result.")
     stages = target / STAGES
-    kept = stages.is_dir() and is_ours(stages)
-    if not (kept or read_marker(target) is not None or leftovers(target)):
+    held = is_ours(stages) and any(stages.iterdir())
+    if not (held or read_marker(target) is not None or leftovers(target)):
         found = "nothing that pimper wrote" if target.exists() else "nothing"
         raise OutputError(
             f"{folder}: found {found}; needed: the folder that was given as `-o OUT` to a run."
@@ -51,7 +51,8 @@ def clean_output(folder: Path | str) -> int:
         restore(target)
         with locked(target, folder):
             finish(target)
-            freed = _size(target / STAGES) + sum(_size(one) for one in leftovers(target))
+            freed = _size(target / STAGES) if kept(target) else 0  # more than its lock
+            freed += sum(_size(one) for one in leftovers(target))
             remove_leftovers(target)
             remove_stages(target)
         if not was_there and not any(target.iterdir()):

@@ -49,7 +49,7 @@ def test_what_a_killed_run_kept_and_left_is_removed(tmp_path, capsys, former):
     if former:
         assert (out / "mesh.ply").read_text() == "whole"
         assert main(["clean", str(out)]) == 0  # again: there is nothing to remove
-        assert "0.0 MB freed" in capsys.readouterr().out
+        assert "out: nothing to remove." in capsys.readouterr().out
 
 
 def test_leftovers_are_found_where_the_folder_is_gone(tmp_path):
@@ -61,14 +61,16 @@ def test_leftovers_are_found_where_the_folder_is_gone(tmp_path):
     assert held(tmp_path) == []
 
 
-@pytest.mark.parametrize("name", ["mine", "nowhere", "file", "mine/.stages"])
+@pytest.mark.parametrize("name", ["mine", "nowhere", "file", "mine/.stages", "empty"])
 def test_a_folder_that_is_not_ours_is_refused(tmp_path, name):
+    (tmp_path / "empty" / STAGES).mkdir(parents=True)
     (tmp_path / "mine" / STAGES).mkdir(parents=True)
     (tmp_path / "mine" / STAGES / "act_one.txt").write_text("a play")
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="needed: the folder"):
         clean_output(tmp_path / name)
     assert (tmp_path / "mine" / STAGES / "act_one.txt").exists()
+    assert (tmp_path / "empty" / STAGES).exists()
 
 
 def test_a_folder_that_is_held_is_refused(tmp_path):
