@@ -1,5 +1,6 @@
 """Cameras of Agisoft Metashape (PhotoScan): the XML that "Export Cameras" writes."""
 
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from pimper_torch.camera_files.layout import expect, numbers
 from pimper_torch.camera_files.posed_camera import PosedCamera, rigid_or_refuse
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, caution, some
 from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.records import Lens
 
@@ -26,7 +27,9 @@ def read_metashape_cameras(path: Path) -> list[PosedCamera]:
     added along x; ``cx``, ``cy`` from (width / 2, height / 2) in a frame whose top-left pixel
     has its centre at (0.5, 0.5), as ours; ``p1`` and ``p2`` the other way round than OpenCV.
 
-    Cameras without a transform are not aligned and left out, as are those switched off.
+    Cameras without a transform are not aligned and left out, as are those switched off. Chunks, and
+    components of one, have frames of their own: of several chunks with such cameras one has to be
+    exported, of several components the largest is read, with a warning.
 
     Raises:
         InputError: The file is something else, defines entities, or describes a lens or rig
@@ -37,14 +40,13 @@ def read_metashape_cameras(path: Path) -> list[PosedCamera]:
         str(sensor.get("id")): (sensor, number)
         for number, sensor in enumerate(chunk.iterfind("sensors//sensor"), start=1)
     }
-    cameras = []
     for camera in chunk.iterfind("cameras//camera"):
-        label = str(camera.get("label"))
         rig = camera.get("master_id") not in (None, camera.get("id"))
-        expect(not rig, path, KIND, f"a transform of its own for {label}", "a camera of a rig")
-        placed = camera.find("transform")
-        if placed is None or camera.get("enabled") in ("0", "false"):
-            continue
+        what = f"a transform of its own for {camera.get('label')}"
+        expect(not rig, path, KIND, what, "a camera of a rig")
+    cameras = []
+    for camera in _component(_placed(chunk), path):
+        label = str(camera.get("label"))
         sensor = lenses.get(str(camera.get("sensor_id")))
         expect(sensor is not None, path, KIND, f"the sensor of {label}", "no such sensor")
         assert sensor is not None
@@ -86,14 +88,39 @@ def parse_without_entities(path: Path, kind: str) -> ElementTree.Element:
 def _chunk(path: Path) -> ElementTree.Element:
     root = parse_without_entities(path, KIND)
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
-    expect(
-        len(chunks) == 1,
-        path,
-        KIND,
-        "a document of one chunk",
-        f"<{root.tag}> with {len(chunks)} chunks",
+    expect(bool(chunks), path, KIND, "a document of one chunk", f"<{root.tag}> without one")
+    aligned = [chunk for chunk in chunks if _placed(chunk)] or chunks
+    if len(aligned) > 1:
+        told = [f"{chunk.get('label')} ({len(_placed(chunk))} cameras)" for chunk in aligned]
+        raise InputError(
+            f"{path}: has {len(aligned)} chunks: {some(told)}; needed: one, as each has a frame of "
+            "its own. Export the cameras of the chunk that is meant, or merge the chunks."
+        )
+    return aligned[0]
+
+
+def _placed(chunk: ElementTree.Element) -> list[ElementTree.Element]:
+    """Find the cameras that are aligned and switched on."""
+    return [
+        camera
+        for camera in chunk.iterfind("cameras//camera")
+        if camera.find("transform") is not None and camera.get("enabled") not in ("0", "false")
+    ]
+
+
+def _component(cameras: list[ElementTree.Element], path: Path) -> list[ElementTree.Element]:
+    """Choose the cameras of the component that has most."""
+    sizes = Counter(camera.get("component_id") for camera in cameras).most_common()
+    if len(sizes) < 2:
+        return cameras
+    (largest, size), *rest = sizes
+    caution(
+        f"{path}: its cameras are in {len(sizes)} components, each in a frame of its own; read is "
+        f"that of {size} cameras, not {some([f'that of {count}' for _, count in rest])}. Align "
+        "them in Metashape for all.",
+        stacklevel=4,
     )
-    return chunks[0]
+    return [camera for camera in cameras if camera.get("component_id") == largest]
 
 
 def _cam_from_world(

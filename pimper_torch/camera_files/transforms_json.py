@@ -8,6 +8,7 @@ import torch
 
 from pimper_torch.camera_files.layout import expect, numbers, objects, read_json
 from pimper_torch.camera_files.posed_camera import PosedCamera, SizesOf, rigid_or_refuse
+from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.records import Lens
 
@@ -121,9 +122,19 @@ def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], path
             return default
         return float(numbers(given, 1, f"{key} of {name}", path, KIND))
 
+    def focal_px(axis: str, side_px: float) -> float:
+        stated_px, angle = value(f"fl_{axis}"), value(f"camera_angle_{axis}")
+        if stated_px > 0 or angle <= 0:
+            return max(stated_px, 0.0)
+        if angle >= math.pi:
+            raise InputError(
+                f"{path}: camera_angle_{axis} of {name} is {angle:g}; needed: radians, below pi. "
+                f"If these are degrees, write {math.radians(angle):.6g}."
+            )
+        return side_px / 2 / math.tan(angle / 2)
+
     width, height = size_px
-    focal = _focal(value("fl_x"), value("camera_angle_x"), width)
-    focal_y = _focal(value("fl_y"), value("camera_angle_y"), height)
+    focal, focal_y = focal_px("x", width), focal_px("y", height)
     expect(
         focal > 0 or focal_y > 0,
         path,
@@ -144,9 +155,3 @@ def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], path
         if any((k1, k2, k3, p1, p2)):
             kind, params = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return Lens(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)
-
-
-def _focal(focal_px: float, angle: float, side_px: float) -> float:
-    if focal_px > 0 or not 0 < angle < math.pi:
-        return max(focal_px, 0.0)
-    return side_px / 2 / math.tan(angle / 2)

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.datasets.metashape import read_metashape
 
 # `hand_camera` from camera to chunk, row by row: columns are its right, down, forward, place.
@@ -109,13 +109,32 @@ def test_the_lens_is_that_of_the_manual(save, lens_of, kind, terms, x, y):
         ({"transform": TRANSFORM.replace("0 0 1 -4", "0 0 -1 -4")}, "a reflection"),
         ({"b": ' master_id="0"'}, "a camera of a rig"),
         ({"component": "<transform><scale>0</scale></transform>"}, "a positive scale"),
-        ({"chunk": "</chunk><chunk>"}, "with 2 chunks"),
         ({"chunk": "<"}, "cannot be read as XML"),
     ],
 )
 def test_another_file_is_refused(save, pieces, needed):
     with pytest.raises(InputError, match=needed):
         read_metashape(save(**pieces))
+
+
+def test_of_several_chunks_with_cameras_none_is_guessed(save):
+    camera = '<camera sensor_id="0" label="z"><transform/></camera>'
+    other = f'</chunk><chunk label="roof"><cameras>{camera}</cameras>'
+    told = r"has 2 chunks: Chunk 1 \(2 cameras\), roof \(1 cameras\); needed: one.*Export the"
+    with pytest.raises(InputError, match=told):
+        read_metashape(save(chunk=other))
+    unaligned = other.replace("<transform/>", "")
+    assert read_metashape(save(chunk=unaligned)).views.names == ("a.png", "b.png")
+
+
+def test_of_several_components_the_largest_is_read(save):
+    third = f'<camera sensor_id="0" component_id="1" label="d"><transform>{TRANSFORM}</transform>'
+    folder = save()
+    text = (folder / "cameras.xml").read_text().replace("</cameras>", f"{third}</camera></cameras>")
+    (folder / "cameras.xml").write_text(text)
+    told = "2 components, each in a frame of its own; read is that of 2 cameras, not that of 1"
+    with pytest.warns(PimperWarning, match=told):
+        assert read_metashape(folder).views.names == ("a.png", "b.png")
 
 
 def test_a_label_without_a_photograph_is_refused(save):

@@ -115,6 +115,10 @@ def test_a_fisheye_bends_by_the_angle(save, lens_of):
         ({"k4": 0.1}, "k4 = 0"),
         ({"k1": "much"}, "1 finite number as k1"),
         ({"fl_x": 0, "fl_y": 0}, "fl_x or camera_angle_x"),
+        (
+            {"fl_x": 0, "fl_y": 0, "camera_angle_x": 90},
+            r"camera_angle_x of .* is 90; needed: radians, below pi\. .* write 1\.5708\.",
+        ),
     ],
 )
 def test_a_frame_of_anything_else_is_refused(save, more, needed):
