@@ -7,12 +7,13 @@ import torch
 from PIL import Image
 
 from pimper_torch.camera_files.read_cameras import read_cameras
-from pimper_torch.errors import InputError, ReconstructionError, some
+from pimper_torch.errors import InputError, ReconstructionError, caution, some
 from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel, match_names
+from pimper_torch.sfm.model_files import names_by_folder
 from pimper_torch.sfm.orientation import find_turns, possible_turns
 from pimper_torch.sfm.quarter_turns import (
     turned_lens,
@@ -32,7 +33,8 @@ def existing_model(views: Views, path: Path) -> SparseModel:
     Args:
         views: Matched by file name; cameras may have been made from photographs of another size,
             and from the pixels that files store where EXIF turns them.
-        path: Folder of a COLMAP model, or a file of cameras, see
+        path: Folder of a COLMAP model, or of several in folders, of which the one with most of the
+            photographs is read; or a file of cameras, see
             :func:`~pimper_torch.camera_files.read_cameras.read_cameras`.
 
     Raises:
@@ -49,6 +51,7 @@ def existing_ways(views: Views, path: Path) -> list[SparseModel]:
         One model where the points tell how photographs are turned, or nothing turns them; else
         that of the photographs as they stand, and that of the pixels that files store.
     """
+    path = _largest(views, path)
     where = place(path)
     read = _model_of_file(views, path) if path.is_file() else colmap.read_model(path)
     model = match_names(read, views.names, where, views.folder)
@@ -62,6 +65,26 @@ def existing_ways(views: Views, path: Path) -> list[SparseModel]:
     if len(model.points_world):
         return [follow_pictures(model, shown, find_turns(model, shown, where))]
     return [follow_pictures(model, shown, turns) for turns in possible_turns(model, shown)]
+
+
+def _largest(views: Views, folder: Path) -> Path:
+    """Choose the model of most of the photographs where a folder holds several, each in its own."""
+    found = {
+        path: match_files(views.names, names, folder=views.folder, where=str(path), what="image")
+        for path, names in names_by_folder(folder).items()
+    }
+    counts = {path: len(views.names) - matches.count(None) for path, matches in found.items()}
+    if not counts:
+        return folder
+    largest = max(counts, key=lambda path: counts[path])
+    others = [f"{path.name} ({count})" for path, count in counts.items() if path != largest]
+    if others:
+        caution(
+            f"{folder} holds {len(counts)} COLMAP models, each in a frame of its own; read is "
+            f"{largest.name}, of {counts[largest]} of {views.num_views} photographs, not "
+            f"{some(others)}. Point to another one if that is meant."
+        )
+    return largest
 
 
 def place(path: Path) -> str:

@@ -114,20 +114,40 @@ def read_files(folder: Path) -> FileModel:
         InputError: The folder holds no such files; or one is cut short, says that it holds more
             than it has room for, or is of another format.
     """
-    parts = ("cameras", "images", "points3D")
-    for ending in (".bin", ".txt"):
-        paths = [folder / f"{part}{ending}" for part in parts]
-        if all(path.is_file() for path in paths):
-            cameras, images, points = _BINARY if ending == ".bin" else _TEXT
-            return FileModel(
-                cameras=_read(paths[0], cameras, folder),
-                images=_read(paths[1], images, folder),
-                points=_read(paths[2], points, folder),
-            )
-    raise InputError(
-        f"{folder} holds no COLMAP model: needed are cameras, images and points3D, all .bin "
-        "or all .txt. Point to the folder that has them, often named sparse/0."
+    ending = _ending(folder)
+    if ending is None:
+        raise InputError(
+            f"{folder} holds no COLMAP model: needed are cameras, images and points3D, all .bin "
+            "or all .txt. Point to the folder that has them, often named sparse/0."
+        )
+    cameras, images, points = _PARSERS[ending]
+    return FileModel(
+        cameras=_read(folder / f"cameras{ending}", cameras, folder),
+        images=_read(folder / f"images{ending}", images, folder),
+        points=_read(folder / f"points3D{ending}", points, folder),
     )
+
+
+def names_by_folder(folder: Path) -> dict[Path, list[str]]:
+    """Read the names of images of the models in folders of a folder that holds none itself.
+
+    Raises:
+        InputError: A file of images cannot be read.
+    """
+    folders = sorted(folder.iterdir()) if folder.is_dir() and not _ending(folder) else []
+    endings = {path: ending for path in folders if (ending := _ending(path))}
+    return {
+        path: [image.name for image in _read(path / f"images{ending}", _PARSERS[ending][1], path)]
+        for path, ending in endings.items()
+    }
+
+
+def _ending(folder: Path) -> str | None:
+    """Find how the three files of a model end; ``None`` where one is missing."""
+    for ending in _PARSERS:
+        if all((folder / f"{part}{ending}").is_file() for part in _PARTS):
+            return ending
+    return None
 
 
 class _Broken(Exception):  # noqa: N818 - what is broken, to be told with the name of the file
@@ -352,5 +372,8 @@ def _text_points(data: bytes) -> FilePoints:
     )
 
 
-_BINARY = (_binary_cameras, _binary_images, _binary_points)
-_TEXT = (_text_cameras, _text_images, _text_points)
+_PARTS = ("cameras", "images", "points3D")
+_PARSERS = {
+    ".bin": (_binary_cameras, _binary_images, _binary_points),
+    ".txt": (_text_cameras, _text_images, _text_points),
+}

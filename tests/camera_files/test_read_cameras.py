@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.records import Cameras, Views
@@ -41,9 +41,11 @@ def views_of(scale: float = 1.0, folder: Path | None = None) -> Views:
     )
 
 
-def of_colmap(rig: Cameras, folder: Path, *, text: bool = False) -> Path:
+def of_colmap(
+    rig: Cameras, folder: Path, *, text: bool = False, names: tuple[str, ...] = NAMES
+) -> Path:
     model = SparseModel(
-        names=NAMES,
+        names=names,
         lenses=colmap.pinhole_lenses(rig),
         cam_from_world=rig.cam_from_world,
         points_world=torch.zeros(0, 3, dtype=torch.float64),
@@ -189,6 +191,28 @@ def test_every_file_gives_the_same_cameras(rig, write, tmp_path):
     assert_close(found.cam_from_world, expected.cam_from_world, rtol=0, atol=1e-6)
     assert_close(pinholes_for(found.lenses), expected.intrinsics, rtol=0, atol=1e-6)
     assert [(lens.width, lens.height) for lens in found.lenses] == [(WIDTH, HEIGHT)] * 3
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_of_several_models_in_a_folder_the_one_of_most_photographs_is_read(rig, text, tmp_path):
+    others = ("x.png", "y.png", "z.png")  # of photographs that are elsewhere
+    for number, names in (("0", ("2.png", *others)), ("1", NAMES), ("10", (*others, "10.png"))):
+        cameras = rig.take(torch.zeros(len(names), dtype=torch.long)) if number != "1" else rig
+        of_colmap(cameras, tmp_path, text=text, names=names).rename(tmp_path / number)
+    told = r"3 COLMAP models, .* read is 1, of 3 of 3 photographs, not 0 \(1\), 10 \(1\)\. Point to"
+    with pytest.warns(PimperWarning, match=told):
+        found = existing_model(views_of(), tmp_path)
+    assert found.names == NAMES
+    assert_close(found.cam_from_world, rig.cam_from_world, rtol=0, atol=1e-6)
+    assert existing_model(views_of(), tmp_path / "1").names == NAMES  # it alone: no warning
+
+
+def test_a_folder_of_one_model_is_read_without_a_word(rig, tmp_path):
+    of_colmap(rig, tmp_path / "sparse")
+    assert existing_model(views_of(), tmp_path / "sparse").names == NAMES
+    of_colmap(rig.take(torch.tensor([0])), tmp_path, names=("2.png",)).rename(tmp_path / "old")
+    (tmp_path / "old").rename(tmp_path / "sparse" / "model" / "old")  # beside the model itself
+    assert existing_model(views_of(), tmp_path / "sparse" / "model").names == NAMES
 
 
 @pytest.mark.parametrize("write", [of_colmap, of_metashape, of_meshroom, of_transforms])
