@@ -15,7 +15,7 @@ from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageErr
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.io.extras import is_heic, is_raw
+from pimper_torch.io.extras import extra_of, format_of
 from pimper_torch.io.focal_lengths import FocalLength, focal_from_exif
 from pimper_torch.io.heic import read_heic, read_heic_head
 from pimper_torch.io.icc import read_profile
@@ -119,9 +119,10 @@ def read_header(path: Path | str) -> Header:
             is too large to be a photograph, or needs a package that is not installed.
     """
     path = Path(path)
-    if is_heic(path):
+    extra = extra_of(path)
+    if extra == "heic":
         return _guarded(path, lambda: _header_of_heic(path))
-    if is_raw(path):
+    if extra == "raw":
         return _guarded(path, lambda: _header_of_raw(path))
 
     def read(image: Image.Image) -> Header:
@@ -227,9 +228,10 @@ def decode(path: Path | str) -> Decoded:
     """
     path = Path(path)
     header = read_header(path)
-    if is_heic(path):
+    extra = extra_of(path)
+    if extra == "heic":
         array = _guarded(path, lambda: read_heic(path))
-    elif is_raw(path):
+    elif extra == "raw":
         array = rotated(_guarded(path, lambda: read_raw(path)), header.orientation)
     elif header.deep:
         array = rotated(_read_deep(path, header.layout), header.orientation)
@@ -252,7 +254,7 @@ def decode(path: Path | str) -> Decoded:
     return Decoded(
         samples=planes[:-1] if has_alpha else planes,
         alpha=planes[-1] if has_alpha else None,
-        lossy=path.suffix.lower() in (".jpg", ".jpeg") or is_heic(path),
+        lossy=format_of(path) in ("JPEG", "HEIC"),
         full=full,
         full_told=header.full_told,
         colour=header.colour,
@@ -411,9 +413,11 @@ def _unidentified(path: Path) -> InputError:
         return _unfit(path, found)
     if found:
         return InputError(f"{path}: {found}")
+    name = format_of(path)
+    content = f", but {name}" if name and name not in _FORMATS else ""
     return InputError(
-        f"{path}: holds no JPEG, PNG or TIFF image that can be read. Convert it, or take it out of "
-        "the folder."
+        f"{path}: holds no JPEG, PNG or TIFF image that can be read{content}. Convert it, or take "
+        "it out of the folder."
     )
 
 

@@ -1,5 +1,6 @@
 """Formats that need a package more than the others, which may be absent."""
 
+import re
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,31 +13,51 @@ RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2"),
     *(".pef", ".srw", ".3fr", ".iiq", ".rwl"),
 )
-# Of each extra: its name for people, the suffixes, and the modules any of which will do.
+# Of each extra: its name for people, and the modules any of which will do.
 _EXTRAS = {
-    "heic": ("a HEIC image", HEIC_SUFFIXES, ("pi_heif", "pillow_heif")),
-    "raw": ("camera raw", RAW_SUFFIXES, ("rawpy",)),
+    "heic": ("a HEIC image", ("pi_heif", "pillow_heif")),
+    "raw": ("camera raw", ("rawpy",)),
+}
+# How files begin. Most camera raw begins as TIFF does.
+_STARTS = {
+    "JPEG": rb"\xff\xd8\xff",
+    "PNG": rb"\x89PNG",
+    "TIFF": rb"II[*+]\0|MM\0[*+]",
+    "HEIC": rb".{4}ftyp(he|mif1|msf1)",
+    "CR3": rb".{4}ftypcrx",
+    "AVIF": rb".{4}ftypavi",
+    "MP4": rb".{4}ftyp",
+    "GIF": rb"GIF8",
+    "WebP": rb"RIFF.{4}WEBP",
+    "PSD": rb"8BPS",
+    "PDF": rb"%PDF",
 }
 
 
-def is_heic(path: Path | str) -> bool:
-    """Tell HEIC by its suffix."""
-    return Path(path).suffix.lower() in HEIC_SUFFIXES
+def format_of(path: Path | str) -> str:
+    """Return the name of a file's format by its first bytes; empty where they tell none."""
+    try:
+        with Path(path).open("rb") as file:
+            start = file.read(16)
+    except OSError:
+        return ""
+    return next((name for name, mark in _STARTS.items() if re.match(mark, start, re.DOTALL)), "")
 
 
-def is_raw(path: Path | str) -> bool:
-    """Tell camera raw by its suffix."""
-    return Path(path).suffix.lower() in RAW_SUFFIXES
+def extra_of(path: Path | str) -> str:
+    """Return the extra that reads a file, ``heic`` or ``raw``; empty where none is needed.
+
+    The content tells, not the suffix, unless it is a TIFF's or tells nothing.
+    """
+    name, suffix = format_of(path), Path(path).suffix.lower()
+    if name == "CR3" or (suffix in RAW_SUFFIXES and name in ("TIFF", "")):
+        return "raw"
+    return "heic" if name == "HEIC" or (suffix in HEIC_SUFFIXES and not name) else ""
 
 
-def installed_suffixes() -> tuple[str, ...]:
-    """Give the suffixes of formats whose package is there."""
-    return tuple(
-        suffix
-        for _, suffixes, modules in _EXTRAS.values()
-        for suffix in suffixes
-        if any(_is_there(name) for name in modules)
-    )
+def is_installed(extra: str) -> bool:
+    """Tell whether a package of an extra is there."""
+    return any(_is_there(name) for name in _EXTRAS[extra][1])
 
 
 def load_extra(extra: str, path: Path | str) -> ModuleType:
@@ -45,7 +66,7 @@ def load_extra(extra: str, path: Path | str) -> ModuleType:
     Raises:
         InputError: It is not installed; says how to.
     """
-    kind, _, modules = _EXTRAS[extra]
+    kind, modules = _EXTRAS[extra]
     for name in modules:
         if _is_there(name):
             return import_module(name)

@@ -3,7 +3,7 @@
 import os
 import re
 import warnings
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError, PimperWarning, some
+from pimper_torch.errors import InputError, PimperWarning, caution, some
 from pimper_torch.file_names import match_files
 from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header
-from pimper_torch.io.extras import installed_suffixes, is_heic, is_raw, load_extra
+from pimper_torch.io.extras import HEIC_SUFFIXES, RAW_SUFFIXES, extra_of, is_installed, load_extra
 from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.focal_lengths import focals_px
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
@@ -41,7 +41,10 @@ _PICTURES = re.compile(
 )
 _VIDEO = re.compile(r"\.(mp4|mov|avi|mkv|m4v|webm|mts)", re.IGNORECASE)
 
-_MORE = "HEIC and camera raw where no other is of the same name and their extras are installed"
+# Which of several files of one name is read: the extra that they need; least first.
+_RANKS = {"raw": 0, "": 1, "heic": 2}
+_DEVELOPED = (".png", ".tif", ".tiff")
+_MORE = "HEIC and camera raw where their extras are installed"
 
 
 def load_views(
@@ -55,7 +58,7 @@ def load_views(
     """Read the photographs of a folder, in the natural order of their names.
 
     JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette, HEIC and camera raw where their
-    extras are installed; links are followed. Other files,
+    extras are installed, of one photograph raw before JPEG; links are followed. Other files,
     hidden ones and folders inside are passed over, with a warning where they look like
     photographs. EXIF's orientation is applied, its focal length kept in pixels. The response is
     undone, so that radiance is linear: the one given, else the one that each file tells by its ICC
@@ -176,24 +179,31 @@ def list_images(folder: Path | str) -> list[Path]:
 
 
 def _readable(entries: Sequence[Path]) -> list[Path]:
-    """Choose the image files; HEIC and camera raw beside a JPEG of the same name are passed over.
+    """Choose the image files, one of those that a camera writes of one photograph.
 
-    Cameras and telephones write both of one photograph.
+    Camera raw goes before JPEG, and JPEG, PNG or TIFF before HEIC; PNG and TIFF beside raw are
+    taken for developed on purpose.
     """
-    files = [path for path in entries if path.is_file()]
-    plain = [path for path in files if path.suffix.lower() in SUFFIXES]
-    stems, more = {path.stem.casefold() for path in plain}, installed_suffixes()
-    others = [
-        path for path in files if path.suffix.lower() in more and path.stem.casefold() not in stems
-    ]
-    return plain + others
+    ranks: dict[str, dict[Path, int]] = defaultdict(dict)
+    for path in entries:
+        suffix = path.suffix.lower()
+        if suffix in (*SUFFIXES, *HEIC_SUFFIXES, *RAW_SUFFIXES) and path.is_file():
+            extra = "" if suffix in SUFFIXES else extra_of(path)
+            if not extra or is_installed(extra):
+                ranks[path.stem.casefold()][path] = _RANKS[extra]
+    chosen: list[Path] = []
+    for twins in ranks.values():
+        developed = any(path.suffix.lower() in _DEVELOPED for path in twins)
+        best = max(min(twins.values()), _RANKS[""] if developed else 0)
+        chosen += [path for path, rank in twins.items() if rank == best]
+    return chosen
 
 
 def _refuse_absent(entries: Sequence[Path]) -> None:
     """Name the package that a folder of nothing but HEIC or camera raw needs."""
     for path in sorted(entries):
-        if path.is_file() and (is_heic(path) or is_raw(path)):
-            load_extra("heic" if is_heic(path) else "raw", path)
+        if path.is_file() and (extra := extra_of(path)):
+            load_extra(extra, path)
 
 
 def _refuse_video(entries: Sequence[Path]) -> None:
@@ -209,8 +219,11 @@ def _refuse_video(entries: Sequence[Path]) -> None:
 def _tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
     """Warn of what looks like photographs and is not read, kind by kind with its count."""
     names = {path.name for path in read}
+    raw = {path.stem.casefold() for path in read if extra_of(path) == "raw"}
     kinds: Counter[str] = Counter()
     examples: list[str] = []
+    twins: list[str] = []
+    lacking: set[str] = set()
     for path in sorted(folder.iterdir()):
         suffix = path.suffix.lower()
         if path.name.startswith(".") or path.name in names:
@@ -219,19 +232,33 @@ def _tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
             kind = "broken link"
         elif path.is_dir():
             kind = "folder of images" if _holds_images(path) else ""
+        elif path.stem.casefold() in raw and suffix in (*SUFFIXES, *HEIC_SUFFIXES):
+            twins.append(path.name)
+            continue
         else:
             known = _PICTURES.fullmatch(suffix) or _VIDEO.fullmatch(suffix)
             kind = suffix[1:].upper() if known else ""
+            extra = extra_of(path) if known else ""
+            if extra and not is_installed(extra):
+                lacking.add(extra)
         if kind:
             kinds[kind] += 1
             examples.append(path.name)
+    if twins:
+        caution(
+            f"{folder}: {some(twins)} were not read, as camera raw of the same names was. Move the "
+            "raw away to read them.",
+            stacklevel=3,
+        )
     if kinds:
         counts = ", ".join(f"{kind} ({count})" for kind, count in kinds.items())
-        warnings.warn(
+        hint = "".join(
+            f' `pip install "pimper_torch[{extra}]"` reads {extra}.' for extra in sorted(lacking)
+        )
+        caution(
             f"{folder}: these were not read: {counts}; {some(examples)}. Read are files ending in "
-            f"{', '.join(SUFFIXES)}, {_MORE}, not those in folders inside. Convert or move what "
-            "belongs to the photographs.",
-            PimperWarning,
+            f"{', '.join(SUFFIXES)}, {_MORE}, not those in folders inside.{hint} Convert or move "
+            "what belongs to the photographs.",
             stacklevel=3,
         )
 

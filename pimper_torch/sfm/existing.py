@@ -150,7 +150,8 @@ def _stored_size(views: Views, view: int) -> tuple[int, int]:
         return width, height
     try:
         with Image.open(Path(views.folder) / views.names[view]) as picture:
-            return picture.size
+            # In camera raw it may be the preview.
+            return picture.size if max(picture.size) >= max(width, height) else (width, height)
     except (OSError, ValueError, Image.DecompressionBombError):
         return width, height
 

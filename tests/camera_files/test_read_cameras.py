@@ -235,6 +235,22 @@ def test_a_file_without_sizes_is_for_the_photographs_as_their_files_are(rig, wri
     assert_close(K[:, :2], rig.intrinsics[:, :2] / 2, rtol=0, atol=1e-6)
 
 
+def test_a_file_without_sizes_is_not_for_the_preview_in_raw(rig, tmp_path):
+    for name in NAMES:  # Pillow reads of a NEF its first picture, of 160 x 120
+        Image.new("L", (WIDTH // 4, HEIGHT // 4)).save(tmp_path / name)
+    found = existing_model(views_of(1.0, tmp_path), of_matrices(rig, tmp_path))
+    assert_close(pinholes_for(found.lenses), rig.intrinsics, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".CR2", ".dng", ".heic"])
+def test_a_model_of_jpegs_is_that_of_raw_photographs_of_the_same_names(rig, suffix, tmp_path):
+    jpegs = tuple(name.replace(".png", ".JPG") for name in NAMES)
+    views = views_of().replace(names=tuple(name.replace(".png", suffix) for name in NAMES))
+    found = existing_model(views, of_colmap(rig, tmp_path, names=jpegs))
+    assert found.names == views.names
+    assert_close(found.cam_from_world, rig.cam_from_world, rtol=0, atol=1e-6)
+
+
 def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
     K = rig.intrinsics.clone()
     K[:, 0, 1] = 1e-3

@@ -11,7 +11,6 @@ from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.decode import decode, read_header, rotated
 from pimper_torch.io.photographs import list_images, load_views
 from pimper_torch.radiometry import Encoding, Linear, srgb_from_linear
-from pimper_torch.radiometry.srgb import linear_from_srgb
 from tests.io.dng import XYZ_TO_CAMERA, write_dng
 
 SRGB_TO_XYZ = torch.tensor(
@@ -162,15 +161,25 @@ def test_a_response_that_is_given_wins_over_raw_too(folder):
         load_views(folder, encoding=Encoding(response="srgb"))
 
 
-def test_raw_beside_a_jpeg_of_the_same_name_is_passed_over(folder, colours):
-    picture = (255 * srgb_from_linear(colours)).round().to(torch.uint8).movedim(0, -1).numpy()
-    for index in range(3):
-        Image.fromarray(picture).save(folder / f"{index}.jpg", quality=100)
-    assert [path.suffix for path in list_images(folder)] == [".jpg"] * 3
-    with pytest.warns(PimperWarning, match=r"were not read: DNG \(3\)"):
-        found = load_views(folder).images[0]
-    wanted = linear_from_srgb(torch.from_numpy(picture / 255).movedim(-1, 0)).float()
-    assert float((found - wanted).abs().mean()) < 0.01
+def test_raw_is_read_and_the_jpeg_of_the_same_photograph_passed_over(folder, pixels):
+    raw = load_views(folder)
+    for name in ("0.jpg", "1.JPG", "2.jpeg"):
+        Image.fromarray(pixels).save(folder / name)
+    told = r"0\.jpg, 1\.JPG, 2\.jpeg were not read, as camera raw of the same names was\."
+    with pytest.warns(PimperWarning, match=told) as warned:
+        beside = load_views(folder)
+    assert len(warned) == 1
+    assert beside.names == ("0.dng", "1.dng", "2.dng")
+    assert torch.equal(beside.images, raw.images)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_what_was_developed_from_raw_is_read_in_its_place(folder, pixels, suffix):
+    Image.fromarray(pixels).save(folder / f"1.{suffix}")
+    assert [path.name for path in list_images(folder)] == ["0.dng", f"1.{suffix}", "2.dng"]
+    Image.fromarray(pixels).save(folder / "1.jpg")
+    with pytest.raises(InputError, match="differ only in their suffix"):
+        list_images(folder)
 
 
 def test_raw_and_jpeg_of_other_names_are_one_set(folder, colours):
@@ -192,9 +201,10 @@ def test_without_its_package_raw_is_refused_with_what_to_install(folder, monkeyp
     with pytest.raises(InputError, match=r'pip install "pimper_torch\[raw\]"'):
         read_header(folder / "1.dng")
     for index in range(3):  # with others, it is passed over with a word
-        Image.fromarray(pixels).save(folder / f"p{index}.png")
-    with pytest.warns(PimperWarning, match=r"were not read: DNG \(3\).*their extras"):
-        assert load_views(folder).num_views == 3
+        Image.fromarray(pixels).save(folder / f"{index}.jpg")
+    told = r'were not read: DNG \(3\).* `pip install "pimper_torch\[raw\]"` reads raw\.'
+    with pytest.warns(PimperWarning, match=told):
+        assert load_views(folder).names == ("0.jpg", "1.jpg", "2.jpg")
 
 
 def test_damaged_and_huge_raw_is_refused_by_name(tmp_path, colours, monkeypatch):
