@@ -49,7 +49,7 @@ class RawHead:
     """What a raw file says without its samples.
 
     Attributes:
-        width: Pixels as the sensor has them.
+        width: Pixels of the camera's own picture, as the sensor lies.
         height: Pixels.
         orientation: EXIF's number.
         gray: A sensor without colours.
@@ -75,7 +75,7 @@ def read_raw_head(path: Path | str) -> RawHead:
     """
     path = Path(path)
     with _opened(path) as raw:
-        sizes = raw.sizes
+        rows, columns = _shown(raw)
         if raw.num_colors not in (1, 3):
             raise InputError(
                 f"{path}: its sensor has {raw.num_colors} colours; needed: red, green and blue. "
@@ -85,9 +85,9 @@ def read_raw_head(path: Path | str) -> RawHead:
         matrix = None if gray else _srgb_from_sensor(raw)
         unknown = not gray and matrix is None
         return RawHead(
-            width=sizes.width,
-            height=sizes.height,
-            orientation=_ORIENTATION.get(sizes.flip, 1),
+            width=columns.stop - columns.start,
+            height=rows.stop - rows.start,
+            orientation=_ORIENTATION.get(raw.sizes.flip, 1),
             gray=gray,
             exif=_exif(path, raw),
             colour=Colour(source=_SOURCE, response=Linear(), srgb_from_file=matrix),
@@ -124,8 +124,10 @@ def read_raw(path: Path | str) -> np.ndarray:
                 f"{path}: its sensor's pixels are no squares in rows; needed: a sensor "
                 "as most cameras have. Develop it to linear TIFF of 16 bits."
             )
+        shown = _shown(raw)
     if saturated is not None:
         array[saturated] = np.iinfo(np.uint16).max
+    array = array[shown]
     return array[..., 0] if array.shape[2] == 1 else array
 
 
@@ -147,7 +149,20 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from error
 
 
-def _white(raw: Any) -> int:  # noqa: ANN401 - of a package that may be absent
+def _shown(raw: Any) -> tuple[slice, slice]:  # noqa: ANN401 - of a package that may be absent
+    """Return the rows and columns that the camera's own picture shows, of those that see light.
+
+    They are fewer by a margin, as interpolation needs; masks and models of the JPEG then fit.
+    """
+    sizes = raw.sizes
+    top, left = sizes.crop_top_margin - sizes.top_margin, sizes.crop_left_margin - sizes.left_margin
+    bottom, right = top + sizes.crop_height, left + sizes.crop_width
+    if 0 <= top < bottom <= sizes.height and 0 <= left < right <= sizes.width:
+        return slice(top, bottom), slice(left, right)
+    return slice(0, sizes.height), slice(0, sizes.width)
+
+
+def _white(raw: Any) -> int:  # noqa: ANN401 - as above
     """Give the level of saturation: the lowest that the file tells."""
     told = [int(level) for level in raw.camera_white_level_per_channel or () if level]
     return min([int(raw.white_level), *told])

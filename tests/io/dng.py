@@ -27,10 +27,14 @@ def write_dng(
     equivalent: int | None = None,
     size: tuple[int, int] | None = None,
     pattern: np.ndarray = BAYER,
+    active: tuple[int, int, int, int] | None = None,
+    crop: tuple[int, int, int, int] | None = None,
 ) -> None:
     """Write a mosaic of red, green; green, blue, or of another pattern, or all colours a pixel.
 
-    ``size`` is what the header claims in place of the mosaic's width and height.
+    ``size`` is what the header claims in place of the mosaic's width and height, ``active`` the
+    top, left, bottom and right of what sees light, and ``crop`` the left, top, width and height in
+    it of what cameras and converters show.
     """
     height, width = mosaic.shape[:2]
     samples = 1 if mosaic.ndim == 2 else mosaic.shape[2]
@@ -61,6 +65,8 @@ def write_dng(
         50728: (5, _ratios(neutral)),
         50778: (3, [21]),
     }
+    tags |= {} if active is None else {50829: (4, list(active))}
+    tags |= {} if crop is None else {50719: (4, list(crop[:2])), 50720: (4, list(crop[2:]))}
     exif = {} if equivalent is None else {0xA405: (3, [equivalent])}
     at = 8 + len(data)
     tags[34665] = (4, [at])

@@ -182,6 +182,22 @@ def test_what_was_developed_from_raw_is_read_in_its_place(folder, pixels, suffix
         list_images(folder)
 
 
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_raw_shows_what_the_cameras_own_picture_shows(tmp_path, colours, orientation):
+    mosaic = mosaic_of(sensor_of(colours))
+    write_dng(tmp_path / "whole.dng", mosaic, orientation=orientation)
+    # Of 60 x 40, what sees light leaves out 2 rows and 4 columns, and the picture some more.
+    margins = {"active": (2, 4, 38, 58), "crop": (4, 2, 48, 30)}
+    write_dng(tmp_path / "crop.dng", mosaic, orientation=orientation, **margins)
+    header = read_header(tmp_path / "crop.dng")
+    assert (header.width, header.height) == ((48, 30) if orientation == 1 else (30, 48))
+    whole, crop = (decode(tmp_path / f"{name}.dng").samples for name in ("whole", "crop"))
+    rows, columns = slice(4, 34), slice(8, 56)
+    if orientation == 6:  # turned right: what was below is on the left
+        rows, columns = columns, slice(40 - 34, 40 - 4)
+    assert torch.equal(crop, whole[:, rows, columns])
+
+
 def test_raw_and_jpeg_of_other_names_are_one_set(folder, colours):
     picture = (255 * srgb_from_linear(colours)).round().to(torch.uint8).movedim(0, -1).numpy()
     Image.fromarray(picture).save(folder / "5.png")
