@@ -1,7 +1,7 @@
 """Frames of a video as they are shown. The only importer of PyAV, an extra."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,26 +23,21 @@ _HIGH_RANGE = {16: "PQ (HDR10, Dolby Vision)", 18: "HLG"}
 
 
 def luma_frames(path: Path) -> Iterator[UInt8[Tensor, "height width"]]:
-    """Give the brightness of every frame, in the order in which they are shown, not turned.
+    """Read the brightness of every frame, in the order in which they are shown, not turned.
 
     Raises:
         InputError: No video, one that cannot be decoded, or PyAV is not installed.
     """
     with _opened(path) as (container, stream):
         _warn_of_range(path, stream)
-        for frame in container.decode(stream):
-            if (frame.width, frame.height) != (stream.width, stream.height):
-                raise InputError(
-                    f"{path}: changes its size from {stream.width} x {stream.height} to "
-                    f"{frame.width} x {frame.height}; needed: frames of one size."
-                )
+        for frame in _whole_frames(path, container, stream):
             yield torch.from_numpy(frame.to_ndarray(format="gray"))
 
 
 def frame_pictures(
     path: Path, numbers: Sequence[int]
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
-    """Give some frames in colour, turned as the video says.
+    """Read frames in colour, turned and mirrored as the video says.
 
     Args:
         path: The video.
@@ -53,12 +48,74 @@ def frame_pictures(
     """
     wanted = set(numbers)
     with _opened(path) as (container, stream):
-        for number, frame in enumerate(container.decode(stream)):
+        for number, frame in enumerate(_whole_frames(path, container, stream)):
             if number in wanted:
-                # FFmpeg tells by how much to turn it counter-clockwise.
-                yield number, np.rot90(frame.to_ndarray(format="rgb24"), frame.rotation // 90)
+                yield number, _upright(frame)
             if number >= max(wanted):
                 break
+
+
+def _whole_frames(path: Path, container: Any, stream: Any) -> Iterator[Any]:  # noqa: ANN401 - untyped
+    """Decode frames to whole pictures of square pixels.
+
+    The other field is interpolated (Weston 3-field deinterlacing) where a frame is marked as
+    interlaced; pixels that are not square are stretched along one side.
+
+    Raises:
+        InputError: The size changes.
+    """
+    from av.filter import Graph
+
+    graph = Graph()
+    for frame in container.decode(stream):
+        if (frame.width, frame.height) != (stream.width, stream.height):
+            raise InputError(
+                f"{path}: changes its size from {stream.width} x {stream.height} to "
+                f"{frame.width} x {frame.height}; needed: frames of one size."
+            )
+        if not graph.configured:
+            width, height = _shown_size(stream)
+            graph.link_nodes(
+                graph.add_buffer(
+                    width=frame.width,
+                    height=frame.height,
+                    format=frame.format,
+                    time_base=stream.time_base,
+                ),
+                graph.add("bwdif", "mode=send_frame:deint=interlaced"),
+                graph.add("scale", f"{width}:{height}:flags=lanczos"),
+                graph.add("buffersink"),
+            ).configure()
+        graph.vpush(frame)
+        yield from _pulled(graph)
+    if graph.configured:
+        graph.vpush(None)
+        yield from _pulled(graph)
+
+
+def _pulled(graph: Any) -> Iterator[Any]:  # noqa: ANN401 - untyped
+    with suppress(BlockingIOError, EOFError):  # where it waits for the next frame
+        while True:
+            yield graph.vpull()
+
+
+def _shown_size(stream: Any) -> tuple[int, int]:  # noqa: ANN401 - untyped
+    """Return the size at which pixels are square; no side shrinks."""
+    shape = float(stream.sample_aspect_ratio or 1)
+    return round(stream.width * max(shape, 1)), round(stream.height / min(shape, 1))
+
+
+def _upright(frame: Any) -> UInt8[np.ndarray, "height width 3"]:  # noqa: ANN401 - untyped
+    """Convert a frame to colours, its rows and columns as its display matrix places them."""
+    picture: np.ndarray = frame.to_ndarray(format="rgb24")
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return picture
+    # (x, y) is shown at (a x + c y, b x + d y); of other angles the nearest quarter is taken.
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].astype(float)
+    if abs(b) > abs(a):
+        picture, a, d = picture.swapaxes(0, 1), c, b
+    return picture[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
 
 
 @contextmanager
@@ -85,10 +142,10 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
                 raise InputError(
                     f"{path}: FFmpeg knows no decoder for its pictures. Convert it to MP4 (H.264)."
                 )
-            if max(stream.width, stream.height) > _MAX_SIDE_PX:
+            width, height = _shown_size(stream)
+            if max(width, height) > _MAX_SIDE_PX:
                 raise InputError(
-                    f"{path}: is {stream.width} x {stream.height}; needed: {_MAX_SIDE_PX} pixels "
-                    "a side at most."
+                    f"{path}: is {width} x {height}; needed: {_MAX_SIDE_PX} pixels a side at most."
                 )
             stream.thread_type = "AUTO"
             yield container, stream

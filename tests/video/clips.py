@@ -20,17 +20,34 @@ def positions():
     return (500 * np.linspace(0, 1, COUNT) ** 2).round().astype(int)
 
 
-def written(path, blur=lambda number: 0.0, gain=lambda number: 1.0, still=False, curve=0):
+def written(
+    path,
+    blur=lambda number: 0.0,
+    gain=lambda number: 1.0,
+    still=False,
+    curve=0,
+    shape=None,
+    field_step=0,
+    places=None,
+):
+    """Write a clip; ``shape`` is that of a pixel, ``field_step`` the motion from
+    the field of odd rows to that of even ones."""
     plane = texture()
+    options = {"x264-params": "interlaced=1"} if field_step else {}
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264" if curve else "mpeg4", rate=30)
+        codec = "libx264" if curve or field_step else "mpeg4"
+        stream = container.add_stream(codec, rate=30, options=options)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         stream.bit_rate = 8_000_000
+        if shape:
+            stream.codec_context.sample_aspect_ratio = shape
         if curve:
             stream.codec_context.color_trc = curve
-        for number, at in enumerate(positions()):
+        for number, at in enumerate(positions() if places is None else places):
             at = 0 if still else at
             picture = plane[20 : 20 + HEIGHT, at : at + WIDTH].astype(float) * gain(number)
+            late = slice(at + field_step, at + field_step + WIDTH)
+            picture[::2] = plane[20 : 20 + HEIGHT : 2, late] * gain(number)
             picture = gaussian_filter(picture, (0, blur(number), 0))
             frame = av.VideoFrame.from_ndarray(
                 picture.clip(0, 255).astype(np.uint8), format="rgb24"

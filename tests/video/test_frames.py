@@ -1,6 +1,7 @@
 """Videos of a patterned plane that passes by, made here."""
 
 import json
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from pimper_torch.cli.main import main
-from pimper_torch.errors import PimperWarning
+from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.photographs import list_images
 from pimper_torch.video.choose import scanned
 from pimper_torch.video.quality import motion, sharpness, thumbnail
@@ -82,22 +83,66 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, capsys):
     assert main(line[:-1]) == 2
 
 
-@pytest.mark.parametrize(("angle", "turns"), [(90, -1), (180, 2), (270, 1)])
-def test_pictures_are_turned_as_the_video_says(angle, turns, tmp_path):
+@pytest.mark.parametrize(
+    ("matrix", "wanted"),
+    [
+        ((1, 0, 0, 1), lambda picture: picture),
+        ((0, 1, -1, 0), lambda picture: np.rot90(picture, -1)),
+        ((-1, 0, 0, -1), lambda picture: np.rot90(picture, 2)),
+        ((0, -1, 1, 0), lambda picture: np.rot90(picture, 1)),
+        ((-1, 0, 0, 1), np.fliplr),
+        ((1, 0, 0, -1), np.flipud),
+        ((0, 1, 1, 0), lambda picture: np.rot90(np.fliplr(picture), 1)),
+        ((0, -1, -1, 0), lambda picture: np.rot90(np.fliplr(picture), -1)),
+        ((0.1, 0.99, -0.99, 0.1), lambda picture: np.rot90(picture, -1)),
+    ],
+)
+def test_pictures_are_turned_and_mirrored_as_the_video_says(matrix, wanted, tmp_path):
+    """The matrix of the track's header: (x, y) is shown at (a x + c y, b x + d y)."""
     plain = written(tmp_path / "clip.mp4")
     turned = tmp_path / "turned.mp4"
     data = bytearray(plain.read_bytes())
-    one = 1 << 16
-    # The matrix of the track's header turns clockwise.
-    a, b = {90: (0, one), 180: (-one, 0), 270: (0, -one)}[angle]
+    a, b, c, d = (round(65536 * value) for value in matrix)
     place = data.index(b"tkhd") + 4 + 40
-    for index, value in enumerate((a, b, 0, -b, a)):
+    for index, value in enumerate((a, b, 0, c, d)):
         data[place + 4 * index : place + 4 * index + 4] = int(value).to_bytes(4, "big", signed=True)
     turned.write_bytes(data)
     ((_, before),) = frame_pictures(plain, [40])
     ((number, after),) = frame_pictures(turned, [40])
     assert number == 40
-    assert np.array_equal(after, np.rot90(before, turns))
+    assert np.array_equal(after, wanted(before))
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [(Fraction(4, 3), (427, 240)), (Fraction(8, 9), (320, 270)), (Fraction(1), (320, 240))],
+)
+def test_pixels_that_are_not_square_become_so(shape, size, tmp_path):
+    ((_, found),) = frame_pictures(written(tmp_path / "clip.mkv", shape=shape), [40])
+    assert found.shape == (*size[::-1], 3)
+    at = positions()[40]
+    plane = Image.fromarray(texture()[20 : 20 + HEIGHT, at : at + WIDTH])
+    shown = np.asarray(plane.resize(size, Image.Resampling.LANCZOS)).astype(float)
+    assert np.abs(found - shown).mean() < 6
+    assert next(iter(luma_frames(tmp_path / "clip.mkv"))).shape == size[::-1]
+
+
+def test_fields_become_whole_pictures_of_one_moment(tmp_path):
+    """Rows of the second field show the plane 8 pixels later."""
+    clip = written(tmp_path / "clip.mp4", field_step=8, places=range(100, 420, 16))
+    frames = list(luma_frames(clip))
+    assert len(frames) == 20
+    plane = texture()[20 : 20 + HEIGHT].astype(float) @ [0.299, 0.587, 0.114]
+    first, second = plane[:, 260 : 260 + WIDTH], plane[:, 268 : 268 + WIDTH]
+    for rows in (slice(0, None, 2), slice(1, None, 2)):
+        away = [np.abs(frames[10].numpy() - one)[rows].mean() for one in (first, second)]
+        assert away[0] < 0.35 * away[1]
+
+
+def test_a_video_too_large_as_it_is_shown_is_refused(tmp_path):
+    clip = written(tmp_path / "clip.mkv", shape=Fraction(100), places=range(3))
+    with pytest.raises(InputError, match=r"is 32000 x 240; needed: 16384 pixels a side at most"):
+        next(iter(luma_frames(clip)))
 
 
 def test_blur_along_the_motion_makes_a_frame_less_sharp_and_light_does_not():
