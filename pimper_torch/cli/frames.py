@@ -51,6 +51,13 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
                 Image.fromarray(picture).save(folder / f"{number:06d}.png")
                 report(done, len(frames))
             figure("photographs", len(frames))
+    if len(frames) < job.count:
+        caution(
+            f"{job.video}: has {len(frames)} frames that differ, of {job.count} that were asked "
+            "for; the others show what these do. Move the camera farther, or more slowly where "
+            "the pictures jump.",
+            stacklevel=2,
+        )
     dull = [f"{number:06d}.png" for number in blurred(scan, frames).tolist()]
     if dull:
         caution(

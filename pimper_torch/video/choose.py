@@ -1,11 +1,14 @@
-"""Which frames of a video are photographs: the sharpest ones, at equal distances along the way."""
+"""Which frames of a video are photographs: the sharpest ones, at equal distances along the way.
+
+A jump of the pictures, in which there is no frame, counts as one distance only.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int, UInt8
-from torch import Tensor
+from torch import Tensor, cat
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Record
@@ -18,6 +21,13 @@ _STEP = 0.02
 # Of each stretch of the way, the middle from which a frame is taken: neighbours are then at least
 # two fifths of a stretch apart. A choice.
 _MIDDLE = 0.6
+
+# Frames that have moved less than this, in widths, show the same: a pixel of those that flow is
+# measured in.
+_SAME = 1 / 320
+
+# Of a stretch, by which sums of its length may be short: far above what float64 rounds.
+_ROUNDING = 1e-6
 
 # Least way of all frames together, in widths: below, nothing moved. A choice.
 _LEAST_WAY = 0.1
@@ -56,10 +66,10 @@ def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
 
     Args:
         scan: Of all frames.
-        count: Of frames to choose; fewer are where the pictures jump over a stretch.
+        count: Of frames to choose.
 
     Returns:
-        Numbers of frames, ascending.
+        Numbers of frames, ascending; fewer where others show what these do.
 
     Raises:
         InputError: Fewer frames than are to be chosen, or nothing moves.
@@ -74,15 +84,29 @@ def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
             f"nothing moves in the {frames} frames of the video (by {whole:.1%} of their width in "
             "all); needed: a camera that goes round the object, or an object that turns."
         )
-    place = scan.way / whole * count
-    stretch = place.floor().clamp(max=count - 1)
-    inner = (place - stretch - 0.5).abs() <= _MIDDLE / 2
-    kept = []
-    for number in range(count):
-        here = ((stretch == number) & inner).nonzero()[:, 0]
-        if len(here):
-            kept.append(here[scan.sharpness[here].argmax()])
-    return torch.stack(kept) if kept else torch.zeros(0, dtype=torch.long)
+    steps = scan.way.double().diff()
+    length = max(_stretch(steps, count), _SAME)
+    place = cat([steps.new_zeros(1), steps.clamp(max=length).cumsum(dim=0)]) / length
+    stretch = (place + _ROUNDING).floor().clamp(max=count - 1)
+    middle = (place - stretch - 0.5).abs()
+    numbers = []
+    for number in sorted(set(stretch.tolist())):
+        here = (stretch == number).nonzero()[:, 0]
+        inner = here[middle[here] <= max(_MIDDLE / 2, float(middle[here].min()))]
+        numbers.append(inner[scan.sharpness[inner].argmax()])
+    return torch.stack(numbers)
+
+
+def _stretch(steps: Float[Tensor, " step"], count: int) -> float:
+    """Compute the length of a stretch of which the way has ``count``, each jump being one.
+
+    The largest ``s`` with ``sum(min(step, s)) >= count s``: that holds for every ``s`` up to the
+    least of what the smaller steps leave for each stretch without the ``j`` largest.
+    """
+    largest = steps.sort(descending=True).values[: count - 1]
+    taken = cat([steps.new_zeros(1), largest.cumsum(dim=0)])
+    rest = (steps.sum() - taken).clamp(min=0)
+    return float((rest / (count - torch.arange(len(rest)))).min())
 
 
 def blurred(scan: Scan, frames: Int[Tensor, " chosen"]) -> Int[Tensor, " blurred"]:

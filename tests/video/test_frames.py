@@ -37,6 +37,22 @@ def test_frames_that_are_chosen_are_sharp_and_equally_far_apart(tmp_path, capsys
     assert np.abs(shown - texture()[20 : 20 + HEIGHT, at : at + WIDTH]).mean() < 6
 
 
+def test_uneven_motion_gives_as_many_frames_as_there_are(tmp_path, capsys):
+    """The plane rests, jumps, creeps and jumps: stretches of equal length would be empty."""
+    places = [0] * 10 + [80] * 5 + list(range(160, 200)) + [280] * 10
+    clip = written(tmp_path / "clip.mp4", places=places)
+    line = ["frames", str(clip), "-o", str(tmp_path / "photos"), "--count", "12"]
+    assert main(line) == 0
+    numbers = [int(path.stem) for path in list_images(tmp_path / "photos")]
+    assert len({places[number] for number in numbers}) == len(numbers) == 12
+    assert "that were asked for" not in capsys.readouterr().err
+    clip = written(tmp_path / "rest.mp4", places=[12 * (number // 8) for number in range(40)])
+    line[1:4] = [str(clip), "-o", str(tmp_path / "few")]
+    assert main(line) == 0
+    assert len(list_images(tmp_path / "few")) == 5
+    assert "has 5 frames that differ, of 12 that were asked for" in capsys.readouterr().err
+
+
 def test_light_that_changes_is_not_taken_for_motion(tmp_path):
     moving = scanned(luma_frames(written(tmp_path / "a.mp4")))
     video = written(tmp_path / "b.mp4", gain=lambda number: 0.75 + 0.25 * np.sin(number / 9))
