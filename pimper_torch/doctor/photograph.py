@@ -11,7 +11,8 @@ from torch import Tensor
 
 from pimper_torch.doctor.sharpness import edge_blur_px
 from pimper_torch.errors import InputError
-from pimper_torch.io.decode import Header, read_header
+from pimper_torch.io.decode import read_header
+from pimper_torch.io.header import Header
 from pimper_torch.io.photographs import shrunk_focals, shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_radiance
 from pimper_torch.parallel import side_by_side

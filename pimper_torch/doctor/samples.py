@@ -5,8 +5,9 @@ from pathlib import Path
 
 from pimper_torch.doctor.findings import Finding, listed
 from pimper_torch.errors import InputError
-from pimper_torch.io.decode import Header, read_header
+from pimper_torch.io.decode import read_header
 from pimper_torch.io.file_cautions import find_cautions, responses_told
+from pimper_torch.io.header import Header
 from pimper_torch.radiometry import Encoding
 
 

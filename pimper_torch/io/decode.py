@@ -16,8 +16,9 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.extras import extra_of, format_of
-from pimper_torch.io.focal_lengths import FocalLength, focal_from_exif
-from pimper_torch.io.heic import read_heic, read_heic_head
+from pimper_torch.io.focal_lengths import focal_from_exif
+from pimper_torch.io.header import Header
+from pimper_torch.io.heic import read_heic, read_heic_header
 from pimper_torch.io.icc import read_profile
 from pimper_torch.io.profiles import (
     PngHead,
@@ -26,7 +27,7 @@ from pimper_torch.io.profiles import (
     colour_of_tiff,
     png_head,
 )
-from pimper_torch.io.raw import read_raw, read_raw_head
+from pimper_torch.io.raw import read_raw, read_raw_header
 from pimper_torch.io.tiff import (
     CMYK_CAUTION,
     Layout,
@@ -47,41 +48,6 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two hold published 
 MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
 _FULL_SCALE = {np.dtype(kind): int(np.iinfo(kind).max) for kind in (np.uint8, np.uint16)}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Header(Record):
-    """What a file says about its image without decoding it.
-
-    Attributes:
-        width: Pixels, the right way up.
-        height: Pixels, the right way up.
-        orientation: EXIF's number, 1 to 8; 1 is upright.
-        focal: See :mod:`pimper_torch.io.focal_lengths`.
-        channels: 1 or 3; alpha not counted.
-        deep: True for 16-bit samples in several channels, which Pillow would cut to 8.
-        full: Level that is full scale, 255 or 65535, or less of 16 bits where a TIFF says so.
-        full_told: The file itself says what its full scale is.
-        significant: Bits of 16 that a PNG says are no filling; 16 where it is silent.
-        transparent: Levels of the one colour of 16 bits that a PNG calls transparent.
-        colour: What the file says about its samples.
-        cautions: What it says and is not followed, each a sentence without its subject.
-        layout: Of a TIFF; ``None`` for other files.
-    """
-
-    width: int
-    height: int
-    orientation: int
-    focal: FocalLength
-    channels: int
-    deep: bool
-    full: int = 255
-    full_told: bool = False
-    significant: int = 16
-    transparent: tuple[int, ...] = ()
-    colour: Colour = SILENT
-    cautions: tuple[str, ...] = ()
-    layout: Layout | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -120,10 +86,10 @@ def read_header(path: Path | str) -> Header:
     """
     path = Path(path)
     extra = extra_of(path)
-    if extra == "heic":
-        return _guarded(path, lambda: _header_of_heic(path))
-    if extra == "raw":
-        return _guarded(path, lambda: _header_of_raw(path))
+    if extra:
+        header = _guarded(path, lambda: _header_of_extra(path, extra))
+        _refuse_huge(path, header.width, header.height, header.channels)
+        return header
 
     def read(image: Image.Image) -> Header:
         layout = None
@@ -158,48 +124,13 @@ def read_header(path: Path | str) -> Header:
     return _with_image(path, read, whole=False)
 
 
-def _header_of_heic(path: Path) -> Header:
-    _refuse_bytes(path)
-    head = read_heic_head(path)
-    channels = 1 if head.gray else 3
-    _refuse_huge(path, head.width, head.height, channels)
-    said = colour_of_exif(head.exif) if head.colour is SILENT else head.colour
-    return Header(
-        width=head.width,
-        height=head.height,
-        orientation=1,
-        focal=focal_from_exif(head.exif.get_ifd(ExifTags.IFD.Exif), head.width, head.height),
-        channels=channels,
-        deep=head.full > _FULL_SCALE[np.dtype(np.uint8)],
-        full=head.full,
-        colour=said,
-    )
-
-
-def _header_of_raw(path: Path) -> Header:
-    _refuse_bytes(path)
-    head = read_raw_head(path)
-    _refuse_huge(path, head.width, head.height, 1)  # one sample a pixel, whatever its colour
-    width, height = head.width, head.height
-    if head.orientation >= 5:
-        width, height = height, width
-    return Header(
-        width=width,
-        height=height,
-        orientation=head.orientation,
-        # Digital zoom crops what a camera develops, not what its sensor sees.
-        focal=focal_from_exif(
-            {**head.exif.get_ifd(ExifTags.IFD.Exif), ExifTags.Base.DigitalZoomRatio: 1},
-            width,
-            height,
-        ),
-        channels=1 if head.gray else 3,
-        deep=True,
-        full=_FULL_SCALE[np.dtype(np.uint16)],
-        full_told=True,
-        colour=head.colour,
-        cautions=head.cautions,
-    )
+def _header_of_extra(path: Path, extra: str) -> Header:
+    if path.stat().st_size > _MAX_BYTES:  # before a library reads it into memory
+        raise InputError(
+            f"{path}: has {path.stat().st_size} bytes; needed: at most {_MAX_BYTES // 2**30} GB. "
+            "Scale it down."
+        )
+    return read_heic_header(path) if extra == "heic" else read_raw_header(path)
 
 
 def _guarded(path: Path, read: Callable[[], Result]) -> Result:
@@ -334,15 +265,6 @@ def _mode_cautions(image: Image.Image) -> list[str]:
     if image.mode != "CMYK" or isinstance(image, TiffImagePlugin.TiffImageFile):
         return []
     return [CMYK_CAUTION]
-
-
-def _refuse_bytes(path: Path) -> None:
-    """Refuse, before a library reads it into memory, a file larger than any photograph."""
-    if path.stat().st_size > _MAX_BYTES:
-        raise InputError(
-            f"{path}: has {path.stat().st_size} bytes; needed: at most {_MAX_BYTES // 2**30} GB. "
-            "Scale it down."
-        )
 
 
 def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pimper_torch.errors import caution, some
-from pimper_torch.io.decode import Header
+from pimper_torch.io.header import Header
 from pimper_torch.io.responses import response_of
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.colour import disagree, told

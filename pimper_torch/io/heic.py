@@ -1,59 +1,43 @@
 """HEIC, as telephones and some cameras write it: read by libheif, turned by the file itself."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.extras import load_extra
+from pimper_torch.io.focal_lengths import focal_from_exif
+from pimper_torch.io.header import Header
 from pimper_torch.io.icc import read_profile
-from pimper_torch.io.profiles import colour_of_codes
+from pimper_torch.io.profiles import colour_of_codes, colour_of_exif
 from pimper_torch.radiometry.colour import SILENT, Colour
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeicHead:
-    """What a HEIC file says without decoding it.
+def read_heic_header(path: Path | str) -> Header:
+    """Read what the primary picture of a HEIC file is, without its pixels.
 
-    Attributes:
-        width: Pixels, the right way up: the file's own rotation is applied, and EXIF's, which
-            only repeats it, is not.
-        height: Pixels.
-        gray: One colour.
-        full: Level of full scale, 255, or that of 10 or 12 bits filled up to 16.
-        exif: As other files have it.
-        colour: What it says about its samples.
+    The file's own rotation is applied; EXIF's, which only repeats it, is not.
     """
-
-    width: int
-    height: int
-    gray: bool
-    full: int
-    exif: Image.Exif
-    colour: Colour
-
-
-def read_heic_head(path: Path | str) -> HeicHead:
-    """Read what the primary picture of a HEIC file is, without its pixels."""
     opened = _opened(path)
     image = opened[opened.primary_index]
     info: Mapping[str, Any] = image.info
     exif = Image.Exif()
     if isinstance(info.get("exif"), bytes):
         exif.load(info["exif"])
-    width, height = image.size
+    colour = _colour(info)
     bits = int(info.get("bit_depth", 8))
-    return HeicHead(
-        width=width,
-        height=height,
-        gray=not image.mode.startswith("RGB"),
+    return Header(
+        width=image.size[0],
+        height=image.size[1],
+        orientation=1,
+        focal=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), *image.size),
+        channels=3 if image.mode.startswith("RGB") else 1,
+        deep=bits > 8,
         full=255 if bits <= 8 else (2**bits - 1) << (16 - bits),
-        exif=exif,
-        colour=_colour(info),
+        colour=colour_of_exif(exif) if colour is SILENT else colour,
     )
 
 

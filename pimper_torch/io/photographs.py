@@ -14,10 +14,11 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning, caution, some
 from pimper_torch.file_names import match_files
-from pimper_torch.io.decode import SUFFIXES, Decoded, Header, decode, read_header
+from pimper_torch.io.decode import SUFFIXES, Decoded, decode, read_header
 from pimper_torch.io.extras import HEIC_SUFFIXES, RAW_SUFFIXES, extra_of, is_installed, load_extra
 from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.focal_lengths import focals_px
+from pimper_torch.io.header import Header
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.io.turned_masks import choose_ways, mask_ways
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding

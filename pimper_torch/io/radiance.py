@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.io.decode import Decoded, Header, decode
+from pimper_torch.io.decode import Decoded, decode
+from pimper_torch.io.header import Header
 from pimper_torch.io.responses import response_of
 from pimper_torch.progress import track
 from pimper_torch.radiometry import SATURATED, Curve, Encoding, Response, Srgb, find_saturation

@@ -9,19 +9,20 @@ import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
+from PIL import ExifTags, Image
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.extras import load_extra
+from pimper_torch.io.focal_lengths import focal_from_exif
+from pimper_torch.io.header import Header
 from pimper_torch.radiometry import SATURATED, Linear
 from pimper_torch.radiometry.colour import Colour
 
@@ -44,30 +45,7 @@ _UNKNOWN_CAMERA = "is of a camera whose colours nobody tells; albedo keeps them 
 _OFF_WHITE = 0.1  # by which rows of a matrix to sRGB may sum to something else than 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RawHead:
-    """What a raw file says without its samples.
-
-    Attributes:
-        width: Pixels of the camera's own picture, as the sensor lies.
-        height: Pixels.
-        orientation: EXIF's number.
-        gray: A sensor without colours.
-        exif: Of the file or of its preview; empty where neither has any.
-        colour: Linear, with the matrix from the sensor's colours to sRGB.
-        cautions: What it does not say.
-    """
-
-    width: int
-    height: int
-    orientation: int
-    gray: bool
-    exif: Image.Exif
-    colour: Colour
-    cautions: tuple[str, ...]
-
-
-def read_raw_head(path: Path | str) -> RawHead:
+def read_raw_header(path: Path | str) -> Header:
     """Read size, turn, colours and EXIF of a raw file, without its samples.
 
     Raises:
@@ -84,12 +62,21 @@ def read_raw_head(path: Path | str) -> RawHead:
         gray = raw.num_colors == 1
         matrix = None if gray else _srgb_from_sensor(raw)
         unknown = not gray and matrix is None
-        return RawHead(
-            width=columns.stop - columns.start,
-            height=rows.stop - rows.start,
-            orientation=_ORIENTATION.get(raw.sizes.flip, 1),
-            gray=gray,
-            exif=_exif(path, raw),
+        width, height = columns.stop - columns.start, rows.stop - rows.start
+        orientation = _ORIENTATION.get(raw.sizes.flip, 1)
+        if orientation >= 5:
+            width, height = height, width
+        # Digital zoom crops what a camera develops, not what its sensor sees.
+        tags = _exif(path, raw).get_ifd(_EXIF_IFD) | {ExifTags.Base.DigitalZoomRatio: 1}
+        return Header(
+            width=width,
+            height=height,
+            orientation=orientation,
+            focal=focal_from_exif(tags, width, height),
+            channels=1 if gray else 3,
+            deep=True,
+            full=np.iinfo(np.uint16).max,
+            full_told=True,
             colour=Colour(source=_SOURCE, response=Linear(), srgb_from_file=matrix),
             cautions=(_UNKNOWN_CAMERA,) if unknown else (),
         )

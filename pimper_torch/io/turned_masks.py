@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from pimper_torch.errors import InputError, caution
-from pimper_torch.io.decode import Header, rotated
+from pimper_torch.io.decode import rotated
+from pimper_torch.io.header import Header
 
 # Standard errors by which the photographs must change more along the outlines of one way; pixels
 # along an outline that are told apart: choices.
