@@ -137,15 +137,22 @@ def _guarded(path: Path, read: Callable[[], Result]) -> Result:
     """Turn whatever a library raises of a file into one error."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+            warnings.simplefilter("ignore")  # size below Pillow's limit, odd but legible tags
             return read()
     except (InputError, MemoryError):
         raise
+    except Image.DecompressionBombError as error:
+        raise InputError(
+            f"{path}: has more than {MAX_PIXELS // 10**6} million pixels; needed: at most as many. "
+            "Scale it down."
+        ) from error
+    except UnidentifiedImageError as error:
+        raise _unidentified(path) from error
     except OSError as error:
-        if error.errno is not None:
+        if error.errno is not None:  # of the system, not of a decoder
             raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
         raise _damaged(path) from error
-    except Exception as error:  # libheif's bindings raise ValueError, EOFError and others
+    except Exception as error:  # libraries raise whatever a damaged file leads to
         raise _damaged(path) from error
 
 
@@ -283,35 +290,22 @@ def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
 
 
 def _with_image(path: Path, use: Callable[[Image.Image], Result], *, whole: bool = True) -> Result:
-    """Open a file with Pillow and turn everything that may go wrong into one error.
+    """Open a file with Pillow.
 
     Args:
         path: Of the file.
         use: What to do with it.
         whole: Read all of it at once; not needed for its header.
     """
-    try:
-        with warnings.catch_warnings(), path.open("rb") as file:
-            warnings.simplefilter("ignore")  # size below Pillow's limit, odd but legible tags
+
+    def read() -> Result:
+        with path.open("rb") as file:
             # From memory: Pillow 13 misreads an uncompressed, turned TIFF that it maps.
             source = io.BytesIO(file.read()) if whole else file
             with Image.open(source, formats=_FORMATS) as image:
                 return use(image)
-    except InputError:
-        raise
-    except Image.DecompressionBombError as error:
-        raise InputError(
-            f"{path}: has more than {MAX_PIXELS // 10**6} million pixels; needed: at most as many. "
-            "Scale it down."
-        ) from error
-    except UnidentifiedImageError as error:
-        raise _unidentified(path) from error
-    except OSError as error:
-        if error.errno is not None:  # of the system, not of a decoder
-            raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
-        raise _damaged(path) from error
-    except Exception as error:  # Pillow's plugins raise whatever a damaged file leads to
-        raise _damaged(path) from error
+
+    return _guarded(path, read)
 
 
 def _damaged(path: Path) -> InputError:
