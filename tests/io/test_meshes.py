@@ -121,8 +121,8 @@ XYZ = tuple(f"property float {axis}" for axis in "xyz")
     [
         ("a.ply", ply("vertex", 2**40, XYZ, bytes(36))),
         ("a.ply", ply("vertex", -3, XYZ, bytes(36))),
-        ("a.ply", ply("vertex", 4, XYZ, bytes(36))),
         ("a.ply", ply("face", 2**31, ("property list uchar int vertex_indices",), bytes(9))),
+        ("a.ply", ply("vertex", 4, XYZ, b"0 0 0\n" * 3).replace(b"binary_little_endian", b"ascii")),
         ("a.ply", ply("vertex", 2**40, XYZ, b"0 0 0\n").replace(b"binary_little_endian", b"ascii")),
         ("a.stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(50)),
     ],
@@ -136,12 +136,18 @@ def test_a_count_beyond_the_files_length_is_refused_before_memory_is_taken(
         read_mesh(tmp_path / name)
 
 
+def test_a_binary_ply_of_another_length_is_refused(tmp_path):
+    (tmp_path / "a.ply").write_bytes(ply("vertex", 4, XYZ, bytes(36)))
+    with pytest.raises(InputError, match=r"a\.ply: cannot be read as a mesh"):
+        read_mesh(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda tree: tree["accessors"][0].update(count=2**40), "says that it holds"),
+        (lambda tree: tree["accessors"][0].update(count=2**40), "damaged"),
         (lambda tree: tree["accessors"][0].pop("bufferView"), "not in the file itself"),
-        (lambda tree: tree["bufferViews"][0].update(byteLength=2**40), "says that it holds"),
+        (lambda tree: tree["bufferViews"][0].update(byteLength=2**40), "damaged"),
         (lambda tree: tree["nodes"].append({"children": [len(tree["nodes"])]}), "circle of nodes"),
         (lambda tree: tree["nodes"].extend([{"mesh": 0}] * 10**5), "500005 vertices"),
         (lambda tree: tree["accessors"][0].update(type="VEC9"), "damaged"),
