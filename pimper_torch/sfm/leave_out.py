@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.ledger import leave_out
 from pimper_torch.progress import track
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.camera_in_place import (
@@ -65,6 +66,10 @@ def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
         matched = read_matched(stored)
         verifier = _Verifier(matched=matched, settings=settings)
         found = _shifted(matched, verifier, settings) or _at_rest(matched, verifier, settings)
+        guard = "sfm.shifted_room" if found.rest.shift_px else "sfm.room"
+        resting = found.rest.features
+        taken = sum(int(one.sum()) for one in resting) if found.rest.room else 0
+        leave_out(guard, taken, total=sum(map(len, matched.keypoints)))
         if found.rest.room:
             geometries = read_geometries(stored) | verifier.found
             _drop_features(stored, matched, found.rest)

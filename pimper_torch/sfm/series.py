@@ -9,6 +9,7 @@ from torch import Tensor
 from pimper_torch.errors import caution, some
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.supporting_plane import PlaneSearch, fixation, supporting_plane
+from pimper_torch.ledger import leave_out
 from pimper_torch.sfm.agreement import agreement
 from pimper_torch.sfm.components import FEWEST_VIEWS, JOINING
 from pimper_torch.sfm.matching import VerifiedPair
@@ -73,6 +74,8 @@ def with_series(
         names: Of all photographs.
     """
     kept = torch.nonzero(torch.bincount(numbers)[numbers] >= FEWEST_VIEWS)[:, 0]
+    small = torch.bincount(numbers)[numbers] < FEWEST_VIEWS
+    leave_out("sfm.small_series", small, names=model.names)
     if len(kept) < model.num_views:
         model, numbers = select_views(model, kept.tolist()), numbers[kept]
     count = len(set(numbers.tolist()))
@@ -97,6 +100,7 @@ def largest_series(model: SparseModel) -> SparseModel:
         model: Registered on what the object stands on. Without such series it stays as it is.
     """
     series = series_apart(model)
+    leave_out("sfm.series_apart", series != torch.bincount(series).argmax(), names=model.names)
     if int(series.max()) == 0:
         return model
     largest = int(torch.bincount(series).argmax())
