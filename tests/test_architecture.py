@@ -28,6 +28,7 @@ ROOMS = [
     "kernels",
     "radiometry",
     "records",
+    "ledger",
     "failures",
     "parallel",
     "stage",

@@ -13,11 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import caution
+from pimper_torch.ledger import leave_out
 from pimper_torch.sfm.agreement import judged
 from pimper_torch.sfm.components import FEWEST_VIEWS, require_motion
 from pimper_torch.sfm.doubt import count_views_with_depth, doubt
 from pimper_torch.sfm.guided import match_guided
-from pimper_torch.sfm.leave_out import leave_out_room
+from pimper_torch.sfm.leave_out import enter_room, leave_out_room
 from pimper_torch.sfm.mapping import MapSettings, map_views
 from pimper_torch.sfm.matching import (
     MatchSettings,
@@ -148,6 +149,10 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
         return plain
     if background:
         _tell_room(rest)
+    else:
+        surroundings = sum(pair.num_matches for pair in around)
+        verified = sum(pair.num_matches for pair in verified_pairs(space))
+        leave_out("sfm.moved_object", surroundings, total=verified)
     return replace(rival, background=background, around=around)
 
 
@@ -186,8 +191,7 @@ def _leave_out_room(
 
 
 def _tell_room(rest: StaticBackground) -> None:
-    left = sum(int(resting.sum()) for resting in rest.features)
-    total = sum(len(resting) for resting in rest.features)
+    left, total = enter_room(rest)
     how = "lie still in the photographs while others move"
     if rest.shift_px:
         how = (

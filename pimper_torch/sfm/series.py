@@ -7,6 +7,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from pimper_torch.errors import caution, some
+from pimper_torch.ledger import leave_out
 from pimper_torch.sfm.agreement import agreement
 from pimper_torch.sfm.components import FEWEST_VIEWS, JOINING
 from pimper_torch.sfm.matching import VerifiedPair
@@ -63,6 +64,8 @@ def with_series(
         names: Of all photographs.
     """
     kept = torch.nonzero(torch.bincount(numbers)[numbers] >= FEWEST_VIEWS)[:, 0]
+    small = torch.bincount(numbers)[numbers] < FEWEST_VIEWS
+    leave_out("sfm.small_series", small, names=model.names)
     if len(kept) < model.num_views:
         model, numbers = select_views(model, kept.tolist()), numbers[kept]
     count = len(set(numbers.tolist()))

@@ -27,6 +27,9 @@ ROOM = RIGID.replace(
     maps=5 * (torch.eye(3, dtype=torch.float64),),
 )
 
+NOTHING = torch.zeros(3, 2).double()
+MOVED = (VerifiedPair(views=(0, 1), first=NOTHING, second=NOTHING),)
+
 
 class Told:
     """What matcher and mapper are told; what the mapper and the judge answer, run by run."""
@@ -149,7 +152,7 @@ def test_a_model_whose_views_all_see_too_few_points_is_none(told, space, monkeyp
 
 
 def test_a_plain_model_that_explains_the_matches_is_taken_before_a_room_is_looked_for(told, space):
-    answers = told([EVERY], explained=[0.95], rest=ROOM, around=("moved",))
+    answers = told([EVERY], explained=[0.95], rest=ROOM, around=MOVED)
     found = register(space, SETTINGS)
     assert answers.asked == []
     assert not found.background
@@ -157,17 +160,17 @@ def test_a_plain_model_that_explains_the_matches_is_taken_before_a_room_is_looke
 
 
 def test_another_explanation_is_taken_where_it_explains_clearly_more(told, space):
-    answers = told([EVERY, EVERY], explained=[0.7, 0.98], around=("moved",))
-    assert register(space, SETTINGS).around == ("moved",)
+    answers = told([EVERY, EVERY], explained=[0.7, 0.98], around=MOVED)
+    assert register(space, SETTINGS).around == MOVED
     assert answers.databases == ["database.db", "other.db"]
     assert (space.folder / "other.db").read_bytes() == b"features and matches"
-    told([EVERY, EVERY], explained=[0.85, 0.94], around=("moved",))
+    told([EVERY, EVERY], explained=[0.85, 0.94], around=MOVED)
     assert register(space, SETTINGS).around == ()
 
 
 def test_an_explanation_that_loses_photographs_does_not_beat_the_plain_one(told, space):
     some = [EVERY, *4 * [[0, 1, 2]]]
-    told(some, explained=[0.7, *4 * [0.5]], around=("moved",))
+    told(some, explained=[0.7, *4 * [0.5]], around=MOVED)
     found = register(space, SETTINGS)
     assert not found.missing
     assert found.around == ()
