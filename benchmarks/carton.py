@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from PIL import Image
+from planarity import dihedrals, planar_faces
 from scipy.spatial import cKDTree
 from sides import drawn, far_apart, square_round
 from torch import Tensor
@@ -29,7 +30,6 @@ from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import read_llff, write_colmap
 from pimper_torch.evidence.datasets.pictures import file_names
-from pimper_torch.evidence.metrics.planarity import dihedrals, planar_faces
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Cameras, Capture, Lens, Mesh, SparseScene

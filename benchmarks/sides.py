@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from closedness import Closedness, closedness
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.metrics.closedness import Closedness, closedness
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viz.render import bounding_box, crop, shade

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from pimper_torch.errors import InputError, NumericalError, ReconstructionError, caution
+from pimper_torch.ledger import Entry, collected
 from pimper_torch.records.failure import Failure
 from pimper_torch.records.record import Record
 
@@ -24,7 +25,6 @@ Result = TypeVar("Result")
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 _on_failure: ContextVar[OnFailure] = ContextVar("on_failure", default="skip")
-_collected: ContextVar[list[Failure] | None] = ContextVar("collected", default=None)
 
 # What torch says when an allocation fails on the CPU; CUDA's error has a class of its own.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
@@ -38,29 +38,29 @@ _LISTED = 5
 
 @contextmanager
 def collecting(
-    on_failure: OnFailure = "skip", failures: list[Failure] | None = None
-) -> Iterator[list[Failure]]:
-    """Collect what is skipped inside the ``with`` block, in threads that it starts, too.
+    on_failure: OnFailure = "skip", entries: list[Entry] | None = None
+) -> Iterator[list[Entry]]:
+    """Collect what is skipped or left out inside the ``with`` block, in threads of it, too.
 
     Where the block ends in an error, what was skipped before is told first.
 
     Args:
         on_failure: ``"fail"`` refuses instead of skipping.
-        failures: Those so far, which more are added to.
+        entries: Those so far, which more are added to.
 
     Yields:
-        The failures so far, for :func:`warn_of` at the end.
+        The entries so far, for :func:`warn_of` at the end.
 
     Raises:
         ReconstructionError: In place of an error of memory.
     """
-    failures = [] if failures is None else failures
-    policy, collected = _on_failure.set(on_failure), _collected.set(failures)
+    entries = [] if entries is None else entries
+    policy, token = _on_failure.set(on_failure), collected.set(entries)
     try:
-        yield failures
+        yield entries
     except BaseException as error:
-        _collected.set(None)
-        warn_of(failures)
+        collected.set(None)
+        warn_of(entries)
         if out_of_memory(error):
             raise ReconstructionError(
                 f"Memory did not suffice, for the smallest parts either: {reason_of(error)}. "
@@ -70,7 +70,7 @@ def collecting(
         raise
     finally:
         _on_failure.reset(policy)
-        _collected.reset(collected)
+        collected.reset(token)
 
 
 def skipped(*failures: Failure, error: BaseException | None = None) -> None:
@@ -89,35 +89,21 @@ def skipped(*failures: Failure, error: BaseException | None = None) -> None:
             f"{first.stage}: {first.what} {first.name} failed: {first.reason}. Failures are to end "
             f"the run (`on_failure` is fail); with skip it goes on: {first.done}."
         ) from error
-    collected = _collected.get()
-    if collected is None:
+    entries = collected.get()
+    if entries is None:
         warn_of(failures)
     else:
-        collected.extend(failures)
+        entries.extend(failures)
 
 
-@contextmanager
-def noted_failures() -> Iterator[list[Failure]]:
-    """Note what is skipped inside the ``with`` block; it is collected all the same.
-
-    Yields:
-        The list that holds it when the block has ended; empty outside of :func:`collecting`.
-    """
-    collected, noted = _collected.get(), list[Failure]()
-    before = 0 if collected is None else len(collected)
-    yield noted
-    if collected is not None:
-        noted += collected[before:]
-
-
-def distinct(failures: Sequence[Failure]) -> tuple[Failure, ...]:
+def distinct(entries: Sequence[Entry]) -> tuple[Failure, ...]:
     """List each failure once, in an order that threads do not change."""
-    return tuple(sorted(set(failures), key=_order))
+    return tuple(sorted({one for one in entries if isinstance(one, Failure)}, key=_order))
 
 
-def warn_of(failures: Sequence[Failure]) -> None:
+def warn_of(entries: Sequence[Entry]) -> None:
     """Warn once of each kind of failure, with how many there are and the first of them."""
-    for (stage, what, done), some in groupby(distinct(failures), key=_kind):
+    for (stage, what, done), some in groupby(distinct(entries), key=_kind):
         kind = list(some)
         names = list(dict.fromkeys(failure.name for failure in kind))
         listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")

@@ -8,7 +8,7 @@ its batch alone: neither the number of workers nor who is first changes it.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar, copy_context
 from functools import cache
 from itertools import pairwise
@@ -17,6 +17,7 @@ from typing import TypeVar
 import torch
 
 from pimper_torch.failures import halved, out_of_memory, released, skipped
+from pimper_torch.ledger import added_up
 from pimper_torch.progress import listening, report
 
 Item = TypeVar("Item")
@@ -50,10 +51,11 @@ def side_by_side(
     """
     workers = min(num_workers(), len(items))
     results = _in_threads(work, items, workers) if workers > 1 else _one_by_one(work, items)
-    for done, result in enumerate(results, start=1):
-        yield result
-        if tracked:
-            report(done, len(items))
+    with nullcontext() if _working.get() else added_up():
+        for done, result in enumerate(results, start=1):
+            yield result
+            if tracked:
+                report(done, len(items))
 
 
 # Fewer rows than these are not worth a second thread: they take it some 50 microseconds.

@@ -29,6 +29,7 @@ ROOMS = [
     "kernels",
     "radiometry",
     "records",
+    "ledger",
     "failures",
     "parallel",
     "stage",

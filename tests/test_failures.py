@@ -1,6 +1,7 @@
 """A patch, a view or a solver that fails is left out, and told; what remains is as without it."""
 
 import warnings
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,6 @@ from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
 from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.failures import (
     by_data,
-    collecting,
     distinct,
     out_of_memory,
     over_patches,
@@ -22,6 +22,7 @@ from pimper_torch.failures import (
     solved_or,
     warn_of,
 )
+from pimper_torch.failures import collecting as collecting_entries
 from pimper_torch.fusion import estimate
 from pimper_torch.io.reports import summary_report
 from pimper_torch.linalg.singular import SingularSystemError
@@ -39,6 +40,15 @@ from pimper_torch.sweep.sweep import Sweep
 
 # As torch words it on the CPU.
 NO_MEMORY = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 123456789 bytes."
+
+
+@contextmanager
+def collecting(*arguments):
+    """Collect failures, without what guards left out."""
+    failures = []
+    with collecting_entries(*arguments) as entries:
+        yield failures
+    failures += [entry for entry in entries if isinstance(entry, Failure)]
 
 
 def heights(some):

@@ -71,6 +71,11 @@ def bits(result):
 def test_a_run_that_keeps_gives_what_one_gives_that_does_not(whole):
     without, _, keeping = whole
     assert bits(keeping) == bits(without) is not None
+    assert keeping.left_out == without.left_out
+    guards = [entry.guard for entry in without.left_out]
+    assert guards.count("remesh.data") == 1
+    assert guards.count("fuse.support") == guards.count("photometry.undetermined") == 2
+    assert guards[-1] == "extract.pieces"
 
 
 @pytest.mark.parametrize("done", [1, 3, 6])

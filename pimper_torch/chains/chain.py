@@ -16,11 +16,13 @@ from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
 from pimper_torch.kernels.switch import Kernels, compile_all, using
+from pimper_torch.ledger import Entry, left_out_of
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     DepthPatches,
     Failure,
+    LeftOut,
     Mesh,
     PatchSet,
     PhotometricPatches,
@@ -56,6 +58,7 @@ class Step(Record):
         surface: Joined over all facets, on the subdivided coarse mesh.
         reports: One of each stage that ran for this step, in order.
         failures: What was left out so far, as it failed.
+        left_out: What guards left out or doubted so far, in order.
     """
 
     scale: float
@@ -66,6 +69,7 @@ class Step(Record):
     surface: Surface
     reports: tuple[StageReport, ...] = ()
     failures: tuple[Failure, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
 
     @property
     def photometric(self) -> PhotometricPatches:
@@ -213,11 +217,11 @@ class Chain(Stage):
             view_named(named, names)  # not first after structure from motion
         passes = self.passes(views, sparse_model, mesh)
         compiled = self.kernels == "torch"
-        failures: list[Failure] = []
+        entries: list[Entry] = []
         while True:
             with (
                 using(self.kernels),
-                collecting(self.on_failure, failures),
+                collecting(self.on_failure, entries),
                 recorded(self, self.observer) as reports,
             ):
                 if not compiled:
@@ -228,8 +232,10 @@ class Chain(Stage):
             if step is None:
                 return
             if step.last:
-                warn_of(failures)
-            yield step.replace(reports=tuple(reports), failures=distinct(failures))
+                warn_of(entries)
+            yield step.replace(
+                reports=tuple(reports), failures=distinct(entries), left_out=left_out_of(entries)
+            )
 
     def forward(
         self,
@@ -258,8 +264,13 @@ class Chain(Stage):
             del step  # the next pass needs its memory
             step = next(steps)
             reports += step.reports
-        with using(self.kernels), recorded(self, self.observer) as last:
+        with (
+            using(self.kernels),
+            collecting(self.on_failure) as entries,
+            recorded(self, self.observer) as last,
+        ):
             found = self.kept(self.extract, step.surface)
+            warn_of(entries)
         return Reconstruction(
             mesh=found,
             scene=step.scene,
@@ -267,7 +278,8 @@ class Chain(Stage):
             coarse=step.coarse,
             patches=step.heights,
             report=(*reports, *last),
-            failures=step.failures,
+            failures=(*step.failures, *distinct(entries)),
+            left_out=(*step.left_out, *left_out_of(entries)),
         )
 
     def _swap(self, stages: Mapping[str, nn.Module]) -> None:

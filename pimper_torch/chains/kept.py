@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from pimper_torch.errors import OutputError, caution, overheard
-from pimper_torch.failures import noted_failures, skipped
+from pimper_torch.failures import distinct, skipped
+from pimper_torch.ledger import kept_entries, noted_entries, repeat_entries
 from pimper_torch.records import Failure, Record, StageReport
 from pimper_torch.reporting import noted, repeat
 from pimper_torch.store import Store, digest, settled
@@ -48,18 +49,21 @@ def kept_call(
     found = store.find(f"{name}-{key}", cls)
     if found is not None:
         skipped(*(Failure(**failure) for failure in found.about["failures"]))
+        repeat_entries(found.about["left_out"])
         repeat([StageReport(**report) for report in found.about["reports"]])
         for message in found.about["cautions"]:
             caution(message)
         return typing.cast(R, _beside(found.record, inputs))
-    with overheard() as cautions, noted() as reports, noted_failures() as failures:
+    with overheard() as cautions, noted() as reports, noted_entries() as entries:
         result = settled(typing.cast(Record, call(*inputs, **derived)))
+    failures = distinct(entries)
     if any(failure.what == "memory" for failure in failures):
         return typing.cast(R, result)  # smaller batches round otherwise
     about = {
         "reports": list(map(dataclasses.asdict, reports)),
         "cautions": cautions,
         "failures": list(map(dataclasses.asdict, failures)),
+        "left_out": kept_entries(entries),
     }
     try:
         store.keep(f"{name}-{key}", result, about)

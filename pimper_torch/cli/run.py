@@ -16,6 +16,7 @@ from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
+from pimper_torch.ledger import closing_line
 from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import held_output
 from pimper_torch.outputs.marker import STAGES
@@ -122,6 +123,8 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
     output.remark(f"{_costs(result)}\n{headline(result)}")
     if result.scene.doubt:
         output.warning(result.scene.doubt)
+    if left_out := closing_line(result.left_out):
+        output.remark(left_out)
     output.remark(f"{job.out}/mesh.ply is the surface{fewer}, {job.out}/overview.png shows it.")
     paths = {name: job.out / name for name in RESULT_NAMES if (job.out / name).exists()}
     figures = json.loads((job.out / "summary.json").read_text(encoding="utf-8"))

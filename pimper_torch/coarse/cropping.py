@@ -5,6 +5,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import crop_intrinsics
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Silhouettes, SparseScene
 
 # Pixels kept round the silhouettes, for windows that reach beyond what they match. A choice.
@@ -32,6 +33,7 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     views, masks = scene.views, silhouettes.masks
     images = views.images.new_zeros(views.num_views, views.images.shape[1], height, width)
     shown = torch.zeros_like(images[:, 0], dtype=torch.bool)
+    leave_out("coarse.cropping", views.inside & ~masks)
     intrinsics = scene.cameras.intrinsics.clone()
     for view, ((left, top), (w, h)) in enumerate(zip(low.tolist(), size.tolist(), strict=True)):
         rows, columns = slice(top, top + h), slice(left, left + w)

@@ -23,6 +23,7 @@ from pimper_torch.coarse.matching import Matcher, Windows, pair
 from pimper_torch.errors import caution
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm.scene import photographed
 
@@ -68,7 +69,9 @@ def depth_points(scene: SparseScene) -> SparseScene:
         _tell(scene, 0)
         return scene
     maps = depth_maps(room, everywhere, _MAPS)[-1]
-    if _confirmed(maps) < _MIN_CONFIRMED:
+    confirmed = _confirmed(maps) >= _MIN_CONFIRMED
+    leave_out("depth_points.doubt", not confirmed)
+    if not confirmed:
         _tell(scene, 0)
         return scene
     parts = [_points_of(scene, maps, view) for view in range(scene.cameras.num_views)]
@@ -232,6 +235,7 @@ def _with(
     error = (expected.movedim(0, 1) - pixels).norm(dim=-1)
     seen = seen & (error <= _MAX_ERROR_PX) & (depth.mT > 0)
     kept = seen.sum(dim=1) >= _FEWEST_VIEWS
+    leave_out("depth_points.points", ~kept, at=points)
     points, seen, error, pixels = points[kept], seen[kept], error[kept], pixels[kept]
     point, view = seen.nonzero(as_tuple=True)
     like, before = scene.points_world, len(scene.points_world)

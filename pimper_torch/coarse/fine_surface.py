@@ -28,6 +28,7 @@ from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import connected_to
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import total
 from pimper_torch.records import Cameras, ContourPoints, Record, SparseScene, Support
 from pimper_torch.sfm.surfaces import poisson_surface
@@ -143,7 +144,9 @@ def fine_surface(
     cloud, maps = no_points(centre), None
     if len(reliable) >= _MIN_POINTS or not contours.confine:
         found, maps, pixel = matched_cloud(part, reliable, densify, POINT_PX)
-        cloud = found.take(contours.hull.depth_of(found.points_world) > -TOLERANCE_PX * pixel)
+        near = contours.hull.depth_of(found.points_world) > -TOLERANCE_PX * pixel
+        leave_out("coarse.matched", ~near, at=found.points_world)
+        cloud = found.take(near)
         level = maps.level
     else:
         factor = densify.factors(max(part.views.images.shape[-2:]))[-1]
@@ -153,6 +156,7 @@ def fine_surface(
     centres = vertices[faces].mean(dim=1)
     support = supports(centres, cloud, contour, counts, REACH_PX * pixel)
     inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
+    leave_out("coarse.outside", ~inside, at=centres)
     if not contours.confine:
         inside &= near_points(faces, centres, cloud, support, counts, pixel)
     fraction = min_fraction(contours)
@@ -349,15 +353,20 @@ def seen_surface(
     known = support >= Support.CONTOUR
     small = (config.hole_px * pixel) ** 2
     possible = inside & ((counts.behind < _MIN_BEHIND) | (support == Support.POINTS))
+    leave_out("coarse.seen_through", inside & ~possible, at=(vertices, faces))
     possible = without_small_holes(vertices, faces, possible, small)
     kept = possible & ((counts.seen > 0) | known)
+    leave_out("coarse.unseen", possible & ~kept, at=(vertices, faces))
     area = float(total(face_normals(vertices, faces[kept]).norm(dim=1))) / 2
     holes = enclosed_holes(vertices, faces, kept, config.max_unseen * area)
     kept = kept | (holes & ~connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
     rings = int(config.hole_px / (2 * CELL_PX))
-    kept &= ~fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)
+    strips = fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)
+    leave_out("coarse.fringes", strips, at=(vertices, faces))
+    kept &= ~strips
     (chosen,) = torch.nonzero(kept, as_tuple=True)
     stays = supported_components(vertices, faces[chosen], known[chosen], fraction)
+    leave_out("coarse.components", ~stays, at=(vertices, faces[chosen]))
     kept[chosen[~stays]] = False
     return kept

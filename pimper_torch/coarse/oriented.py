@@ -14,6 +14,7 @@ from pimper_torch.coarse.matching import shifted
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record, SparseScene
 
@@ -132,6 +133,7 @@ def _of_view(
     noise = spread / q.square() * rays.norm(dim=-1) * oblique
     cloud = OrientedPoints(points_world=points, normals_world=normals, noise=noise)
     kept = (denied(maps, view, points) <= maps.agreed[view][fitted]) & (oblique > 0)
+    leave_out("coarse.denied", ~kept, at=points)
     known = ~wanted
     known[fitted] = kept
     return cloud.take(kept), known

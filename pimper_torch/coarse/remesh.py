@@ -15,6 +15,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import corners_of, face_edges, vertex_fans
 from pimper_torch.geometry.visibility import ambient_occlusion
+from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import total
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
 from pimper_torch.silhouettes.contours import Contours
@@ -108,13 +109,16 @@ class Remesh(Stage):
             misfit[templates.facet] = misfit_of(found).to(misfit)
             seen[templates.facet] = heights.num_views >= (1 if contours.confine else _MIN_VIEWS)
         inside = within(contours.hull, surface, patches.num_patches)
+        leave_out("remesh.outside", ~inside, at=(mesh.vertices_world, mesh.faces))
         if contours.confine:
             seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
             if patches.coarse.support is not None:
                 occlusion = ambient_occlusion(mesh.vertices_world, mesh.faces).to(misfit)
                 centers = mesh.vertices_world[mesh.faces].mean(dim=1).detach()
                 support = patches.coarse.support
-                inside &= ~contradicted(centers, mesh.faces, support, misfit, occlusion)
+                against = contradicted(centers, mesh.faces, support, misfit, occlusion)
+                leave_out("remesh.contradicted", against, at=centers)
+                inside &= ~against
         return remesh(
             patches.coarse,
             surface,
@@ -172,6 +176,7 @@ def remesh(
     corners, centres = _on_surface(old, faces, edges, face_edge, surface)
     with torch.no_grad():
         kept = _with_data(old, faces, surface, seen, config.max_hole)
+        leave_out("remesh.data", ~kept, at=(old, faces))
         if inside is not None and bool((kept & inside).any()):
             kept = kept & inside
         severity = _severity(corners, faces, surface, spacing, residual, config)

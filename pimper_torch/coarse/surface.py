@@ -20,6 +20,7 @@ from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import triangulation_angles
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
 from pimper_torch.sfm.surfaces import simplified
 from pimper_torch.silhouettes.contours import Contours
@@ -91,7 +92,9 @@ class CoarseSurface(Stage):
             pixel = pixel_size(scene, reliable) if len(reliable) else float("inf")
             support = None
         else:
-            reliable = reliable[contours.hull.depth_of(scene.points_world[reliable]) > 0]
+            within = contours.hull.depth_of(points := scene.points_world[reliable]) > 0
+            leave_out("coarse.hull", ~within, at=points)
+            reliable = reliable[within]
             if len(reliable) < 4 and not contours.confine:
                 raise ReconstructionError(
                     f"coarse mesh: {len(reliable)} of {len(scene.points_world)} sparse points are "
@@ -100,9 +103,12 @@ class CoarseSurface(Stage):
                 )
             fine = fine_surface(scene, reliable, contours, self.densify, self.fine)
             vertices, faces = _used(*simplified(fine.vertices_world, fine.faces, count))
+            crowded = len(faces)
             faces = two_faces_an_edge(vertices, faces)
+            leave_out("coarse.crowded", crowded - len(faces), total=crowded)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
             kept = supported_components(vertices, faces, whole, min_fraction(contours))
+            leave_out("coarse.pieces", ~kept)
             vertices, faces = _used(vertices, faces[kept])
             pixel, support = fine.pixel, fine.support_of(vertices[faces])
         return CoarseMesh(
@@ -127,6 +133,7 @@ class CoarseSurface(Stage):
             & (scene.reprojection_errors_px <= _MAX_ERROR_PX)
             & (angle >= torch.deg2rad(angle.new_tensor(_MIN_ANGLE_DEG)))
         )
+        leave_out("coarse.reliable", ~reliable, at=scene.points_world)
         return reliable.nonzero()[:, 0]
 
 

@@ -21,6 +21,7 @@ from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import (
     CoarseMesh,
@@ -395,6 +396,7 @@ def _agreement(
     away = (estimates.height - median) / (outlier_samples * estimates.scale)
     many = patches[estimates.vertex] >= 3
     beyond = (away.abs() - 1).clamp_min(0)
+    leave_out("fuse.outvoted", many & (_DISTRUST * beyond.square() > 1))
     return torch.where(many, 1 / (1 + _DISTRUST * beyond.square()), 1)
 
 

@@ -23,6 +23,7 @@ from pimper_torch.fusion.problem import FINEST, Problem, pose
 from pimper_torch.fusion.terms import Terms
 from pimper_torch.geometry.subdivision import transferred
 from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import average
 from pimper_torch.records import Convergence, Record, StopCause, Surface, SweptPatches
 from pimper_torch.silhouettes.contours import Contours
@@ -148,6 +149,9 @@ class Fuse(Stage):
         shared = self._shared(coarse, contacts)
         fine = pose(swept, config.samples_per_vertex, config.slopes)
         solved, solves = self._solve(fine, contacts, shared)
+        leave_out("fuse.support", ~fine.blend.supported, at=fine.points)
+        leave_out("fuse.normals", ~fine.known, at=fine.points)
+        leave_out("fuse.albedo", ~fine.blend.observed, at=fine.points)
         subdivision, directions, blend = fine.subdivision, fine.directions, fine.blend
         heights = solved.to(blend.heights)
         vertices = subdivision.points + heights[:, None] * directions

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -138,6 +139,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "doubt": scene.doubt or None,
         "offset_world": list(scene.offset_world),
         "failures": _failures(result.failures),
+        "left_out": [asdict(entry) for entry in result.left_out],
         "sparse_points": len(scene.points_world),
         "mesh_points": len(result.coarse.mesh.vertices_world),
         "triangles": len(result.coarse.mesh.faces),

@@ -220,11 +220,6 @@ class Hierarchy:
         small = matrix.shape[0] <= _DENSE
         self._coarsest = _dense_inverse(matrix).to(device) if small else None
 
-    @property
-    def num_levels(self) -> int:
-        """Including that of the given matrix."""
-        return len(self._levels)
-
     def precondition(self, residual: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         """Apply the approximate inverse."""
         return self.cycle(residual).clone()

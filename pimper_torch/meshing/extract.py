@@ -12,6 +12,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import component_areas
 from pimper_torch.geometry.topology import face_components, vertex_fans
+from pimper_torch.ledger import leave_out
 from pimper_torch.meshing.borders import protruding
 from pimper_torch.meshing.faults import faults, overturned, stretched
 from pimper_torch.meshing.groups import diagonal, small_groups
@@ -89,11 +90,20 @@ class Extract(Stage):
         max_hole = self.config.max_hole * diagonal(vertices)
         filled = small_groups(vertices, surface.faces, ~supported, max_hole)
         keep = (supported | filled)[surface.faces].all(dim=1)
+        leave_out("extract.support", ~keep, at=(vertices, surface.faces))
         error, bound = surface.expected_error, self.config.max_expected_error
         if error is not None:
-            keep &= (error <= bound * diagonal(vertices))[surface.faces].all(dim=1)
+            near = (error <= bound * diagonal(vertices))[surface.faces].all(dim=1)
+            leave_out("extract.expected_error", keep & ~near, at=(vertices, surface.faces))
+            keep &= near
         with_support = int(keep.sum())
-        faces = surface.faces[keep & ~self._spikes(surface)]
+        spikes, long = (
+            self._spikes(surface),
+            stretched(vertices, surface.faces, self.config.max_stretch),
+        )
+        leave_out("extract.spikes", keep & spikes & long, at=(vertices, surface.faces))
+        leave_out("extract.overturned", keep & spikes & ~long, at=(vertices, surface.faces))
+        faces = surface.faces[keep & ~spikes]
         if len(faces) == 0:
             raise ReconstructionError(
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
@@ -103,9 +113,12 @@ class Extract(Stage):
                 "of missing data that the report gives."
             )
         teeth = protruding(vertices, faces, _TOOTH * facet_side(surface))
+        leave_out("extract.borders", teeth & ~teeth.all(), at=(vertices, faces))
         if not bool(teeth.all()):  # where all is as narrow as a facet, it is the surface
             faces = faces[~teeth]
-        faces = faces[large_components(vertices, faces, self.config.min_piece)]
+        large = large_components(vertices, faces, self.config.min_piece)
+        leave_out("extract.pieces", ~large, at=(vertices, faces))
+        faces = faces[large]
         source, faces = vertex_fans(faces)
         return Mesh(
             vertices_world=surface.vertices_world[source],

@@ -13,6 +13,7 @@ from torch import Tensor
 from pimper_torch.config import require
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, corners_of, vertex_components
+from pimper_torch.ledger import leave_out
 from pimper_torch.meshing.faults import faults
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.meshing.plates import least_bent
@@ -68,6 +69,7 @@ class Repair(Stage):
         positions, moving = repair(vertices[used], part.faces, part.broken, farthest)
         vertices = vertices.index_copy(0, used, positions)
         moved = torch.zeros_like(surface.facet, dtype=torch.bool).index_put((used,), moving)
+        leave_out("repair", moved, at=before)
         beside = corners_of(faces, moved[faces].any(dim=1), len(vertices))
         return surface.replace(
             vertices_world=vertices,

@@ -15,6 +15,7 @@ from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.pyramid import look_up, pyramid_level
 from pimper_torch.patches.resample import hide, resampled
@@ -113,13 +114,16 @@ class Warp(Stage):
             radiance = raster.new_zeros(shape, dtype=sources.images.finest.dtype)
             return Observations(radiance=radiance, valid=radiance[:, :, 0] > 0)
 
-        return over_patches(
+        found = over_patches(
             lambda some: self._register(cameras, sources, templates.take(some)),
             templates.facet,
             "warp",
             lost,
             "These patches have no samples, as if no view showed them",
         )
+        total = int(templates.inside.sum()) * cameras.num_views
+        leave_out("warp", total - int(found.valid.sum()), total=total)
+        return found
 
     def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
         images, config = sources.images.finest, self.config

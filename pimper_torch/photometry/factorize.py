@@ -14,6 +14,7 @@ from pimper_torch.config import require, require_at_most
 from pimper_torch.failures import by_data, out_of_memory, over_patches, reason_of, skipped
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.photometry.balm import solve_balm
@@ -293,6 +294,11 @@ class Factorize(Stage):
     def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
         """Set the scale of albedo over all patches, and warn of those that are undetermined."""
         config = self.config
+        status = torch.cat([bucket.status for bucket in solved.buckets])
+        mesh, facet = solved.patches.coarse.mesh, [one.facet for one in solved.patches.buckets]
+        undetermined = status != int(PatchStatus.DETERMINED)
+        at = mesh.vertices_world, mesh.faces[torch.cat(facet)]
+        leave_out("photometry.undetermined", undetermined, at=at)
         warn_of_undetermined(solved.buckets, config.min_views, config.min_light_variation)
         return in_gauge(solved)
 
@@ -314,6 +320,8 @@ class Factorize(Stage):
         rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
         observed = bucket.registered.valid & bucket.templates.inside[:, None]
         lit = in_row(illuminated, rows.index) & rows.seen & faces_light(point_light, rows.normals)
+        dark = int((rows.seen & ~lit).sum())
+        leave_out("photometry.shadows", dark, total=int(rows.seen.sum()))
         status = patch_status(
             observed.flatten(1).any(dim=1),
             rows.seen.flatten(1).any(dim=1),
@@ -343,6 +351,8 @@ class Factorize(Stage):
         is_solved = factors.lights.isfinite().flatten(1).all(dim=1) & (
             finite_normals & enough_views
         ).any(dim=1)
+        outvoted = (factors.weight < problem.weight / 2) & rows.seen
+        leave_out("photometry.robust", int(outvoted.sum()), total=int(rows.seen.sum()))
         failed = (prepared.status == int(PatchStatus.DETERMINED)) & ~is_solved
         status = torch.where(failed, int(PatchStatus.FAILED), prepared.status)
         _tell_failed(bucket.templates.facet[failed])

@@ -1,7 +1,7 @@
 """Frozen data that travels between stages; no algorithms."""
 
 from pimper_torch.records.contours import ContourPoints, ContourRays
-from pimper_torch.records.failure import Failure
+from pimper_torch.records.failure import Failure, LeftOut
 from pimper_torch.records.patches import (
     AlignStatus,
     Convergence,
@@ -49,6 +49,7 @@ __all__ = [
     "FacetPoints",
     "Failure",
     "Heights",
+    "LeftOut",
     "Lens",
     "Mesh",
     "Observations",

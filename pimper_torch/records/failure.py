@@ -1,8 +1,11 @@
-"""What of a run failed and was left out."""
+"""What of a run failed or was left out."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from pimper_torch.records.record import Record
+
+What = Literal["photographs", "features", "matches", "points", "pixels", "facets", "faces", "doubt"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,3 +25,24 @@ class Failure(Record):
     name: str
     reason: str
     done: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeftOut(Record):
+    """What a guard left out of what it looked at, or doubted; see :mod:`pimper_torch.ledger`.
+
+    Attributes:
+        guard: Room and name, such as ``extract.borders``.
+        what: Was left out; samples of photographs are pixels.
+        count: How many.
+        total: Of how many.
+        reason: In a few words.
+        names: Of photographs, where they are known.
+    """
+
+    guard: str
+    what: What
+    count: int
+    total: int
+    reason: str
+    names: tuple[str, ...] = ()

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from pimper_torch.records.failure import Failure
+from pimper_torch.records.failure import Failure, LeftOut
 from pimper_torch.records.patches import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
@@ -41,6 +41,7 @@ class Reconstruction(Record):
         patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
         report: One entry a stage, in the order they ran.
         failures: What was left out, as it failed.
+        left_out: What guards left out or doubted, in order.
     """
 
     mesh: Mesh
@@ -50,6 +51,7 @@ class Reconstruction(Record):
     report: tuple[StageReport, ...]
     silhouettes: Silhouettes
     failures: tuple[Failure, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
 
     @property
     def cameras(self) -> Cameras:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.ledger import leave_out
 from pimper_torch.progress import track
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.camera_in_place import (
@@ -71,6 +72,14 @@ def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
             _drop_matches(stored, matched, found, geometries, settings.min_inliers)
             return found.rest.replace(maps=_maps(found, settings.min_inliers))
     return found.rest
+
+
+def enter_room(rest: StaticBackground) -> tuple[int, int]:
+    """Enter in the ledger how many features rest with a room; return their and all numbers."""
+    resting = sum(int(one.sum()) for one in rest.features)
+    total = sum(map(len, rest.features))
+    leave_out("sfm.shifted_room" if rest.shift_px else "sfm.room", resting, total=total)
+    return resting, total
 
 
 def _maps(found: "_Found", fewest: int) -> tuple[Float[Tensor, "3 3"], ...]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, some
 from pimper_torch.file_names import match_files
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Lens, Record, pairs_table
 from pimper_torch.records.scene import no_maps, no_series
 
@@ -108,6 +109,7 @@ def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
     while model.num_views:
         seen = torch.bincount(model.observation_view, minlength=model.num_views)
         strong = torch.nonzero(seen >= fewest)[:, 0].tolist()
+        leave_out("sfm.weak_views", seen < fewest)
         if len(strong) == model.num_views:
             break
         model = select_views(model, strong)

@@ -17,6 +17,7 @@ from pimper_torch.errors import (
     overheard,
     some,
 )
+from pimper_torch.ledger import kept_entries, leave_out, noted_entries, repeat_entries
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.colmap import CAMERA_MODELS
@@ -33,7 +34,7 @@ from pimper_torch.sfm.quarter_turns import turned_views
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
 from pimper_torch.sfm.scene import assemble_scene, model_of_scene, with_model_points
-from pimper_torch.sfm.series import largest_series, series_in, with_series
+from pimper_torch.sfm.series import series_in, with_series
 from pimper_torch.sfm.triangulation import TriangulationSettings, lacks_points, triangulate
 from pimper_torch.sfm.upright import upright
 from pimper_torch.sfm.workspace import workspace
@@ -227,7 +228,7 @@ class Reconstruct(Stage):
         _require_finite(views)
         if sparse_model is None:
             return placed_scene(views, find_model(views, self.config, self.store)[0])
-        return placed_scene(views, largest_series(self._given(views, Path(sparse_model))))
+        return placed_scene(views, self._given(views, Path(sparse_model)))
 
     def with_points(self, scene: SparseScene) -> SparseScene:
         """Triangulate points for a scene whose views observe hardly any, its cameras held fixed.
@@ -268,6 +269,7 @@ def placed_scene(views: Views, model: SparseModel) -> SparseScene:
     Warns of those that the model lacks, and of a model that is doubtful.
     """
     missing = [name for name in views.names if name not in model.names]
+    leave_out("sfm.missing", len(missing), total=views.num_views, names=missing)
     if missing:
         caution(
             f"{model.num_views} of {views.num_views} photographs found their place; left "
@@ -275,6 +277,7 @@ def placed_scene(views: Views, model: SparseModel) -> SparseScene:
             stacklevel=3,
         )
     reason = "" if lacks_points(model) else doubt(model, views.num_views)
+    leave_out("sfm.doubt", bool(reason))
     if reason:
         caution(reason, stacklevel=3)
     return assemble_scene(views, model).replace(doubt=reason)
@@ -310,16 +313,18 @@ def kept_model(
     """
     kept = store.find(key, SparseModel) if store and key else None
     if kept is not None:
+        repeat_entries(kept.about["left_out"])
         for message in kept.about["cautions"]:
             caution(message, stacklevel=3)
         return kept.record, float(kept.about["seconds"])
     began = time.perf_counter()
-    with overheard() as cautions:
+    with overheard() as cautions, noted_entries() as entries:
         model = settled(find())
     seconds = time.perf_counter() - began
     if store and key:
         try:
-            store.keep(key, model, {"seconds": seconds, "cautions": cautions})
+            about = {"seconds": seconds, "cautions": cautions, "left_out": kept_entries(entries)}
+            store.keep(key, model, about)
         except OutputError as error:
             caution(str(error), stacklevel=3)
     return model, seconds
@@ -352,6 +357,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
             "in which there are features, of some hundred pixels at least."
         )
     turns = (0,) * views.num_views if config.own_cameras else sensor_turns(views)
+    leave_out("sfm.quarter_turns", sum(map(bool, turns)), total=len(turns))
     lying = turned_views(views, [-quarters for quarters in turns])
     lenses = choose_lenses(lying, shared=config.shared_camera, own=config.own_cameras)
     release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
@@ -365,13 +371,12 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     model = _chosen(found, names, 0.0 if found.around else _MIN_FRACTION)
     if found.around:
         model = with_series(model, series_in(model, views.names, found.around), views.names)
-    else:
-        model = largest_series(model)
     series = dict(zip(model.names, model.series.tolist(), strict=False))
     numbers = [views.names.index(name) for name in model.names]
     model = refine_tracks(lying.take(numbers), model, config.tracks)
     release_memory()
     reason = doubt_one_lens(model)
+    leave_out("sfm.one_lens", bool(reason))
     if reason:
         caution(reason, stacklevel=3)
     model = with_background(model, found, names)
@@ -396,6 +401,7 @@ def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> 
         for file, fraction in found.misplaced.items()
         if names[file] in model.names
     ]
+    leave_out("sfm.misplaced", len(misplaced), total=model.num_views)
     if misplaced:
         caution(
             f"{len(misplaced)} of {model.num_views} photographs contradict most matches with those "

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import homogeneous
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
@@ -96,7 +97,10 @@ def refine_tracks(
     if rounds:
         model = bundle(model, scale, cameras=False)
         limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
+        before = len(model.points_world)
         model = model.without(observation_errors(model) > limit)
+        lost = before - len(model.points_world)
+        leave_out("sfm.tracks", lost, total=before)
     return model
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, caution, some
 from pimper_torch.geometry.frames import rigid
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Lens
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.model_files import FileCamera, FileImage, FileModel
@@ -53,6 +54,9 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
         for fault, names in faults.items()
     ]
     nowhere = int((~finite).sum())
+    broken = [name for names in faults.values() for name in names]
+    leave_out("sfm.broken_images", len(broken), total=len(files.images), names=broken)
+    leave_out("sfm.broken_points", nowhere, total=len(finite))
     if nowhere:
         dropped.append(f"{nowhere} of {len(finite)} points, whose coordinates are not finite")
     broken_images = len(files.images) - len(kept) > _MAX_BROKEN * len(files.images)

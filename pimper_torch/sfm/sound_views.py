@@ -9,6 +9,7 @@ from torch import Tensor
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.failures import skipped
 from pimper_torch.geometry.projection import project
+from pimper_torch.ledger import leave_out
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Failure, SparseScene
 
@@ -32,11 +33,14 @@ def sound(scene: SparseScene) -> SparseScene:
         ReconstructionError: Fewer than three views are left.
     """
     finite = scene.points_world.isfinite().all(dim=1)
+    leave_out("sfm.sound_points", ~finite)
     if not bool(finite.all()):
         lost = f"{int((~finite).sum())} of {len(finite)}"
         skipped(_failure("points", lost, "their coordinates are not finite", "They are left out"))
         scene = with_points(scene, finite)
     reasons = dict(_unusable(scene))
+    unusable = [scene.views.names[view] for view in reasons]
+    leave_out("sfm.sound_views", len(unusable), total=scene.views.num_views, names=unusable)
     if not reasons:
         return scene
     names = scene.views.names

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Record
 from pimper_torch.silhouettes.cuts import Cuts
 from pimper_torch.silhouettes.opencv import blind_holes, components_of
@@ -103,4 +104,5 @@ def _without_shadows(cuts: Cuts) -> Cuts:
     for view in (exceeds & (over < _MOST * own) & (lost <= _SHIFTED * over)).nonzero()[:, 0]:
         outside = masks[view] & (cuts.margins_px[view] < -far / 2)
         masks[view] &= ~components_of(outside, excess[view])
+    leave_out("silhouettes.shadows", cuts.masks & ~masks)
     return cuts.replace(masks=masks)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import torch
 
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.sfm.sound_views import with_views
 
@@ -29,7 +30,9 @@ def by_series(
     chosen = [scene.series == number for number in sorted(set(scene.series.tolist()))]
     views = [one.nonzero()[:, 0] for one in chosen]
     found = [find(part(scene, one.tolist()), tuple(one.tolist())) for one in views]
-    if any(one.source == "everything" for one in found):
+    doubtful = sum(one.source == "everything" for one in found)
+    leave_out("silhouettes.by_series", doubtful, total=len(found))
+    if doubtful:
         planes = torch.cat([one.planes_world for one in found])
         return Silhouettes.everything(scene.views, planes)
     order = torch.cat(views).argsort()

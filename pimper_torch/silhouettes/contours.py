@@ -8,6 +8,7 @@ from torch import Tensor
 
 from pimper_torch.errors import caution
 from pimper_torch.geometry.projection import triangulate_rays
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
 from pimper_torch.silhouettes.hull import Everywhere, Hull, visual_hull
 from pimper_torch.silhouettes.rays import RayConfig, contour_rays
@@ -105,6 +106,7 @@ class TraceContours(Stage):
             hull = visual_hull(
                 silhouettes, cameras.to(torch.float32), box.float(), disagreeing=fraction
             )
+        leave_out("contours.hull", hull is None)
         if hull is None:
             caution(
                 "contours: the silhouettes of the views have no place in common, so that they "

@@ -13,6 +13,7 @@ from torch.nn.functional import interpolate
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
 from pimper_torch.silhouettes.by_series import by_series
 from pimper_torch.silhouettes.cues import cues_of
@@ -86,6 +87,7 @@ class CorrectSilhouettes(Stage):
         cuts = cuts_of(cues, masks, margins)
         corrected = silhouettes_of(cuts, scene.views, self.details)
         confirmed = corrected.reliable
+        leave_out("silhouettes.unconfirmed", ~confirmed, names=scene.views.names)
         return silhouettes.replace(
             inside=torch.where(confirmed[:, None, None], corrected.inside, silhouettes.inside),
             reliable=silhouettes.reliable | confirmed,

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
 from pimper_torch.failures import skipped
+from pimper_torch.ledger import leave_out
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
 from pimper_torch.silhouettes.by_series import by_series
@@ -67,6 +68,7 @@ class FindSilhouettes(Stage):
         doubt = "the views' silhouettes have nothing in common"
         if cuts is not None:
             doubt = self._doubt(agreement_of(cuts))
+        leave_out("silhouettes.doubt", cuts is None or bool(doubt))
         if cuts is None or doubt:
             _warn(doubt, cues.plane is not None)
             return Silhouettes.everything(scene.views, self._top(cues))
@@ -121,7 +123,9 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
 
 def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
     """Take empty silhouettes for unreliable: the hull of all views would be empty."""
+    leave_out("silhouettes.unreliable", ~silhouettes.reliable, names=names)
     empty = silhouettes.reliable & ~(silhouettes.inside > 0.5).flatten(1).any(dim=1)
+    leave_out("silhouettes.empty", empty, names=names)
     if not bool(empty.any()):
         return silhouettes
     skipped(

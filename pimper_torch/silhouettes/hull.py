@@ -207,23 +207,6 @@ def visual_hull(
     return hull if bool(hull.occupied.any()) else None
 
 
-def projection(
-    hull: Hull,
-    intrinsics: Float[Tensor, "3 3"],
-    cam_from_world: Float[Tensor, "4 4"],
-    size_px: tuple[int, int],
-) -> Bool[Tensor, "height width"]:
-    """Render the pixels of one view whose rays meet the hull.
-
-    Args:
-        hull: With its distances.
-        intrinsics: In pixels of the picture that is wanted.
-        cam_from_world: Rigid.
-        size_px: Width and height of that picture.
-    """
-    return margins(hull, intrinsics, cam_from_world, size_px) > 0
-
-
 def margins(
     hull: Hull,
     intrinsics: Float[Tensor, "3 3"],

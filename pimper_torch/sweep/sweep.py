@@ -13,6 +13,7 @@ from pimper_torch.failures import over_patches, skipped
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.pyramid import look_up
 from pimper_torch.patches.sources import Sources, prepare
@@ -178,6 +179,12 @@ class Sweep(Stage):
             return self._sweep(cameras, sources, coarse, part)
 
         found = over_patches(work, templates.facet, "sweep", lost, _NO_HEIGHTS)
+        usable = bucket[1].valid.sum(dim=1)
+        most = (usable - self.config.num_views).clamp_min(0)
+        leave_out("sweep.selection", int(most.sum()), total=int(usable.sum()))
+        asked = usable >= self.config.min_views
+        none = asked & (found.information == 0)
+        leave_out("sweep.heights", int(none.sum()), total=int(asked.sum()))
         finite = found.offset.isfinite() & found.information.isfinite()
         if bool(finite.all()):
             return found

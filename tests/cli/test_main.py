@@ -27,7 +27,7 @@ from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.io.version import installed_version
 from pimper_torch.outputs.marker import MARKER
 from pimper_torch.radiometry import Encoding, linear_from_srgb
-from pimper_torch.records import Mesh, Silhouettes
+from pimper_torch.records import LeftOut, Mesh, Silhouettes
 from pimper_torch.silhouettes.find import FindSilhouettes
 
 
@@ -72,6 +72,20 @@ def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys)
     for stage in ("read", "warp", "write"):
         assert stage in told.err
     assert "samples 1,200" in told.err
+
+
+def test_a_run_closes_with_what_guards_left_out(
+    photos, chain, reconstruction, tmp_path, monkeypatch, capsys
+):
+    gone = LeftOut(
+        guard="sfm.missing", what="photographs", count=1, total=4, reason="none", names=("3.png",)
+    )
+    told = reconstruction.replace(left_out=(gone,))
+    monkeypatch.setattr(chain, "__call__", lambda *_: told)
+    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
+    assert "Left out: 3.png (sfm.missing)." in capsys.readouterr().out
+    (written,) = json.loads((tmp_path / "out" / "summary.json").read_text())["left_out"]
+    assert LeftOut(**{**written, "names": tuple(written["names"])}) == gone
 
 
 def test_options_reach_their_stages(photos, chain, tmp_path):

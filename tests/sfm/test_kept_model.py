@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from pimper_torch.errors import PimperWarning, caution
+from pimper_torch.failures import collecting
+from pimper_torch.ledger import leave_out, left_out_of
 from pimper_torch.sfm import reconstruct
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig, find_model
 from pimper_torch.store import Store, digest
@@ -21,6 +23,7 @@ def runs(model, monkeypatch):
     def found(views, config):
         runs.append(config)
         caution("one may be misplaced")
+        leave_out("sfm.tracks", len(runs), total=9)
         maps = torch.eye(3, dtype=torch.float64).repeat(5, 1, 1)
         return model.replace(background_from_view=maps)
 
@@ -37,6 +40,15 @@ def test_structure_from_motion_runs_once_for_the_same_photographs(views, runs, t
     Reconstruct(ReconstructConfig(seed=1), cache=tmp_path)(views)
     Reconstruct()(views)
     assert len(runs) == 3
+
+
+def test_what_guards_left_out_is_entered_again(views, runs, tmp_path):
+    store, told = Store(folder=tmp_path), []
+    for _ in range(2):
+        with collecting() as entries:
+            find_model(views, ReconstructConfig(), store)
+        told.append([(entry.guard, entry.count, entry.total) for entry in left_out_of(entries)])
+    assert told == [[("sfm.tracks", 1, 9)]] * 2
 
 
 def test_the_seconds_are_those_in_which_it_was_found(views, runs, tmp_path):

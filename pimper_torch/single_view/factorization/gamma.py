@@ -23,7 +23,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.robust import robust_deviation
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Srgb
-from pimper_torch.records import PatchViews, Record, Views
+from pimper_torch.records import Record, Views
 from pimper_torch.single_view.factorization.encoded import (
     ITERATIONS,
     EncodedFit,
@@ -215,37 +215,6 @@ def gamma_of_photographs(
     encoded = views.images[:, colour][:, where]
     return estimate_gamma(
         encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank, max_samples=max_samples
-    )
-
-
-def gamma_of_patches(
-    seen: PatchViews, *, rank: int = 4, channel: int | None = None, max_samples: int = 300
-) -> GammaEstimate:
-    """Estimate the gamma of registered photographs, from all facets together.
-
-    One light a view for the whole scene is assumed, so a near point light counts as noise. Samples
-    that registration dropped as dark or saturated stay dropped: keep ``warp.dark_level`` well
-    below 0.1.
-
-    Args:
-        seen: Of views read with :data:`~pimper_torch.radiometry.LINEAR`.
-        rank: 3 for distant point lights alone, 4 with ambient light.
-        channel: Which colour; by default the middle one, green.
-        max_samples: More are subsampled evenly.
-
-    Raises:
-        InputError: As :func:`estimate_gamma`.
-    """
-    values, valid = [], []
-    for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
-        colour = registered.radiance.shape[2] // 2 if channel is None else channel
-        facet = (templates.barycentric >= 0).all(dim=-1)
-        values.append(registered.radiance[:, :, colour].movedim(1, 0)[:, facet])
-        valid.append(registered.valid.movedim(1, 0)[:, facet])
-    encoded = torch.cat(values, dim=1).detach()
-    # Values outside [0, 1] are rounding of interpolation and pyramids.
-    return estimate_gamma(
-        encoded.clamp(0, 1), torch.cat(valid, dim=1), rank=rank, max_samples=max_samples
     )
 
 

@@ -3,10 +3,10 @@ import math
 import pytest
 import torch
 import trimesh
+from closedness import closedness
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.metrics.closedness import closedness
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.records import Mesh
 

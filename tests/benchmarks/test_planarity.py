@@ -2,10 +2,10 @@ import math
 
 import pytest
 import torch
+from planarity import dihedrals, planar_faces
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.metrics.planarity import dihedrals, planar_faces
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.records import Mesh

@@ -1,0 +1,288 @@
+"""What guards leave out of plain photographs, and what they gain where they are needed.
+
+    python benchmarks/guards.py FOLDER [--presets fast default] [--sets NAME ...] [--tiny]
+    python benchmarks/guards.py FOLDER --without extract.borders [--sets NAME ...]
+    python benchmarks/guards.py FOLDER --table
+
+Every set is rendered once into FOLDER, run with the ledger's listener, and judged by the truth:
+a photograph is right unless it was spoilt, a doubt if the cameras are good, faces, facets and
+points if they lie near the true surface, pixels if they show the object. Features and matches are
+counted. Results are kept, one JSON a run, under set, preset and key: a run that was interrupted
+goes on with the same command.
+"""
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from guard_sets import SETS, Set, prepared
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from pimper_torch.chains.presets import load_chain
+from pimper_torch.errors import PimperError
+from pimper_torch.evidence.datasets import read_rendered
+from pimper_torch.evidence.metrics.evaluate import Evaluation, evaluate
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.io.photographs import load_views
+from pimper_torch.ledger import GUARDS, listening
+from pimper_torch.records import Capture, Estimate, LeftOut, Reconstruction
+
+# A place is right within this fraction of the object's diagonal: five times what accurate surfaces
+# are off. Cameras are good within these errors; all choices.
+NEAR, MOST_DEG, MOST_PERCENT = 0.005, 1.0, 2.0
+SAMPLES = 5_000  # places of an entry that are judged
+
+
+def nothing(like: int) -> Callable[..., Tensor]:
+    """Return a guard that marks none of its argument number ``like``."""
+    return lambda *given, **_: torch.zeros(len(given[like]), dtype=torch.bool)
+
+
+def everything(like: int) -> Callable[..., Tensor]:
+    """Return a guard that marks all of its argument number ``like``."""
+    return lambda *given, **_: torch.ones(len(given[like]), dtype=torch.bool)
+
+
+# What stands in for each guard that can be switched off, and settings that switch it off.
+PATCHES: dict[str, dict[str, object]] = {
+    "sfm.room": {"sfm.registration._leave_out_room": lambda *_: (None, {})},
+    "sfm.shifted_room": {"sfm.registration._leave_out_room": lambda *_: (None, {})},
+    "sfm.moved_object": {"sfm.registration.tie_series": lambda *_: (None, ())},
+    "sfm.weak_views": {"sfm.registration.drop_weak_views": lambda model, _: model},
+    "sfm.misplaced": {"sfm.agreement._MIN_AGREEMENT": 0.0},
+    "sfm.one_lens": {"sfm.reconstruct.doubt_one_lens": lambda _: ""},
+    "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
+    "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},
+    "silhouettes.shadows": {"silhouettes.agreement._without_shadows": lambda cuts: cuts},
+    "coarse.seen_through": {"coarse.fine_surface._MIN_BEHIND": 10**9},
+    "coarse.fringes": {"coarse.fine_surface.fringes": nothing(1)},
+    "remesh.outside": {
+        "coarse.remesh.within": lambda *given: torch.ones(given[2], dtype=torch.bool)
+    },
+    "remesh.contradicted": {"coarse.remesh.contradicted": nothing(1)},
+    "remesh.data": {"coarse.remesh._with_data": everything(1)},
+    "fuse.outvoted": {"fusion.blend._agreement": lambda found, *_: torch.ones_like(found.height)},
+    "repair": {"meshing.repair.Repair.forward": lambda _, surface: surface},
+    "extract.spikes": {"meshing.extract.Extract._spikes": lambda _, one: nothing(0)(one.faces)},
+    "extract.borders": {"meshing.extract.protruding": nothing(1)},
+}
+CHANGES: dict[str, dict[str, object]] = {
+    "photometry.shadows": {"factorize": {"shadows": False}},
+    "photometry.robust": {"factorize": {"loss": "squares"}},
+    "extract.expected_error": {"extract": {"max_expected_error": math.inf}},
+    "extract.pieces": {"extract": {"min_piece": 0.0}},
+}
+
+
+@dataclass
+class Heard:
+    """The ledger's listener: entries, places of what was taken, and masks of pixels."""
+
+    entries: list[tuple[LeftOut, Tensor | None, Tensor | None]] = field(default_factory=list)
+
+    def __call__(self, entry: LeftOut, mask: Tensor | None, places: Tensor | None) -> None:
+        """Keep an entry with as many places as are judged."""
+        if mask is not None and places is not None and entry.count:
+            taken = places.detach()[mask.flatten()]
+            places = taken[:: math.ceil(len(taken) / SAMPLES)].double().cpu()
+        pixels = mask.cpu() if mask is not None and mask.ndim == 3 and entry.count else None
+        self.entries.append((entry, places if entry.count else None, pixels))
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The truth about what guards took; without a true scene it tells nothing of places."""
+
+    names: tuple[str, ...]
+    spoilt: list[str]
+    good: bool | None = None
+    truth_from_world: Tensor | None = None
+    surface: NearestSurface | None = None
+    near: float = 0.0
+    shown: Tensor | None = None
+
+    def right(self, entry: LeftOut, places: Tensor | None, pixels: Tensor | None) -> float | None:
+        """Return the fraction of what was taken that was right; ``None`` where nothing tells."""
+        if entry.what == "photographs" and entry.names:
+            return sum(name not in self.spoilt for name in entry.names) / len(entry.names)
+        if entry.what == "doubt" and self.good is not None:
+            return float(self.good)
+        if places is not None and self.surface is not None and self.truth_from_world is not None:
+            distance = self.surface.query(transform(self.truth_from_world, places)).distance
+            return float((distance < self.near).double().mean())
+        if pixels is not None and self.shown is not None and len(pixels) == len(self.shown):
+            shown = interpolate(self.shown[:, None].float(), pixels.shape[1:])[:, 0] > 0.5
+            return float(shown[pixels].double().mean())
+        return None
+
+
+def judge_of(
+    place: Path, spoilt: list[str], result: Reconstruction | None
+) -> tuple[Judge, dict[str, object]]:
+    """Compare a result with the truth, and return the figures of cameras and surface, too."""
+    if result is None or not (place / "truth").exists():
+        names = () if result is None else result.scene.views.names
+        return Judge(names=names, spoilt=spoilt), {}
+    capture, names = read_rendered(place, maps=False, photographs=False), result.scene.views.names
+    estimate = Estimate(mesh=result.mesh, names=names, cameras=result.cameras)
+    found: Evaluation = evaluate(estimate, capture)
+    cameras, surface, mesh = found.cameras, found.surface, capture.truth.mesh
+    assert None not in (cameras, surface, mesh)
+    good = cameras.mean_rotation_deg < MOST_DEG and cameras.mean_center_percent < MOST_PERCENT
+    judge = Judge(
+        names=names,
+        spoilt=spoilt,
+        good=good,
+        truth_from_world=found.alignment.truth_from_world,
+        surface=NearestSurface(mesh),
+        near=NEAR * surface.diagonal,
+        shown=shown_by(place, capture, names),
+    )
+    return judge, {
+        "rotation_deg": cameras.mean_rotation_deg,
+        "centre_percent": cameras.mean_center_percent,
+        "chamfer_percent": surface.seen.chamfer_mean_percent if surface.seen else None,
+        "accuracy_percent": surface.accuracy.mean_percent if surface.accuracy else None,
+    }
+
+
+def shown_by(place: Path, capture: Capture, names: tuple[str, ...]) -> Tensor | None:
+    """Read which pixels of the registered photographs show the object."""
+    masks = load_views(place / "photos", masks=place / "masks").masks
+    rows = [capture.views.names.index(name) for name in names]
+    return None if masks is None else masks[rows]
+
+
+def run(place: Path, spoilt: list[str], one: Set, preset: str, without: str) -> dict[str, Any]:
+    """Reconstruct a set once, and count what every guard took, and how much of it was right."""
+    heard, result, failure = Heard(), None, ""
+    chain = load_chain(preset, CHANGES.get(without, {}))
+    began = time.perf_counter()
+    with ExitStack() as stack:
+        for target, replacement in PATCHES.get(without, {}).items():
+            stack.enter_context(patch(f"pimper_torch.{target}", replacement))
+        stack.enter_context(listening(heard))
+        try:
+            result = chain(
+                load_views(place / "photos", masks=place / "masks" if one.masks else None)
+            )
+        except (PimperError, RuntimeError, IndexError, ValueError) as error:  # without a guard
+            failure = f"{type(error).__name__}: {str(error)[:200]}"
+    seconds = time.perf_counter() - began
+    judge, figures = judge_of(place, spoilt, result)
+    rows: dict[str, dict[str, float]] = {}
+    for entry, places, pixels in heard.entries:
+        row = rows.setdefault(entry.guard, dict.fromkeys(("count", "total", "judged", "right"), 0))
+        fraction = judge.right(entry, places, pixels) if entry.count else None
+        row["count"], row["total"] = row["count"] + entry.count, row["total"] + entry.total
+        if fraction is not None:
+            row["judged"] += entry.count
+            row["right"] += fraction * entry.count
+    registered = [len(judge.names), len(list((place / "photos").iterdir()))]
+    return {
+        "seconds": seconds,
+        "failure": failure,
+        "registered": registered,
+        **figures,
+        "guards": rows,
+    }
+
+
+def told(found: dict[str, Any]) -> str:
+    """Return the figures of a run as cells."""
+    cells = [f"{found['registered'][0]} of {found['registered'][1]}"]
+    for name in ("rotation_deg", "centre_percent", "accuracy_percent", "chamfer_percent"):
+        value = found.get(name)
+        cells.append("" if value is None else f"{value:.3f}")
+    return " | ".join([*cells, found["failure"].replace("|", "/")[:80], f"{found['seconds']:.0f}"])
+
+
+def table(found: dict[tuple[str, str, str], dict[str, Any]]) -> Iterator[str]:
+    """Lay out runs by set, what guards took on plain sets, and what they gain on their own."""
+    head = "views | ° | centres % | accuracy % | Chamfer % | error | s | taken by its guards"
+    yield f"\n| set | preset | without | {head} |"
+    yield "|---|---|---|--:|--:|--:|--:|--:|---|--:|---|"
+    for (name, preset, without), each in sorted(found.items()):
+        own = {guard: each["guards"].get(guard) for guard in SETS[name].guards}
+        taken = [f"{guard} {row['count']} of {row['total']}" for guard, row in own.items() if row]
+        yield f"| {name} | {preset} | {without} | {told(each)} | {', '.join(taken)} |"
+    yield "\n| guard | what | preset | plain sets | took | of | % | right % | most on |"
+    yield "|---|---|---|--:|--:|--:|--:|--:|---|"
+    for guard, (what, _) in GUARDS.items():
+        for preset in sorted({key[1] for key in found}):
+            rows = {
+                name: each["guards"][guard]
+                for (name, used, without), each in found.items()
+                if used == preset and not (without or SETS[name].guards) and guard in each["guards"]
+            }
+            sums = sum((Counter(row) for row in rows.values()), Counter())
+            acted = [name for name, row in rows.items() if row["count"]]
+            if not rows:
+                continue
+            part = f"{100 * sums['count'] / sums['total']:.2f}" if sums["total"] else ""
+            right = f"{100 * sums['right'] / sums['judged']:.0f}" if sums["judged"] else ""
+            most = max(
+                acted, key=lambda name: rows[name]["count"] / rows[name]["total"], default=""
+            )
+            yield (
+                f"| {guard} | {what} | {preset} | {len(acted)} of {len(rows)} | "
+                f"{sums['count']:.0f} | {sums['total']:.0f} | {part} | {right} | {most} |"
+            )
+
+
+def main() -> None:
+    """Read the command line, do what is left to do, and print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, help="of rendered scenes and results")
+    parser.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS), metavar="NAME")
+    parser.add_argument("--presets", nargs="+", default=["fast", "default"])
+    parser.add_argument("--without", choices=sorted({*PATCHES, *CHANGES}), help="on every set")
+    parser.add_argument("--key", help="of the results; the commit by default")
+    parser.add_argument("--tiny", action="store_true", help="8 photographs of 240x180 each")
+    parser.add_argument("--table", action="store_true", help="print what is there, run nothing")
+    options = parser.parse_args()
+    commit = ("git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD")
+    key = options.key or subprocess.run(commit, capture_output=True, text=True).stdout.strip()
+    results = options.folder / "results" / (f"{key}-tiny" if options.tiny else key)
+    results.mkdir(parents=True, exist_ok=True)
+    found: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for preset in options.presets:
+        for name in options.sets:
+            own = [guard for guard in SETS[name].guards if guard in PATCHES or guard in CHANGES]
+            for without in [options.without] if options.without else ["", *own]:
+                path = results / f"{name}--{preset}--{without or 'all'}.json"
+                if not path.exists() and not options.table:
+                    place, spoilt = prepared(options.folder, name, options.tiny)
+                    each = run(place, spoilt, SETS[name], preset, without)
+                    path.with_suffix(".part").write_text(json.dumps(each))
+                    path.with_suffix(".part").rename(path)
+                    say(f"{name} {preset} {without}: {told(each)}")
+                if path.exists():
+                    found[name, preset, without] = json.loads(path.read_text())
+    for line in table(found):
+        say(line)
+
+
+def say(line: str) -> None:
+    """Write a line at once."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    main()

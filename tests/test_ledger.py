@@ -1,0 +1,124 @@
+"""What guards leave out is counted, by whom and why, and nothing else changes."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+import pimper_torch
+from pimper_torch.failures import collecting, distinct, skipped
+from pimper_torch.ledger import (
+    GUARDS,
+    closing_line,
+    kept_entries,
+    leave_out,
+    left_out_of,
+    listening,
+    noted_entries,
+    repeat_entries,
+)
+from pimper_torch.parallel import side_by_side
+from pimper_torch.records import Failure, LeftOut
+
+FAILED = Failure(stage="warp", what="patch", name="3", reason="numbers", done="Left out")
+
+
+def entry(guard, count, total, names=()):
+    what, reason = GUARDS[guard]
+    return LeftOut(guard=guard, what=what, count=count, total=total, reason=reason, names=names)
+
+
+def test_a_mask_is_counted_and_names_are_those_of_its_photographs():
+    with collecting() as entries:
+        leave_out("silhouettes.empty", torch.tensor([True, False, True]), names=("a", "b", "c"))
+        leave_out("extract.borders", torch.tensor([False, True, False, False]))
+        leave_out("sfm.missing", 1, total=8, names=["d"])
+        leave_out("sfm.doubt", bool("why"))
+    assert left_out_of(entries) == (
+        entry("silhouettes.empty", 2, 3, ("a", "c")),
+        entry("extract.borders", 1, 4),
+        entry("sfm.missing", 1, 8, ("d",)),
+        entry("sfm.doubt", 1, 1),
+    )
+
+
+def test_outside_of_a_run_nothing_is_noted():
+    with noted_entries() as entries:
+        leave_out("extract.borders", torch.ones(3, dtype=torch.bool))
+        repeat_entries(kept_entries([entry("extract.borders", 3, 3)]))
+    assert entries == []
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_what_threads_leave_out_is_added_up_for_each_guard_and_call(threads, monkeypatch):
+    monkeypatch.setattr("pimper_torch.parallel.num_workers", lambda: threads)
+
+    def work(number):
+        leave_out("warp", number, total=10)
+        leave_out("photometry.robust", torch.arange(10) < number)
+        if number == 3:
+            skipped(FAILED)
+        return number
+
+    with collecting() as entries:
+        leave_out("warp", 5, total=10)
+        for _ in range(2):
+            assert list(side_by_side(work, range(6))) == list(range(6))
+    passes = (entry("photometry.robust", 15, 60), entry("warp", 15, 60))
+    assert left_out_of(entries) == (entry("warp", 5, 10), *passes, *passes)
+    assert distinct(entries) == (FAILED,)
+
+
+def test_entries_are_repeated_from_json_as_they_were():
+    before = [entry("sfm.missing", 2, 8, ("a", "b")), entry("extract.borders", 1, 4)]
+    with collecting() as entries, noted_entries() as noted:
+        repeat_entries(json.loads(json.dumps(kept_entries([FAILED, *before]))))
+    assert entries == noted == before
+
+
+def test_a_listener_hears_masks_and_places_in_threads_too():
+    heard = []
+    vertices = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    mask = torch.tensor([True, False])
+
+    def work(number):
+        leave_out("extract.pieces", mask, at=(vertices, faces))
+        leave_out("repair", mask[:1], at=vertices[:1])
+        leave_out("sfm.tracks", 1, total=3)
+
+    with listening(lambda *entry: heard.append(entry)):
+        list(side_by_side(work, [0]))
+    leave_out("extract.pieces", mask)
+    (pieces, cut, centres), (_, _, points), (_, nothing, nowhere) = heard
+    assert (pieces.count, pieces.total) == (1, 2)
+    assert cut is mask
+    assert centres.tolist() == [[1, 1, 0], [0, 1, 1]]
+    assert points.tolist() == [[0, 0, 0]]
+    assert nothing is nowhere is None
+
+
+def test_the_closing_line_names_photographs_and_what_is_more_than_a_twentieth():
+    left_out = [
+        entry("sfm.missing", 2, 8, ("IMG_1", "IMG_2")),
+        entry("remesh.outside", 500, 1000),
+        entry("warp", 90, 100),
+        entry("sfm.doubt", 1, 1),
+        entry("remesh.outside", 60, 1000),
+        entry("extract.spikes", 5, 100),
+        entry("extract.borders", 8, 100),
+    ]
+    assert closing_line(left_out) == (
+        "Left out: IMG_1, IMG_2 (sfm.missing); 6% of the facets (remesh.outside); "
+        "8% of the faces (extract.borders)."
+    )
+    assert closing_line([entry("warp", 90, 100), entry("sfm.missing", 0, 8)]) == ""
+
+
+def test_every_guard_is_entered_somewhere_under_its_name():
+    package = Path(pimper_torch.__file__).parent
+    sources = [path.read_text() for path in package.rglob("*.py") if path.name != "ledger.py"]
+    called = re.findall(r'"([a-z_.]+)"', " ".join(text for text in sources if "leave_out(" in text))
+    assert set(GUARDS) <= set(called)
