@@ -12,6 +12,7 @@ from pimper_torch.camera_files.layout import expect, numbers
 from pimper_torch.camera_files.posed_camera import (
     PosedCamera,
     SizesOf,
+    number_lenses,
     pinhole_lens,
     rigid_or_refuse,
 )
@@ -65,21 +66,14 @@ def read_camera_arrays(
     else:
         _one_each(len(poses), photographs, path)
         names = sorted(photographs)
-    found = [
+    cameras = [
         PosedCamera(
-            name=name,
-            lens=pinhole_lens(K, size),
-            skew_px=float(K[0, 1]),
-            cam_from_world=pose,
+            name=name, lens=pinhole_lens(K, size), skew_px=float(K[0, 1]), cam_from_world=pose
         )
         for name, size, K, pose in zip(names, sizes_of(names), intrinsics, poses, strict=True)
         if size is not None
     ]
-    lenses = list(dict.fromkeys(camera.lens for camera in found))
-    return [
-        camera.replace(lens=camera.lens.replace(camera=1 + lenses.index(camera.lens)))
-        for camera in found
-    ]
+    return number_lenses(cameras)
 
 
 def read_world_mats(

@@ -58,20 +58,10 @@ def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
         if pose is None or lens is None:
             continue
         independent = str(view.get("isPoseIndependant", "true")) not in ("false", "0")
-        expect(
-            independent,
-            path,
-            KIND,
-            f"a pose of its own for {name}",
-            "a pose in a rig, which cannot be read; export without rigs",
-        )
-        cameras.append(
-            PosedCamera(
-                name=str(view.get("path")),
-                lens=lens,
-                cam_from_world=_cam_from_world(pose, name, path),
-            )
-        )
+        rig = "a pose in a rig, which cannot be read; export without rigs"
+        expect(independent, path, KIND, f"a pose of its own for {name}", rig)
+        placed = _cam_from_world(pose, name, path)
+        cameras.append(PosedCamera(name=str(view.get("path")), lens=lens, cam_from_world=placed))
     expect(bool(cameras), path, KIND, "views with a pose and intrinsics", "none")
     return cameras
 

@@ -165,8 +165,8 @@ def _rigid_and_scale(
 def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, float]:
     """Translate a sensor's calibration, and give its skew."""
     label = sensor.get("label") or sensor.get("id")
-    found = sensor.findall("calibration")
-    adjusted = [one for one in found if one.get("class") == "adjusted"] or found
+    given = sensor.findall("calibration")
+    adjusted = [one for one in given if one.get("class") == "adjusted"] or given
     expect(bool(adjusted), path, KIND, f"a calibration of the sensor {label}", "none")
     calibration = adjusted[0]
 
@@ -184,13 +184,8 @@ def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, f
         for side in numbers(resolution_px, 2, f"resolution of the sensor {label}", path, KIND)
     )
     old = calibration.find("f") is None and calibration.find("fx") is not None
-    expect(
-        value("f") > 0 and not old,
-        path,
-        KIND,
-        f"a positive f of the sensor {label}",
-        "fx and fy, as old PhotoScan wrote them; export with a newer one" if old else "none",
-    )
+    found = "fx and fy, as old PhotoScan wrote them; export with a newer one" if old else "none"
+    expect(value("f") > 0 and not old, path, KIND, f"a positive f of the sensor {label}", found)
     f, b1, b2 = value("f"), value("b1"), value("b2")
     k1, k2, k3, k4 = (value(tag) for tag in ("k1", "k2", "k3", "k4"))
     p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))

@@ -36,6 +36,15 @@ class PosedCamera(Record):
     skew_px: float = 0.0
 
 
+def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
+    """Let cameras share a lens's number where their lenses are equal."""
+    lenses = list(dict.fromkeys(camera.lens for camera in cameras))
+    return [
+        camera.replace(lens=camera.lens.replace(camera=1 + lenses.index(camera.lens)))
+        for camera in cameras
+    ]
+
+
 def pinhole_lens(
     intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int], camera: int = 1
 ) -> Lens:

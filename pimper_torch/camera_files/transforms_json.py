@@ -7,7 +7,12 @@ from pathlib import Path
 import torch
 
 from pimper_torch.camera_files.layout import expect, numbers, objects, read_json
-from pimper_torch.camera_files.posed_camera import PosedCamera, SizesOf, rigid_or_refuse
+from pimper_torch.camera_files.posed_camera import (
+    PosedCamera,
+    SizesOf,
+    number_lenses,
+    rigid_or_refuse,
+)
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.records import Lens
@@ -62,11 +67,7 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
         size = stated_size(frame) or (sizes[index] if sizes else None)
         if size is not None:
             cameras.append(frame_camera(frame, name, size, path))
-    lenses = list(dict.fromkeys(camera.lens for camera in cameras))
-    return [
-        camera.replace(lens=camera.lens.replace(camera=1 + lenses.index(camera.lens)))
-        for camera in cameras
-    ]
+    return number_lenses(cameras)
 
 
 def stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
@@ -91,28 +92,14 @@ def frame_camera(
     Raises:
         InputError: It is no camera.
     """
-    matrix = frame.get("transform_matrix")
-    expect(
-        isinstance(matrix, list) and len(matrix) in (3, 4),
-        path,
-        KIND,
-        f"4 rows of 4 numbers as transform_matrix of {name}",
-        type(matrix).__name__,
-    )
-    rows = matrix[:3] if isinstance(matrix, list) else []
-    world_from_cam = numbers(rows, 12, f"transform_matrix of {name}", path, KIND).reshape(3, 4)
-    pose = rigid_or_refuse(
-        world_from_cam[:, :3] * FLIP,
-        world_from_cam[:, 3],
-        f"transform_matrix of {name}",
-        path,
-        KIND,
-    )
-    return PosedCamera(
-        name=name,
-        lens=_lens(frame, name, size_px, path),
-        cam_from_world=invert_rigid(pose),
-    )
+    matrix, what = frame.get("transform_matrix"), f"transform_matrix of {name}"
+    rows = matrix[:3] if isinstance(matrix, list) and len(matrix) in (3, 4) else []
+    found = type(matrix).__name__
+    expect(bool(rows), path, KIND, f"4 rows of 4 numbers as {what}", found)
+    world_from_cam = numbers(rows, 12, what, path, KIND).reshape(3, 4)
+    turn, shift = world_from_cam[:, :3] * FLIP, world_from_cam[:, 3]
+    pose = invert_rigid(rigid_or_refuse(turn, shift, what, path, KIND))
+    return PosedCamera(name=name, lens=_lens(frame, name, size_px, path), cam_from_world=pose)
 
 
 def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], path: Path) -> Lens:
@@ -135,13 +122,8 @@ def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], path
 
     width, height = size_px
     focal, focal_y = focal_px("x", width), focal_px("y", height)
-    expect(
-        focal > 0 or focal_y > 0,
-        path,
-        KIND,
-        f"fl_x or camera_angle_x, in the file or for {name}",
-        "neither, or no positive one",
-    )
+    what = f"fl_x or camera_angle_x, in the file or for {name}"
+    expect(focal > 0 or focal_y > 0, path, KIND, what, "neither, or no positive one")
     fx, fy = focal or focal_y, focal_y or focal
     pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))

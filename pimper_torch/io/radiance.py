@@ -1,6 +1,5 @@
 """Image files to radiance: the response undone, 1 where the sensor saturates, shrunk."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError, caution
 from pimper_torch.io.decode import Decoded, decode
 from pimper_torch.io.header import Header
 from pimper_torch.io.responses import response_of
@@ -274,11 +273,10 @@ def _tell(folder: Path, whites: _Whites) -> None:
         levels = [str(round(full * float(one))) for one in white]
         same = len(set(levels)) == 1
         text = levels[0] if same else f"{', '.join(levels)} (red, green, blue)"
-        warnings.warn(
+        caution(
             f"{folder}: values of its files of {full.bit_length()} bits pile up at {text} of "
             f"{full}, which is taken for the level of saturation. If it is not, set "
             "`photographs.saturation` to the true level, or to 1 for full scale.",
-            PimperWarning,
             stacklevel=4,
         )
 
@@ -295,11 +293,10 @@ def _tell_low(folder: Path, tallies: Mapping[_Kind, _Tally], whites: _Whites) ->
     highest = max(int(tally.counts.sum(dim=0).nonzero().max()) for tally in deep.values())
     bits = next((bits for bits in _SENSOR_BITS if highest < 2**bits), None)
     if bits is not None:
-        warnings.warn(
+        caution(
             f"{folder}: no value of its files of 16 bits is above {highest} of 65535. If they hold "
             f"{bits} bits, full scale is {2**bits - 1}: say so by `photographs.saturation`; "
             "saturated pixels are taken for radiance otherwise.",
-            PimperWarning,
             stacklevel=4,
         )
 
