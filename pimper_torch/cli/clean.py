@@ -14,7 +14,15 @@ from pimper_torch.outputs.clean import clean_output, require_cleanable
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    out: Path
+    """Remove what a run into OUT kept to go on from, and what killed runs left beside it.
+
+    The result itself stays.
+
+    Attributes:
+        out: Folder that was given to a run as `-o OUT`.
+    """
+
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
@@ -37,17 +45,6 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         OutputError: The folder.
         SystemExit: ``--help`` was answered.
     """
-
-    def clean(out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]) -> _Job:
-        """Remove what a run into OUT kept to go on from, and what killed runs left beside it.
-
-        The result itself stays.
-
-        Args:
-            out: Folder that was given to a run as `-o OUT`.
-        """
-        return _Job(out=out)
-
-    job = read_arguments(clean, command, arguments)
+    job = read_arguments(_Job, command, arguments)
     require_cleanable(job.out)
     return job

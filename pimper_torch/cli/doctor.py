@@ -20,9 +20,21 @@ from pimper_torch.radiometry import FROM_FILES, Encoding
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    photos: Path | None
-    max_size_px: int
-    photographs: Encoding
+    """Tell what is installed here, and whether photographs are fit for a run, in seconds.
+
+    Of photographs: number, sizes, blur, saturation, exposure, lenses, overlap, how much the
+    light varies, and an estimate of time and memory; each with what to do. Exit code 2 where
+    a run would be refused.
+
+    Attributes:
+        photos: Folder of JPEG, PNG or TIFF files; without it, the machine alone.
+        max_size_px: As of `pimper reconstruct`.
+        photographs: As of `pimper reconstruct`.
+    """
+
+    photos: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PHOTOS")] = None
+    max_size_px: int = 0
+    photographs: Encoding = FROM_FILES
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
@@ -55,28 +67,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         InputError: The folder.
         SystemExit: ``--help`` was answered.
     """
-
-    def doctor(
-        photos: Annotated[
-            tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PHOTOS")
-        ] = None,
-        max_size_px: int = 0,
-        photographs: Encoding = FROM_FILES,
-    ) -> _Job:
-        """Tell what is installed here, and whether photographs are fit for a run, in seconds.
-
-        Of photographs: number, sizes, blur, saturation, exposure, lenses, overlap, how much the
-        light varies, and an estimate of time and memory; each with what to do. Exit code 2 where
-        a run would be refused.
-
-        Args:
-            photos: Folder of JPEG, PNG or TIFF files; without it, the machine alone.
-            max_size_px: As of `pimper reconstruct`.
-            photographs: As of `pimper reconstruct`.
-        """
-        return _Job(photos=photos, max_size_px=max_size_px, photographs=photographs)
-
-    job = read_arguments(doctor, command, arguments, levels=True)
+    job = read_arguments(_Job, command, arguments, levels=True)
     if job.photos is not None:
         list_images(job.photos)
     return job

@@ -20,10 +20,19 @@ from pimper_torch.video.read import frame_pictures, luma_frames
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    video: Path
-    out: Path
-    count: int
-    overwrite: bool
+    """Choose photographs out of a video: sharp frames, equally far apart on the way.
+
+    Attributes:
+        video: MP4, MOV, MKV, WebM or AVI; needs pip install "pimper_torch[video]".
+        out: Folder for the photographs, PNG; new or empty.
+        count: Of photographs.
+        overwrite: Replace photographs that came from a video before.
+    """
+
+    video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
+    count: int = 40
+    overwrite: Flag = False
 
     def __post_init__(self) -> None:
         require(3 <= self.count <= 10_000, "count", self.count, "3 to 10,000")
@@ -79,24 +88,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         PimperError: The folder, or a wrong argument.
         SystemExit: ``--help`` was answered.
     """
-
-    def frames(
-        video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")],
-        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],
-        count: int = 40,
-        overwrite: Flag = False,
-    ) -> _Job:
-        """Choose photographs out of a video: sharp frames, equally far apart on the way.
-
-        Args:
-            video: MP4, MOV, MKV, WebM or AVI; needs pip install "pimper_torch[video]".
-            out: Folder for the photographs, PNG; new or empty.
-            count: Of photographs.
-            overwrite: Replace photographs that came from a video before.
-        """
-        return _Job(video=video, out=out, count=count, overwrite=overwrite)
-
-    job = read_arguments(frames, command, arguments)
+    job = read_arguments(_Job, command, arguments)
     require_apart(job.out, {"VIDEO": job.video})
     prepare_output(job.out, "frames", job.overwrite)
     return job

@@ -17,10 +17,21 @@ from pimper_torch.viz.sheet import is_sheet, write_sheet
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    out: Path
-    paper: Paper
-    side_mm: int
-    overwrite: bool
+    """Write a sheet of markers as PDF, to be printed and photographed with an object.
+
+    Results are then in millimetres. The larger the markers, the farther they are recognised.
+
+    Attributes:
+        out: The file, such as sheet.pdf.
+        paper: Size of the sheet.
+        side_mm: Of the markers' black squares, 10 to 36 millimetres.
+        overwrite: Replace a former sheet.
+    """
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="SHEET")]
+    paper: Paper = "a4"
+    side_mm: int = SIDE_MM
+    overwrite: Flag = False
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
@@ -46,26 +57,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         PimperError: The file, or a wrong argument.
         SystemExit: ``--help`` was answered.
     """
-
-    def markers(
-        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="SHEET")],
-        paper: Paper = "a4",
-        side_mm: int = SIDE_MM,
-        overwrite: Flag = False,
-    ) -> _Job:
-        """Write a sheet of markers as PDF, to be printed and photographed with an object.
-
-        Results are then in millimetres. The larger the markers, the farther they are recognised.
-
-        Args:
-            out: The file, such as sheet.pdf.
-            paper: Size of the sheet.
-            side_mm: Of the markers' black squares, 10 to 36 millimetres.
-            overwrite: Replace a former sheet.
-        """
-        return _Job(out=out, paper=paper, side_mm=side_mm, overwrite=overwrite)
-
-    job = read_arguments(markers, command, arguments)
+    job = read_arguments(_Job, command, arguments)
     require(job.out.suffix.lower() == ".pdf", "SHEET", job.out.name, "a name ending in .pdf")
     layout(job.side_mm, job.paper)
     prepare_file(job.out, job.overwrite, is_sheet)

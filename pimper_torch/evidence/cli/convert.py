@@ -99,14 +99,25 @@ _OPTIONS = tuple(field.name for field in dataclasses.fields(ReadOptions))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """The arguments of a conversion."""
+    """Read a data set of one layout and write its photographs and cameras in another.
 
-    data: Path
-    out: Path
+    Photographs are written as 8-bit sRGB, undistorted, with pinhole cameras.
+
+    Attributes:
+        data: The data set's folder; for some layouts its file of cameras.
+        out: Folder for the result; new or empty.
+        source: Layout of DATA.
+        target: Layout to write.
+        overwrite: Replace a former result in OUT.
+        options: Of the reader.
+    """
+
+    data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
     source: Source
     target: Target
-    overwrite: bool
-    options: ReadOptions
+    overwrite: Flag = False
+    options: Annotated[ReadOptions, tyro.conf.arg(name="")] = ReadOptions()
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
@@ -151,37 +162,7 @@ def parse(arguments: Sequence[str]) -> Job:
     Raises:
         SystemExit: ``--help`` was answered.
     """
-
-    def convert(
-        data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")],
-        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],
-        source: Source,
-        target: Target,
-        overwrite: Flag = False,
-        options: Annotated[ReadOptions, tyro.conf.arg(name="")] = ReadOptions(),
-    ) -> Job:
-        """Read a data set of one layout and write its photographs and cameras in another.
-
-        Photographs are written as 8-bit sRGB, undistorted, with pinhole cameras.
-
-        Args:
-            data: The data set's folder; for some layouts its file of cameras.
-            out: Folder for the result; new or empty.
-            source: Layout of DATA.
-            target: Layout to write.
-            overwrite: Replace a former result in OUT.
-            options: Of the reader.
-        """
-        return Job(
-            data=data,
-            out=out,
-            source=source,
-            target=target,
-            overwrite=overwrite,
-            options=options,
-        )
-
-    return read_arguments(convert, "convert", arguments, levels=True)
+    return read_arguments(Job, "convert", arguments, levels=True)
 
 
 def readers() -> Mapping[Source, Callable[..., Capture]]:

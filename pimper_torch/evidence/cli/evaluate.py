@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -101,14 +101,24 @@ class EvaluateOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """The arguments of an evaluation."""
+    """Measure a result against the truth, each figure under its own named convention.
 
-    result: Path
-    truth: Path
-    out: Path | None
-    calibration: Path | None = None
-    overwrite: bool = False
-    options: EvaluateOptions = field(default_factory=EvaluateOptions)
+    Attributes:
+        result: Folder that `pimper reconstruct` wrote, or a mesh of any method.
+        truth: Folder of a rendered scene or of a data set, or a mesh.
+        out: JSON file for all figures.
+        calibration: PNG file for the calibration curve of a result that tells its expected
+            error.
+        overwrite: Replace files that a former evaluation wrote, and no others.
+        options: The measuring.
+    """
+
+    result: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULT")]
+    truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")]
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    overwrite: Flag = False
+    options: Annotated[EvaluateOptions, tyro.conf.arg(name="")] = EvaluateOptions()
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
@@ -163,36 +173,7 @@ def parse(arguments: Sequence[str]) -> Job:
     Raises:
         SystemExit: ``--help`` was answered.
     """
-
-    def evaluate(
-        result: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULT")],
-        truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")],
-        out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
-        calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
-        overwrite: Flag = False,
-        options: Annotated[EvaluateOptions, tyro.conf.arg(name="")] = EvaluateOptions(),
-    ) -> Job:
-        """Measure a result against the truth, each figure under its own named convention.
-
-        Args:
-            result: Folder that `pimper reconstruct` wrote, or a mesh of any method.
-            truth: Folder of a rendered scene or of a data set, or a mesh.
-            out: JSON file for all figures.
-            calibration: PNG file for the calibration curve of a result that tells its expected
-                error.
-            overwrite: Replace files that a former evaluation wrote, and no others.
-            options: The measuring.
-        """
-        return Job(
-            result=result,
-            truth=truth,
-            out=out,
-            calibration=calibration,
-            overwrite=overwrite,
-            options=options,
-        )
-
-    return read_arguments(evaluate, "evaluate", arguments)
+    return read_arguments(Job, "evaluate", arguments)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

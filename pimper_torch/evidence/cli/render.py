@@ -27,11 +27,21 @@ _RARE = tuple(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    scene: str
-    out: Path
-    processes: int
-    overwrite: bool
-    config: SceneConfig
+    """Render photographs of a scene under a point light, and write the truth beside them.
+
+    Attributes:
+        scene: One of mug, jar, balls, potatoes, pair, or the path of a mesh file.
+        out: Folder for photos, masks and truth; new or empty.
+        processes: That render at the same time.
+        overwrite: Replace a former rendering in OUT.
+        config: The photographs.
+    """
+
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
+    processes: int = 2
+    overwrite: Flag = False
+    config: Annotated[SceneConfig, tyro.conf.arg(name="")] = _DEFAULT
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
@@ -61,23 +71,4 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         ConfigError: An impossible setting.
         SystemExit: ``--help`` was answered.
     """
-
-    def render(
-        scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")],
-        out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")],
-        processes: int = 2,
-        overwrite: Flag = False,
-        config: Annotated[SceneConfig, tyro.conf.arg(name="")] = _DEFAULT,
-    ) -> _Job:
-        """Render photographs of a scene under a point light, and write the truth beside them.
-
-        Args:
-            scene: One of mug, jar, balls, potatoes, pair, or the path of a mesh file.
-            out: Folder for photos, masks and truth; new or empty.
-            processes: That render at the same time.
-            overwrite: Replace a former rendering in OUT.
-            config: The photographs.
-        """
-        return _Job(scene=scene, out=out, processes=processes, overwrite=overwrite, config=config)
-
-    return read_arguments(render, command, arguments, rare=_RARE)
+    return read_arguments(_Job, command, arguments, rare=_RARE)

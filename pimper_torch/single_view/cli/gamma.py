@@ -39,10 +39,19 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    photos: Path
-    mask: Path | None
-    rank: Literal[3, 4]
-    max_size_px: int
+    """Find the gamma of photographs that a fixed camera took of one object under many lights.
+
+    Attributes:
+        photos: Folder of JPEG, PNG or TIFF files; the camera did not move.
+        mask: Image that is bright on the object and dark off it, of the photographs' size.
+        rank: 3 if point lights are far away and the room is dark, 4 with ambient light.
+        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+    """
+
+    photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
+    mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    rank: Literal[3, 4] = 4
+    max_size_px: int = 0
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
@@ -52,24 +61,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         InputError: The folder of photographs, or the mask.
         SystemExit: ``--help`` was answered.
     """
-
-    def gamma(
-        photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")],
-        mask: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
-        rank: Literal[3, 4] = 4,
-        max_size_px: int = 0,
-    ) -> _Job:
-        """Find the gamma of photographs that a fixed camera took of one object under many lights.
-
-        Args:
-            photos: Folder of JPEG, PNG or TIFF files; the camera did not move.
-            mask: Image that is bright on the object and dark off it, of the photographs' size.
-            rank: 3 if point lights are far away and the room is dark, 4 with ambient light.
-            max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
-        """
-        return _Job(photos=photos, mask=mask, rank=rank, max_size_px=max_size_px)
-
-    job = read_arguments(gamma, command, arguments)
+    job = read_arguments(_Job, command, arguments)
     list_images(job.photos)
     if job.mask is not None and not job.mask.is_file():
         raise InputError(
