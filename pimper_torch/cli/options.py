@@ -232,8 +232,15 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
         if folder is not None:
             for path in list_images(folder):
                 require_name(path, InputError)
-    _refuse_few(job)
     present = [path.name for path in list_images(job.photos)]
+    least = job.config.factorize.min_views
+    require(
+        len(present) >= least,
+        f"{job.photos}: the number of photographs",
+        len(present),
+        f"{least} at least, better 10 or more: a normal comes from {least} lights or more "
+        "(`factorize.min_views`)",
+    )
     for name in _references(job.config):
         view_named(name, present)
     for name in measured_in(job.inputs.scale_bar, job.inputs.camera_distance):
@@ -250,22 +257,6 @@ def _inputs(job: Job) -> dict[str, Path | None]:
         "--mesh": job.inputs.mesh,
         "--cache": job.common.cache,
     }
-
-
-def _refuse_few(job: Job) -> None:
-    """Refuse so few photographs that no normal can come of them.
-
-    Raises:
-        ConfigError: Says how many are needed.
-    """
-    least = job.config.factorize.min_views
-    require(
-        len(list_images(job.photos)) >= least,
-        f"{job.photos}: the number of photographs",
-        len(list_images(job.photos)),
-        f"{least} at least, better 10 or more: a normal comes from {least} lights or more "
-        "(`factorize.min_views`)",
-    )
 
 
 def _references(config: Config) -> set[str]:

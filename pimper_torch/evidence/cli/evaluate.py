@@ -157,23 +157,15 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
 
     Raises:
         PimperError: An impossible setting, nothing to measure, or files that cannot be written.
+        SystemExit: ``--help`` was answered.
     """
-    job = parse(arguments)
+    job = read_arguments(Job, command, arguments)
     job.options.config()
     for path in (job.result, job.truth):
         if not path.exists():
             raise InputError(f"{path}: found nothing; needed: a result, and what it should be.")
     _prepare_files(job)
     return job
-
-
-def parse(arguments: Sequence[str]) -> Job:
-    """Read the arguments of ``evaluate``.
-
-    Raises:
-        SystemExit: ``--help`` was answered.
-    """
-    return read_arguments(Job, "evaluate", arguments)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
