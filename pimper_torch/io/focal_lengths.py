@@ -73,15 +73,16 @@ def focals_px(focals: Sequence[FocalLength]) -> list[float]:
     """Compute focal lengths of one set of photographs in pixels, NaN where a file is silent.
 
     Where photographs of one lens have the same 35 mm equivalent at unlike digital zooms, the
-    equivalent does not contain the zoom.
+    equivalent does not contain the zoom, or is rounded: focal lengths are as their zooms then.
     """
     zooms: dict[tuple[float, float], list[float]] = defaultdict(list)
     for focal in focals:
         zooms[focal.lens].append(focal.zoom)
-    return [
-        focal.px * (focal.zoom if max(at) > _SAME_ZOOM * min(at) else 1.0)
-        for focal, at in ((focal, zooms[focal.lens]) for focal in focals)
-    ]
+    contained = {}
+    for lens, several in zooms.items():
+        least, most = min(several), max(several)
+        contained[lens] = math.sqrt(least * most) if most < _SAME_ZOOM * least else 1.0
+    return [focal.px * focal.zoom / contained[focal.lens] for focal in focals]
 
 
 def _positive(value: object) -> float:

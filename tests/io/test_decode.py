@@ -11,6 +11,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError
 from pimper_torch.io.decode import decode, read_header, rotated
 from pimper_torch.io.focal_lengths import focal_from_exif, focals_px
+from pimper_torch.sfm.lenses import group_lenses
 
 
 @pytest.fixture
@@ -175,8 +176,10 @@ def test_a_digital_zoom_is_part_of_the_equivalent_unless_equal_ones_have_unlike_
     # Another lens of that equivalent says nothing about this one.
     tele = zoomed(1, 55, focal_mm=9.0)
     assert focals_px([zoomed(1.951, 55), tele]) == pytest.approx([5500, 5500])
-    # Equivalents are rounded: 13.4 and 13.0 mm.
-    assert focals_px([zoomed(1, 13), zoomed(1.03, 13)]) == pytest.approx([1300, 1300])
+    # Equivalents are rounded, here of 12.8 and 13.2 mm: they are told apart all the same.
+    wide, narrow = focals_px([zoomed(1, 13), zoomed(1.03, 13)])
+    assert (narrow / wide, math.sqrt(wide * narrow)) == pytest.approx((1.03, 1300))
+    assert group_lenses([(9, 6)] * 2, [wide, narrow]) == [0, 1]
     # A camera that leaves it out.
     assert focals_px([zoomed(1), zoomed(2), zoomed(4)]) == pytest.approx([2800, 5600, 11200])
 
