@@ -27,7 +27,7 @@ from pimper_torch.sfm.quarter_turns import (
 _MAX_SKEW_PX = 0.1
 
 
-def existing_model(views: Views, path: Path) -> SparseModel:
+def existing_ways(views: Views, path: Path) -> list[SparseModel]:
     """Read cameras and put them in the photographs' order, sizes and orientations.
 
     Args:
@@ -37,19 +37,13 @@ def existing_model(views: Views, path: Path) -> SparseModel:
             photographs is read; or a file of cameras, see
             :func:`~pimper_torch.camera_files.read_cameras.read_cameras`.
 
-    Raises:
-        ReconstructionError: There are cameras of fewer than 3 of the photographs.
-        InputError: They do not belong to the photographs, or cannot be read.
-    """
-    return existing_ways(views, path)[0]
-
-
-def existing_ways(views: Views, path: Path) -> list[SparseModel]:
-    """Do what :func:`existing_model` does, in the two ways that cameras without points allow.
-
     Returns:
         One model where the points tell how photographs are turned, or nothing turns them; else
         that of the photographs as they stand, and that of the pixels that files store.
+
+    Raises:
+        ReconstructionError: There are cameras of fewer than 3 of the photographs.
+        InputError: They do not belong to the photographs, or cannot be read.
     """
     path = _largest(views, path)
     where = place(path)

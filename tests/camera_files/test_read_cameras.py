@@ -14,12 +14,16 @@ from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.records import Cameras, Views
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.undistort import pinholes_for
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 90.0
 NAMES = ("10.png", "2.png", "a b.png")
+
+
+def existing_model(views: Views, path: Path) -> SparseModel:
+    return existing_ways(views, path)[0]
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ from pimper_torch.io.responses import read_curve
 from pimper_torch.records import Mesh, Views
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.sfm.colmap import pinhole_lenses, read_model, reconstruction_of, write_binary
-from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.video.read import luma_frames
 
@@ -228,7 +228,7 @@ def _models(root: Path) -> list[Seed]:
         files = tuple(sorted(path.name for path in (root / kind).iterdir()))
         seeds += [
             Seed(f"model {kind}", root / kind, files, read_model),
-            Seed(f"sparse {kind}", root / kind, files, lambda at: existing_model(views, at)),
+            Seed(f"sparse {kind}", root / kind, files, lambda at: existing_ways(views, at)),
         ]
     return seeds
 

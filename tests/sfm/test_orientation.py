@@ -10,7 +10,7 @@ from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
 from pimper_torch.sfm.colmap import write_binary
-from pimper_torch.sfm.existing import existing_model, existing_ways
+from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.quarter_turns import QUARTERS
 from pimper_torch.sfm.scene import assemble_scene
 from tests.sfm.ball import (
@@ -23,6 +23,10 @@ from tests.sfm.ball import (
 )
 
 EXIF = {quarters: tag for tag, quarters in QUARTERS.items()}
+
+
+def existing_model(views, path):
+    return existing_ways(views, path)[0]
 
 
 @pytest.fixture(scope="module")

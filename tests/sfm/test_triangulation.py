@@ -14,7 +14,7 @@ from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
-from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.photograph_agreement import explained, pinholes_of
@@ -200,4 +200,4 @@ def test_a_file_that_has_no_camera_of_the_photographs_is_refused(views, tmp_path
     whole = {"w": 80, "h": 60, "fl_x": 90.0, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(whole))
     with pytest.raises((InputError, ReconstructionError), match="has none of the photographs"):
-        existing_model(views, tmp_path / "transforms.json")
+        existing_ways(views, tmp_path / "transforms.json")

@@ -12,7 +12,7 @@ from pimper_torch.evidence.scenes.write import render_scene
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.sfm import reconstruct
-from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.existing import existing_ways
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_a_scenes_model_is_found_once_and_its_seconds_are_those_of_the_first_run
     def structure_from_motion(views, config):
         runs.append(config)
         time.sleep(0.3)
-        return existing_model(views, rendered / "truth" / "sparse")
+        return existing_ways(views, rendered / "truth" / "sparse")[0]
 
     monkeypatch.setattr(reconstruct, "structure_from_motion", structure_from_motion)
     config = BenchConfig(scenes=(str(rendered),), samples=500)
