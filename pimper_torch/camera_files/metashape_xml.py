@@ -91,10 +91,10 @@ def _chunk(path: Path) -> ElementTree.Element:
     expect(bool(chunks), path, KIND, "a document of one chunk", f"<{root.tag}> without one")
     aligned = [chunk for chunk in chunks if _placed(chunk)] or chunks
     if len(aligned) > 1:
-        told = [f"{chunk.get('label')} ({len(_placed(chunk))} cameras)" for chunk in aligned]
+        labels = [f"{chunk.get('label')} ({len(_placed(chunk))} cameras)" for chunk in aligned]
         raise InputError(
-            f"{path}: has {len(aligned)} chunks: {some(told)}; needed: one, as each has a frame of "
-            "its own. Export the cameras of the chunk that is meant, or merge the chunks."
+            f"{path}: has {len(aligned)} chunks: {some(labels)}; needed: one, as each has a frame "
+            "of its own. Export the cameras of the chunk that is meant, or merge the chunks."
         )
     return aligned[0]
 
@@ -184,8 +184,8 @@ def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, f
         for side in numbers(resolution_px, 2, f"resolution of the sensor {label}", path, KIND)
     )
     old = calibration.find("f") is None and calibration.find("fx") is not None
-    found = "fx and fy, as old PhotoScan wrote them; export with a newer one" if old else "none"
-    expect(value("f") > 0 and not old, path, KIND, f"a positive f of the sensor {label}", found)
+    other = "fx and fy, as old PhotoScan wrote them; export with a newer one" if old else "none"
+    expect(value("f") > 0 and not old, path, KIND, f"a positive f of the sensor {label}", other)
     f, b1, b2 = value("f"), value("b1"), value("b2")
     k1, k2, k3, k4 = (value(tag) for tag in ("k1", "k2", "k3", "k4"))
     p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))

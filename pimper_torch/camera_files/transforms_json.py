@@ -94,8 +94,7 @@ def frame_camera(
     """
     matrix, what = frame.get("transform_matrix"), f"transform_matrix of {name}"
     rows = matrix[:3] if isinstance(matrix, list) and len(matrix) in (3, 4) else []
-    found = type(matrix).__name__
-    expect(bool(rows), path, KIND, f"4 rows of 4 numbers as {what}", found)
+    expect(bool(rows), path, KIND, f"4 rows of 4 numbers as {what}", type(matrix).__name__)
     world_from_cam = numbers(rows, 12, what, path, KIND).reshape(3, 4)
     turn, shift = world_from_cam[:, :3] * FLIP, world_from_cam[:, 3]
     pose = invert_rigid(rigid_or_refuse(turn, shift, what, path, KIND))

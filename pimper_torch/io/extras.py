@@ -56,7 +56,7 @@ def extra_of(path: Path | str) -> str:
 
 
 def is_installed(extra: str) -> bool:
-    """Tell whether a package of an extra is there."""
+    """Return whether a package of an extra is installed."""
     return any(_is_there(name) for name in _EXTRAS[extra][1])
 
 

@@ -63,14 +63,12 @@ def existing_ways(views: Views, path: Path) -> list[SparseModel]:
 
 def _largest(views: Views, folder: Path) -> Path:
     """Choose the model of most of the photographs where a folder holds several, each in its own."""
-    found = {
-        path: match_files(views.names, names, folder=views.folder, where=str(path), what="image")
-        for path, names in names_by_folder(folder).items()
-    }
-    counts = {path: len(views.names) - matches.count(None) for path, matches in found.items()}
-    if not counts:
-        return folder
-    largest = max(counts, key=lambda path: counts[path])
+    counts: dict[Path, int] = {}
+    for path, names in names_by_folder(folder).items():
+        where, photographs = str(path), views.folder
+        matches = match_files(views.names, names, folder=photographs, where=where, what="image")
+        counts[path] = len(matches) - matches.count(None)
+    largest = max(counts, key=lambda path: counts[path], default=folder)
     others = [f"{path.name} ({count})" for path, count in counts.items() if path != largest]
     if others:
         caution(
