@@ -99,7 +99,6 @@ SETS = {
     "potatoes-glossy": Set("potatoes", 24, 480, ROUND | {"specular": 0.08, "roughness": 0.2}),
     "skull": Set("skull", 24, 900),
     "turned-over": Set("mug", 24, 640, ROUND | {"turned_over": True}, ("sfm.moved_object",)),
-    "turned-apart": Set("jar", 16, 400, ROUND | {"turned_over": True}, ("sfm.series_apart",)),
     "room": Set("mug", 24, 640, ROOM, ("sfm.room",)),
     "room-shifts": Set("mug", 24, 640, ROOM | {"pan_jitter_px": 40.0}, ("sfm.shifted_room",)),
     "stamp": Set("mug", 16, 480, ROUND | PATTERN, ("sfm.room",), stamped),

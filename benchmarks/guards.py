@@ -61,12 +61,11 @@ def everything(like: int) -> Callable[..., Tensor]:
 
 # What stands in for each guard that can be switched off, and settings that switch it off.
 PATCHES: dict[str, dict[str, object]] = {
-    "sfm.room": {"sfm.registration._leave_out_room": lambda *_: {}},
-    "sfm.shifted_room": {"sfm.registration._leave_out_room": lambda *_: {}},
+    "sfm.room": {"sfm.registration._leave_out_room": lambda *_: (None, {})},
+    "sfm.shifted_room": {"sfm.registration._leave_out_room": lambda *_: (None, {})},
     "sfm.moved_object": {"sfm.registration.tie_series": lambda *_: (None, ())},
     "sfm.weak_views": {"sfm.registration.drop_weak_views": lambda model, _: model},
-    "sfm.misplaced": {"sfm.registration.misplaced_views": lambda *_: {}},
-    "sfm.series_apart": {"sfm.reconstruct.largest_series": lambda model: model},
+    "sfm.misplaced": {"sfm.agreement._MIN_AGREEMENT": 0.0},
     "sfm.one_lens": {"sfm.reconstruct.doubt_one_lens": lambda _: ""},
     "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
     "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},

@@ -24,7 +24,6 @@ GUARDS: dict[str, tuple[What, str]] = {
     "sfm.weak_views": ("photographs", "see too few points"),
     "sfm.misplaced": ("doubt", "their strongest pairs contradict the model"),
     "sfm.small_series": ("photographs", "of a series of few"),
-    "sfm.series_apart": ("photographs", "the object stands elsewhere in them"),
     "sfm.tracks": ("points", "reproject far off"),
     "sfm.one_lens": ("doubt", "a lens for each photograph fits better"),
     "sfm.missing": ("photographs", "not registered"),

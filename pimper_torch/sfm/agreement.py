@@ -7,7 +7,8 @@ their matches agree with a right model; those of a misplaced view do not. Pairs 
 do not tell: a third of a carton's disagree with the right model, too, for its sides look alike.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
 from jaxtyping import Float
 from kornia.geometry.epipolar import essential_from_Rt, fundamental_from_essential
@@ -27,36 +28,54 @@ _JUDGES = 3
 _MIN_AGREEMENT = 0.5
 
 
-def misplaced_views(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """Agreement of a model with the verified matches of its photographs.
+
+    Attributes:
+        explained: Fraction of all verified matches that the model's epipolar geometry explains;
+            matches of photographs that the model lacks are not explained.
+        misplaced: By name, views that contradict most matches of their strongest pairs, with the
+            fraction that agrees.
+    """
+
+    explained: float
+    misplaced: Mapping[str, float]
+
+
+def judged(
     model: SparseModel, files: Sequence[str], pairs: Sequence[VerifiedPair], max_error_px: float
-) -> dict[str, float]:
-    """Find the views whose strongest pairs contradict the model.
+) -> Judgement:
+    """Compare a model with verified matches.
 
     Args:
         model: Its names are among ``files``.
         files: Of all photographs.
-        pairs: With numbers of photographs; those that the model lacks do not judge.
+        pairs: With numbers of photographs.
         max_error_px: Distance from the model's epipolar geometry up to which a match agrees.
-
-    Returns:
-        By name, the fraction of the matches in those pairs that agree.
     """
     view_of = {files.index(name): view for view, name in enumerate(model.names)}
-    judged: dict[PhotographPair, tuple[int, float]] = {}
+    agreeing: dict[PhotographPair, tuple[int, float]] = {}
     for pair in pairs:
         if all(number in view_of for number in pair.views):
             first, second = (view_of[number] for number in pair.views)
             inside = pair.replace(views=(first, second))
-            judged[first, second] = pair.num_matches, agreement(model, inside, max_error_px)
-    found = {}
+            agreeing[first, second] = pair.num_matches, agreement(model, inside, max_error_px)
+    misplaced = {}
     for view, name in enumerate(model.names):
-        mine = [judged[pair] for pair in judged if view in pair]
-        judges = sorted(mine, reverse=True)[:_JUDGES]
-        total = sum(count for count, _ in judges)
-        agreeing = sum(count * fraction for count, fraction in judges)
-        if agreeing < _MIN_AGREEMENT * total:
-            found[name] = agreeing / total
-    return found
+        mine = [agreeing[pair] for pair in agreeing if view in pair]
+        fraction = _agreeing_fraction(sorted(mine, reverse=True)[:_JUDGES])
+        if fraction < _MIN_AGREEMENT:
+            misplaced[name] = fraction
+    total = sum(pair.num_matches for pair in pairs)
+    compared = sum(count for count, _ in agreeing.values())
+    explained = _agreeing_fraction(agreeing.values()) * compared / total if total else 0.0
+    return Judgement(explained=explained, misplaced=misplaced)
+
+
+def _agreeing_fraction(pairs: Collection[tuple[int, float]]) -> float:
+    total = sum(count for count, _ in pairs)
+    return sum(count * fraction for count, fraction in pairs) / total if total else 1.0
 
 
 def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> float:

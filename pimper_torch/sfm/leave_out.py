@@ -66,16 +66,20 @@ def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
         matched = read_matched(stored)
         verifier = _Verifier(matched=matched, settings=settings)
         found = _shifted(matched, verifier, settings) or _at_rest(matched, verifier, settings)
-        guard = "sfm.shifted_room" if found.rest.shift_px else "sfm.room"
-        resting = found.rest.features
-        taken = sum(int(one.sum()) for one in resting) if found.rest.room else 0
-        leave_out(guard, taken, total=sum(map(len, matched.keypoints)))
         if found.rest.room:
             geometries = read_geometries(stored) | verifier.found
             _drop_features(stored, matched, found.rest)
             _drop_matches(stored, matched, found, geometries, settings.min_inliers)
             return found.rest.replace(maps=_maps(found, settings.min_inliers))
     return found.rest
+
+
+def enter_room(rest: StaticBackground) -> tuple[int, int]:
+    """Enter in the ledger how many features rest with a room; return their and all numbers."""
+    resting = sum(int(one.sum()) for one in rest.features)
+    total = sum(map(len, rest.features))
+    leave_out("sfm.shifted_room" if rest.shift_px else "sfm.room", resting, total=total)
+    return resting, total
 
 
 def _maps(found: "_Found", fewest: int) -> tuple[Float[Tensor, "3 3"], ...]:

@@ -34,7 +34,7 @@ from pimper_torch.sfm.quarter_turns import turned_views
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
 from pimper_torch.sfm.scene import assemble_scene, model_of_scene, with_model_points
-from pimper_torch.sfm.series import largest_series, series_in, with_series
+from pimper_torch.sfm.series import series_in, with_series
 from pimper_torch.sfm.triangulation import TriangulationSettings, lacks_points, triangulate
 from pimper_torch.sfm.upright import upright
 from pimper_torch.sfm.workspace import workspace
@@ -223,7 +223,7 @@ class Reconstruct(Stage):
         _require_finite(views)
         if sparse_model is None:
             return placed_scene(views, find_model(views, self.config, self.store)[0])
-        return placed_scene(views, largest_series(self._given(views, Path(sparse_model))))
+        return placed_scene(views, self._given(views, Path(sparse_model)))
 
     def with_points(self, scene: SparseScene) -> SparseScene:
         """Triangulate points for a scene whose views observe hardly any, its cameras held fixed.
@@ -366,8 +366,6 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     model = _chosen(found, names, 0.0 if found.around else _MIN_FRACTION)
     if found.around:
         model = with_series(model, series_in(model, views.names, found.around), views.names)
-    else:
-        model = largest_series(model)
     series = dict(zip(model.names, model.series.tolist(), strict=False))
     numbers = [views.names.index(name) for name in model.names]
     model = refine_tracks(lying.take(numbers), model, config.tracks)

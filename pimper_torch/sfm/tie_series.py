@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from pimper_torch.ledger import leave_out
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.leave_out import (
     Matched,
@@ -74,14 +73,6 @@ def tie_series(
             if not torch.equal(rows, verified[pair]):
                 ids = matched.ids[pair[0]], matched.ids[pair[1]]
                 stored.update_two_view_geometry(*ids, seconds[pair])
-        changed = [
-            pair for pair in found.tying if not torch.equal(found.tying[pair], verified[pair])
-        ]
-        count, total = (
-            sum(len(verified[pair]) for pair in some)
-            for some in ((*changed, *found.dropped), verified)
-        )
-        leave_out("sfm.moved_object", count, total=total)
         for pair in found.dropped:
             stored.delete_two_view_geometry(matched.ids[pair[0]], matched.ids[pair[1]])
     pixels = [one.double() for one in matched.keypoints]

@@ -19,7 +19,7 @@ from pimper_torch.sfm.binding import loaded, quiet, thread_count
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
 from pimper_torch.sfm.features import FeatureSettings, find_features, too_small
 from pimper_torch.sfm.guided import NearEpipolarLines, guided_matches, read_features
-from pimper_torch.sfm.leave_out import leave_out_room
+from pimper_torch.sfm.leave_out import enter_room, leave_out_room
 from pimper_torch.sfm.matching import (
     MatchSettings,
     PhotographPair,
@@ -106,7 +106,7 @@ def triangulate(
         release_memory()
         if sum(count > 0 for count in counts) >= 2:
             match_pairs(space, all_pairs(views.num_views), settings.matching)
-            leave_out_room(space.database, settings.matching)
+            enter_room(leave_out_room(space.database, settings.matching))
         verified = verified_pairs(space)
         given = _way(models, verified, settings, where)
         require_agreement(given, verified, settings.matching.max_error_px, where)

@@ -3,11 +3,12 @@
 Photographs go by their number there: ``000007.png`` is view 7, and image 8 of the database.
 """
 
+import shutil
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +28,13 @@ class Workspace:
         files: Names of the photographs in ``images``, in the order of the views.
         masked: Whether ``masks`` holds a mask for each, under its name with another ``.png``
             behind, as COLMAP wants them.
+        database_name: File of COLMAP's database.
     """
 
     folder: Path
     files: tuple[str, ...]
     masked: bool
+    database_name: str = "database.db"
 
     @property
     def images(self) -> Path:
@@ -46,7 +49,13 @@ class Workspace:
     @property
     def database(self) -> Path:
         """COLMAP's database."""
-        return self.folder / "database.db"
+        return self.folder / self.database_name
+
+    def with_copied_database(self, name: str) -> "Workspace":
+        """Copy the database to another file of the folder, for matches of another hypothesis."""
+        copied = replace(self, database_name=name)
+        shutil.copyfile(self.database, copied.database)
+        return copied
 
 
 @contextmanager

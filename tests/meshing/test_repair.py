@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from closedness import closedness
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.metrics.closedness import closedness
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import (

@@ -1,13 +1,15 @@
 """Views that the pairs with most matches contradict."""
 
+import pytest
 import torch
 from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.agreement import agreement, epipolar_geometry, misplaced_views
+from pimper_torch.sfm.agreement import agreement, epipolar_geometry, judged
 from pimper_torch.sfm.colmap import distort
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs
+from pimper_torch.sfm.model import select_views
 from tests.sfm import ball
 
 
@@ -61,16 +63,32 @@ def test_exact_matches_agree_with_their_model_through_a_bent_lens(generator):
     model, points = scene(generator)
     pairs = pairs_of(model, points)
     assert all(agreement(model, pair, 0.01) == 1 for pair in pairs)
-    assert misplaced_views(model, model.names, pairs, 0.01) == {}
+    assert judged(model, model.names, pairs, 0.01).misplaced == {}
 
 
 def test_a_view_put_elsewhere_is_told_from_its_neighbours(generator):
     model, points = scene(generator)
     pairs = pairs_of(model, points)
-    found = misplaced_views(rotated(model, 3), model.names, pairs, 4.0)
+    found = judged(rotated(model, 3), model.names, pairs, 4.0).misplaced
     judges = [agreement(rotated(model, 3), pair, 4.0) for pair in pairs if 3 in pair.views]
     assert found.keys() == {"3.png"}
     assert min(judges) <= found["3.png"] <= max(judges) < 0.5
+
+
+def test_matches_are_explained_by_fraction_those_of_missing_photographs_not_at_all(generator):
+    model, points = scene(generator)
+    pairs = pairs_of(model, points)
+    counts = torch.tensor([pair.num_matches for pair in pairs]).double()
+    assert judged(model, model.names, pairs, 0.01).explained == 1
+    wrong = rotated(model, 3)
+    fractions = torch.tensor([agreement(wrong, pair, 4.0) for pair in pairs]).double()
+    explained = judged(wrong, model.names, pairs, 4.0).explained
+    assert explained == pytest.approx(float((counts * fractions).sum() / counts.sum()))
+    views = [0, 1, 2, *range(4, model.num_views)]
+    there = torch.tensor([3 not in pair.views for pair in pairs])
+    explained = judged(select_views(model, views), model.names, pairs, 0.01).explained
+    assert explained == pytest.approx(float(counts[there].sum() / counts.sum()))
+    assert judged(model, model.names, [], 4.0).explained == 0
 
 
 def test_pairs_with_few_matches_do_not_judge(generator):
@@ -80,7 +98,7 @@ def test_pairs_with_few_matches_do_not_judge(generator):
         for pair in pairs_of(model, points, {(0, 4): 20, (0, 5): 20})
     ]
     assert agreement(model, pairs[4], 4.0) < 0.5
-    assert misplaced_views(model, model.names, pairs, 4.0) == {}
+    assert judged(model, model.names, pairs, 4.0).misplaced == {}
 
 
 def test_photographs_that_the_model_lacks_do_not_judge(generator):
@@ -91,5 +109,5 @@ def test_photographs_that_the_model_lacks_do_not_judge(generator):
         for pair in pairs_of(model, points)
     ]
     stray = pairs[0].replace(views=(0, 1), first=pairs[0].first.flip(0))
-    assert misplaced_views(model, files, [stray, *pairs], 4.0) == {}
-    assert misplaced_views(rotated(model, 5), files, [stray, *pairs], 4.0).keys() == {"5.png"}
+    assert judged(model, files, [stray, *pairs], 4.0).misplaced == {}
+    assert judged(rotated(model, 5), files, [stray, *pairs], 4.0).misplaced.keys() == {"5.png"}

@@ -1,12 +1,13 @@
 """Which pairs are matched again, and how often the mapper starts."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
+from pimper_torch.errors import PimperWarning
 from pimper_torch.sfm import registration
+from pimper_torch.sfm.agreement import Judgement
 from pimper_torch.sfm.doubt import count_views_with_depth
 from pimper_torch.sfm.mapping import MapSettings
 from pimper_torch.sfm.matching import MatchSettings, VerifiedPair, all_pairs
@@ -19,13 +20,24 @@ MATCHING = MatchSettings(max_ratio=0.8, max_error_px=2.0, min_inliers=15, seed=0
 MAPPING = MapSettings(min_inliers=6, pairs_count=False, seed=5)
 SETTINGS = RegistrationSettings(matching=MATCHING, mapping=MAPPING, guided_pairs=1, starts=2)
 
+RIGID = StaticBackground(features=(), still_fraction=0.0, moving_pairs=0, violating_fraction=0.0)
+ROOM = RIGID.replace(
+    features=5 * (torch.tensor([True, False]),),
+    violating_fraction=0.5,
+    maps=5 * (torch.eye(3, dtype=torch.float64),),
+)
+
+NOTHING = torch.zeros(3, 2).double()
+MOVED = (VerifiedPair(views=(0, 1), first=NOTHING, second=NOTHING),)
+
 
 class Told:
     """What matcher and mapper are told; what the mapper and the judge answer, run by run."""
 
-    def __init__(self, models, misplaced=()):
+    def __init__(self, models, misplaced=(), explained=()):
         self.models, self.misplaced = list(models), list(misplaced)
-        self.matched, self.mapped = [], []
+        self.explained, self.asked = list(explained), []
+        self.matched, self.mapped, self.databases = [], [], []
 
     def match(self, space, pairs, settings):
         self.matched.append((False, list(pairs)))
@@ -35,21 +47,27 @@ class Told:
 
     def map(self, space, settings):
         self.mapped.append((settings.seed, settings.pairs_count))
+        self.databases.append(space.database_name)
         return [self.models.pop(0)]
 
     def judge(self, model, files, pairs, max_error_px):
-        return self.misplaced.pop(0) if self.misplaced else {}
+        return Judgement(
+            explained=self.explained.pop(0) if self.explained else 1.0,
+            misplaced=self.misplaced.pop(0) if self.misplaced else {},
+        )
 
 
 @pytest.fixture
 def told(model, monkeypatch):
     """Five photographs whose neighbours share most matches."""
 
-    def tell(numbers, misplaced=()):
-        answers = Told([select_views(model, some) for some in numbers], misplaced)
-        rest = StaticBackground(
-            features=(), still_fraction=0.0, moving_pairs=0, violating_fraction=0.0
-        )
+    def tell(numbers, misplaced=(), explained=(), rest=RIGID, around=()):
+        answers = Told([select_views(model, some) for some in numbers], misplaced, explained)
+
+        def leave_out(database, settings):
+            answers.asked.append(database.name)
+            return rest
+
         pairs = [
             VerifiedPair(
                 views=pair,
@@ -61,9 +79,11 @@ def told(model, monkeypatch):
         monkeypatch.setattr(registration, "match_pairs", answers.match)
         monkeypatch.setattr(registration, "match_guided", answers.guide)
         monkeypatch.setattr(registration, "map_views", answers.map)
-        monkeypatch.setattr(registration, "misplaced_views", answers.judge)
+        monkeypatch.setattr(registration, "judged", answers.judge)
+        monkeypatch.setattr(registration, "doubt", lambda model, count: "")
         monkeypatch.setattr(registration, "verified_pairs", lambda space: pairs)
-        monkeypatch.setattr(registration, "leave_out_room", lambda database, settings: rest)
+        monkeypatch.setattr(registration, "leave_out_room", leave_out)
+        monkeypatch.setattr(registration, "tie_series", lambda *_: (None, around))
         monkeypatch.setattr(
             registration,
             "count_views_with_depth",
@@ -75,8 +95,9 @@ def told(model, monkeypatch):
 
 
 @pytest.fixture
-def space(model):
-    return Workspace(folder=Path(), files=model.names, masked=False)
+def space(model, tmp_path):
+    (tmp_path / "database.db").write_bytes(b"features and matches")
+    return Workspace(folder=tmp_path, files=model.names, masked=False)
 
 
 NEIGHBOURS = (True, [(0, 1), (1, 2), (2, 3), (3, 4)])
@@ -128,3 +149,40 @@ def test_a_model_whose_views_all_see_too_few_points_is_none(told, space, monkeyp
     found = register(space, replace(SETTINGS, mapping=replace(MAPPING, min_inliers=1000)))
     assert found.models == ()
     assert found.missing == tuple(space.files)
+
+
+def test_a_plain_model_that_explains_the_matches_is_taken_before_a_room_is_looked_for(told, space):
+    answers = told([EVERY], explained=[0.95], rest=ROOM, around=MOVED)
+    found = register(space, SETTINGS)
+    assert answers.asked == []
+    assert not found.background
+    assert found.around == ()
+
+
+def test_another_explanation_is_taken_where_it_explains_clearly_more(told, space):
+    answers = told([EVERY, EVERY], explained=[0.7, 0.98], around=MOVED)
+    assert register(space, SETTINGS).around == MOVED
+    assert answers.databases == ["database.db", "other.db"]
+    assert (space.folder / "other.db").read_bytes() == b"features and matches"
+    told([EVERY, EVERY], explained=[0.85, 0.94], around=MOVED)
+    assert register(space, SETTINGS).around == ()
+
+
+def test_an_explanation_that_loses_photographs_does_not_beat_the_plain_one(told, space):
+    some = [EVERY, *4 * [[0, 1, 2]]]
+    told(some, explained=[0.7, *4 * [0.5]], around=MOVED)
+    found = register(space, SETTINGS)
+    assert not found.missing
+    assert found.around == ()
+
+
+def test_features_of_a_room_are_left_out_where_the_plain_model_is_doubtful(
+    told, space, monkeypatch
+):
+    told([EVERY, EVERY], rest=ROOM)
+    doubts = ["follows a camera in its place", ""]
+    monkeypatch.setattr(registration, "doubt", lambda model, count: doubts.pop(0))
+    with pytest.warns(PimperWarning, match="5 of 10 features lie still"):
+        found = register(space, SETTINGS)
+    assert found.background.keys() == set(space.files)
+    assert found.explained == 1

@@ -10,7 +10,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.records import Lens
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.series import largest_series, series_apart, series_in, with_series
+from pimper_torch.sfm.series import series_in, with_series
 from tests.sfm.moved import K, bodies, poses
 
 LENS = Lens(camera=1, model="PINHOLE", params=(400.0, 400.0, 160.0, 120.0), width=320, height=240)
@@ -47,25 +47,6 @@ def model_of(counts, generator, *, moved=True):
         observation_view=view,
         observation_pixels=pixels[view, point],
     )
-
-
-def test_views_that_see_the_object_at_two_places_are_two_series(generator):
-    model = model_of((12, 10), generator)
-    assert series_apart(model).tolist() == [0] * 12 + [1] * 10
-
-
-def test_views_that_share_the_object_are_one_series(generator):
-    model = model_of((12, 10), generator, moved=False)
-    assert series_apart(model).tolist() == [0] * 22
-    assert largest_series(model) is model
-
-
-def test_the_larger_series_is_kept_with_a_warning_that_names_the_other_and_what_joins(generator):
-    with pytest.warns(PimperWarning, match="10 of 22 photographs") as told:
-        kept = largest_series(model_of((12, 10), generator))
-    assert kept.names == tuple(f"{view:02d}.jpg" for view in range(12))
-    assert "12.jpg, 13.jpg" in str(told[0].message)
-    assert "low down" in str(told[0].message)
 
 
 def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generator):
