@@ -76,6 +76,7 @@ def foreign(folder: Path) -> list[str]:
 ROUND, TURN = {"path": "handheld"}, {"path": "turntable"}
 PATTERN, PLAIN, GREY = {"table": "patterned"}, {"table": "plain"}, {"albedo": (0.6, 0.6, 0.6)}
 ROOM = {**TURN, "fixed_point_light": True, "fixed_room": True}
+TURNED = {**ROUND, **PATTERN, "elevation_deg": 22.0, "turned_over": True}
 SETS = {
     "mug-arc": Set("mug", 12, 480),
     "jar-arc": Set("jar", 24, 800, PATTERN),
@@ -98,7 +99,7 @@ SETS = {
     "jar-glossy": Set("jar", 16, 640, {"specular": 0.08, "roughness": 0.15}),
     "potatoes-glossy": Set("potatoes", 24, 480, ROUND | {"specular": 0.08, "roughness": 0.2}),
     "skull": Set("skull", 24, 900),
-    "turned-over": Set("mug", 24, 640, ROUND | {"turned_over": True}, ("sfm.moved_object",)),
+    "turned-over": Set("mug", 20, 480, TURNED, ("sfm.moved_object",)),
     "room": Set("mug", 24, 640, ROOM, ("sfm.room",)),
     "room-shifts": Set("mug", 24, 640, ROOM | {"pan_jitter_px": 40.0}, ("sfm.shifted_room",)),
     "stamp": Set("mug", 16, 480, ROUND | PATTERN, ("sfm.room",), stamped),

@@ -268,6 +268,9 @@ def main() -> None:
         for name in options.sets:
             own = [guard for guard in SETS[name].guards if guard in PATCHES or guard in CHANGES]
             for without in [options.without] if options.without else ["", *own]:
+                whole = found.get((name, preset, ""))
+                if without and whole and not whole["guards"].get(without, {}).get("count"):
+                    continue  # it took nothing that it could be without
                 path = results / f"{name}--{preset}--{without or 'all'}.json"
                 if not path.exists() and not options.table:
                     place, spoilt = prepared(options.folder, name, options.tiny)
