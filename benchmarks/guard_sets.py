@@ -65,14 +65,6 @@ def inverted(folder: Path) -> list[str]:
     return [sorted((folder / "photos").iterdir())[2].name]
 
 
-def unusable(folder: Path) -> list[str]:
-    """Overexpose one photograph, and empty another one's mask."""
-    photographs, masks = (sorted((folder / part).iterdir()) for part in ("photos", "masks"))
-    for path, value in ((photographs[1], 255), (masks[3], 0)):
-        Image.fromarray(np.full_like(np.asarray(Image.open(path)), value)).save(path)
-    return [photographs[1].name, photographs[3].name]
-
-
 def foreign(folder: Path) -> list[str]:
     """Put a photograph of the skull in the place of one."""
     path = sorted((folder / "photos").iterdir())[2]
@@ -84,6 +76,7 @@ def foreign(folder: Path) -> list[str]:
 ROUND, TURN = {"path": "handheld"}, {"path": "turntable"}
 PATTERN, PLAIN, GREY = {"table": "patterned"}, {"table": "plain"}, {"albedo": (0.6, 0.6, 0.6)}
 ROOM = {**TURN, "fixed_point_light": True, "fixed_room": True}
+TURNED = {**ROUND, **PATTERN, "elevation_deg": 22.0, "turned_over": True}
 SETS = {
     "mug-arc": Set("mug", 12, 480),
     "jar-arc": Set("jar", 24, 800, PATTERN),
@@ -92,8 +85,8 @@ SETS = {
     "limbs-arc": Set("limbs", 16, 640),
     "mug-round": Set("mug", 24, 640, ROUND | PATTERN),
     "jar-round": Set("jar", 30, 640, ROUND),
-    "balls-round": Set("balls", 20, 480, ROUND),
-    "potatoes-round": Set("potatoes", 16, 400, ROUND),
+    "balls-round": Set("balls", 24, 480, ROUND | PATTERN),
+    "potatoes-round": Set("potatoes", 30, 400, ROUND),
     "limbs-round": Set("limbs", 24, 640, ROUND | PATTERN),
     "mug-turn": Set("mug", 24, 480, TURN),
     "jar-turn": Set("jar", 20, 640, TURN | PATTERN),
@@ -106,14 +99,13 @@ SETS = {
     "jar-glossy": Set("jar", 16, 640, {"specular": 0.08, "roughness": 0.15}),
     "potatoes-glossy": Set("potatoes", 24, 480, ROUND | {"specular": 0.08, "roughness": 0.2}),
     "skull": Set("skull", 24, 900),
-    "turned-over": Set("mug", 24, 640, ROUND | {"turned_over": True}, ("sfm.moved_object",)),
+    "turned-over": Set("mug", 20, 480, TURNED, ("sfm.moved_object",)),
     "room": Set("mug", 24, 640, ROOM, ("sfm.room",)),
     "room-shifts": Set("mug", 24, 640, ROOM | {"pan_jitter_px": 40.0}, ("sfm.shifted_room",)),
-    "stamp": Set("potatoes", 16, 480, ROUND, ("sfm.room",), stamped),
-    "zoomed": Set("potatoes", 16, 480, ROUND | PATTERN, ("sfm.one_lens",), zoomed),
+    "stamp": Set("mug", 16, 480, ROUND | PATTERN, ("sfm.room",), stamped),
+    "zoomed": Set("potatoes", 16, 480, PATTERN, ("sfm.one_lens",), zoomed),
     "foreign": Set("jar", 16, 480, PATTERN, ("sfm.weak_views", "sfm.misplaced"), foreign),
-    "unusable": Set("potatoes", 12, 400, ROUND, ("sfm.sound_views",), unusable, masks=True),
-    "inverted": Set("potatoes", 12, 400, ROUND, ("silhouettes.empty",), inverted, masks=True),
+    "inverted": Set("mug", 16, 480, PATTERN, ("remesh.outside",), inverted, masks=True),
     "mouth": Set("mug", 20, 640, ROUND | PATTERN, ("remesh.contradicted", "coarse.seen_through")),
     "flaps": Set("skull", 8, 900, {}, ("extract.borders", "coarse.fringes", "extract.pieces")),
     "shadows": Set(

@@ -34,7 +34,9 @@ from torch.nn.functional import interpolate
 from pimper_torch.chains.presets import load_chain
 from pimper_torch.errors import PimperError
 from pimper_torch.evidence.datasets import read_rendered
-from pimper_torch.evidence.metrics.evaluate import Evaluation, evaluate
+from pimper_torch.evidence.metrics.alignment import align_estimate, transfer
+from pimper_torch.evidence.metrics.distances import TrueSurface, true_surface
+from pimper_torch.evidence.metrics.evaluate import camera_figures
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.io.photographs import load_views
@@ -139,15 +141,17 @@ def judge_of(
         return Judge(names=names, spoilt=spoilt), {}
     capture, names = read_rendered(place, maps=False, photographs=False), result.scene.views.names
     estimate = Estimate(mesh=result.mesh, names=names, cameras=result.cameras)
-    found: Evaluation = evaluate(estimate, capture)
-    cameras, surface, mesh = found.cameras, found.surface, capture.truth.mesh
-    assert None not in (cameras, surface, mesh)
+    generator = torch.Generator().manual_seed(0)
+    moved = align_estimate(estimate, capture, "cameras", generator=generator).truth_from_world
+    surface = TrueSurface(capture).compare(transfer(result.mesh, moved))
+    cameras, mesh = camera_figures(estimate, capture), true_surface(capture)
+    assert cameras is not None
     good = cameras.mean_rotation_deg < MOST_DEG and cameras.mean_center_percent < MOST_PERCENT
     judge = Judge(
         names=names,
         spoilt=spoilt,
         good=good,
-        truth_from_world=found.alignment.truth_from_world,
+        truth_from_world=moved,
         surface=NearestSurface(mesh),
         near=NEAR * surface.diagonal,
         shown=shown_by(place, capture, names),
@@ -264,6 +268,9 @@ def main() -> None:
         for name in options.sets:
             own = [guard for guard in SETS[name].guards if guard in PATCHES or guard in CHANGES]
             for without in [options.without] if options.without else ["", *own]:
+                whole = found.get((name, preset, ""))
+                if without and whole and not whole["guards"].get(without, {}).get("count"):
+                    continue  # it took nothing that it could be without
                 path = results / f"{name}--{preset}--{without or 'all'}.json"
                 if not path.exists() and not options.table:
                     place, spoilt = prepared(options.folder, name, options.tiny)

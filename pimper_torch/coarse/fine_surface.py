@@ -158,7 +158,9 @@ def fine_surface(
     inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
     leave_out("coarse.outside", ~inside, at=centres)
     if not contours.confine:
-        inside &= near_points(faces, centres, cloud, support, counts, pixel)
+        near = near_points(faces, centres, cloud, support, counts, pixel)
+        leave_out("coarse.far", inside & ~near, at=centres)
+        inside &= near
     fraction = min_fraction(contours)
     kept = seen_surface(vertices, faces, support, counts, inside, pixel, config, fraction)
     if not bool(kept.any()):

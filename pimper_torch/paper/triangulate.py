@@ -16,6 +16,7 @@ from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_components, face_edges
+from pimper_torch.ledger import leave_out
 from pimper_torch.paper.cloud import with_cloud
 from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.paper.filters import (
@@ -114,7 +115,10 @@ class Triangulate(Stage):
             vertices = torch.cat([vertices, filled])
             source = torch.cat([source, torch.full_like(source[:1], -1).expand(len(filled))])
             faces = self._facets(vertices, scene.views, cameras, reference)
-        faces = largest_component(faces)
+        connected = largest_component(faces)
+        lost = len(faces) - len(connected)
+        leave_out("triangulate.pieces", lost, total=len(faces))
+        faces = connected
         if len(faces) == 0:
             raise ReconstructionError(
                 f"coarse mesh: all facets between {len(vertices)} points were dropped, and at "
@@ -178,6 +182,8 @@ class Triangulate(Stage):
                 f"least 4 are needed ({counts}). Take more photographs near the frontal one, or "
                 "choose another `triangulate.reference`."
             )
+        left = torch.ones_like(keep).index_fill(0, index, False)
+        leave_out("triangulate.reliable", left, at=scene.points_world)
         quality = length[index].to(angle) - scene.reprojection_errors_px[index]
         seen = observed[index, reference].to(quality)
         return index, quality + 3 * seen
