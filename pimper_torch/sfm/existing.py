@@ -12,6 +12,7 @@ from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
+from pimper_torch.sfm.crops import follow_crops
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.orientation import find_turns, possible_turns
 from pimper_torch.sfm.quarter_turns import (
@@ -60,6 +61,7 @@ def existing_ways(views: Views, path: Path) -> list[SparseModel]:
         )
     shown = taken(views, model)
     if len(model.points_world):
+        model = follow_crops(model, shown, _whole_sizes(shown), where)
         return [follow_pictures(model, shown, find_turns(model, shown, where))]
     return [follow_pictures(model, shown, turns) for turns in possible_turns(model, shown)]
 
@@ -130,6 +132,17 @@ def _stored_size(views: Views, view: int) -> tuple[int, int]:
             return picture.size
     except (OSError, ValueError, Image.DecompressionBombError):
         return width, height
+
+
+def _whole_sizes(views: Views) -> list[tuple[int, int]]:
+    """Give the sizes of photographs before they were shrunk on reading, in their orientation."""
+    sizes = []
+    for view in range(views.num_views):
+        width, height = (int(side) for side in views.sizes_px[view])
+        whole = _stored_size(views, view)
+        across = (whole[0] > whole[1]) != (width > height)
+        sizes.append(turned_size(*whole, int(across)))
+    return sizes
 
 
 def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:

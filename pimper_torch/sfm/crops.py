@@ -1,0 +1,362 @@
+"""Photographs that were cropped since a model was made of them, or that reach beyond its pictures.
+
+Sizes alone do not tell a crop from a resize. Points do: what is round them agrees between views
+where the principal point is right. So do the margins of camera raw, which JPEG leaves out.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, normalize
+
+from pimper_torch.errors import InputError, caution, some
+from pimper_torch.records import Views
+from pimper_torch.sfm.model import SparseModel, longest_tracks
+from pimper_torch.sfm.quarter_turns import (
+    QUARTERS,
+    cropped_lens,
+    turned_pixels,
+    turned_size,
+    turned_vectors,
+)
+from pimper_torch.sfm.squares import ERRORS, SAMPLES, sides_of, squares_in, standard_errors
+
+# Points of each view in the search, and in what is made of it. Of potatoes in 8 views of 240x180,
+# cropped by 20 px, the best shift is a pixel off with 40, and right with 400: choices.
+_FEW, _MANY = 40, 400
+# Pixels from one shift to the next in the first search, of pictures halved until they are so many
+# along an axis, or too small; shifts at a time: choices.
+_STEP_PX, _STEPS, _SMALLEST_PX, _AT_ONCE = 3, 12, 48, 64
+# A shift that is off by so much of the picture, and 4 px at least, must be worse: choices. Where
+# photographs of potatoes, mug, jar and balls (8 and 12 views of 240x180 and 320x240) were cropped
+# to 0.95 to 0.5 of their size, of the shifts about a resize one at least is worse by 1.5 standard
+# errors at most; about the crop all are by 4.9 and more, at twice the reach where texture is large.
+_SHARP, _SHARP_PX = 0.01, 4.0
+# Correlation above chance: at crops of these scenes 0.37 to 0.87, of another object's photographs
+# up to 0.28.
+_LEAST = 0.2
+# By so much the shift that was found is off where the object is a glossy mug; else by 1 px.
+_ROUND_PX = 3.0
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Placing:
+    """A photograph's pixel is ``scale`` times what the model's is beyond ``shift``, in all ways."""
+
+    shift: Float[Tensor, "way 2"]
+    scale: Float[Tensor, "2"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Group:
+    """Views of one size of the model's pictures and one of photographs, in their orientation.
+
+    Attributes:
+        whole: Of the model's pictures.
+        size: Of the photographs, before they were shrunk on reading.
+        shrunk: So many pixels of that are one of what was read.
+        views: Their numbers.
+    """
+
+    whole: Size
+    size: Size
+    shrunk: float
+    views: tuple[int, ...]
+
+    @property
+    def room(self) -> Float[Tensor, "2"]:
+        """The largest shift; negative where photographs reach beyond."""
+        return torch.tensor(self.whole, dtype=torch.float64) - torch.tensor(self.size)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Points:
+    """Points, and the photographs that they are looked for in, halved ``level`` times."""
+
+    model: SparseModel
+    views: Views
+    quarters: tuple[int, ...]
+    sides: Float[Tensor, "observation 2 2"]
+    pictures: tuple[Float[Tensor, "channel _ _"], ...]
+    level: int = 0
+
+    @classmethod
+    def of(cls, model: SparseModel, views: Views, quarters: Sequence[int], most: int) -> "_Points":
+        """Choose so many of each view."""
+        chosen = longest_tracks(model, most)
+        return cls(
+            model=chosen,
+            views=views,
+            quarters=tuple(quarters),
+            sides=sides_of(chosen, views),
+            pictures=tuple(
+                image[:, :height, :width]
+                for image, (width, height) in zip(
+                    views.images, views.sizes_px.tolist(), strict=True
+                )
+            ),
+        )
+
+    def at(self, level: int) -> "_Points":
+        """Halve the photographs."""
+        grey = (picture.detach().mean(dim=0, keepdim=True) for picture in self.pictures)
+        smaller = tuple(avg_pool2d(one, 2**level) for one in grey) if level else self.pictures
+        return replace(self, pictures=smaller, level=level)
+
+    def placing(self, view: int, size: Size, shift: Float[Tensor, "way 2"]) -> _Placing:
+        """Place a photograph that was resized from a part of the model's picture of that size."""
+        before = shift.new_tensor(self._before(view))
+        return _Placing(shift=shift, scale=before / shift.new_tensor(size))
+
+    def agreement(
+        self, views: Sequence[int], placings: Mapping[int, _Placing]
+    ) -> tuple[Float[Tensor, "way mine"], Float[Tensor, "way mine"]]:
+        """Correlate some views' observations with all others of their points, and of another."""
+        point, count = self.model.observation_point, len(self.model.points_world)
+        squares = self._squares(placings)
+        sums = squares.new_zeros(len(squares), count, SAMPLES).index_add(1, point, squares)
+        others = normalize(sums[:, point] - squares, dim=-1)
+        strangers = normalize(sums, dim=-1)[:, point - 1]
+        mine = torch.isin(self.model.observation_view, torch.tensor(views))
+        return (squares * others).sum(dim=-1)[:, mine], (squares * strangers).sum(dim=-1)[:, mine]
+
+    def _squares(self, placings: Mapping[int, _Placing]) -> Float[Tensor, "way observation sample"]:
+        """Sample the squares of photographs that are placed; zero in the others."""
+        ways = max(len(one.shift) for one in placings.values())
+        found = torch.zeros(ways, len(self.sides), SAMPLES)
+        for view, placing in placings.items():
+            here = (self.model.observation_view == view).nonzero()[:, 0]
+            pixels = self.model.observation_pixels[here] - placing.shift[:, None]
+            turns, before = self.quarters[view], self._before(view)
+            centers = turned_pixels(pixels * placing.scale, *before, turns) / 2**self.level
+            across = turned_vectors(self.sides[here], turns)
+            found[:, here] = squares_in(self.pictures[view], centers, across)
+        return found
+
+    def _before(self, view: int) -> Size:
+        width, height = (int(side) for side in self.views.sizes_px[view])
+        return turned_size(width, height, self.quarters[view])
+
+
+def follow_crops(
+    model: SparseModel, views: Views, sizes_px: Sequence[Size], where: str
+) -> SparseModel:
+    """Cut a model's pictures where photographs were cut out of them; a constant to autograd.
+
+    Photographs of one size share the crop. That they were resized is the plain explanation: a crop
+    must agree better.
+
+    Args:
+        model: Its views are the photographs, in their order.
+        views: The photographs.
+        sizes_px: Their sizes before they were shrunk on reading.
+        where: The model is, for messages, as a sentence starts.
+
+    Returns:
+        Lenses of the sizes of cropped photographs, principal points and observations shifted, and
+        a :class:`~pimper_torch.errors.PimperWarning`. All else is as it was, so that photographs of
+        another shape that nothing explains can be refused.
+
+    Raises:
+        InputError: Photographs were cropped, and points do not tell where.
+    """
+    quarters = _quarters(model, sizes_px, views)
+    groups = _groups(model, sizes_px, quarters, views)
+    changed = [group for group in groups if group.whole != group.size]
+    if not changed or not len(model.observation_view):
+        return model
+    few, many = (_Points.of(model, views, quarters, count) for count in (_FEW, _MANY))
+    still = torch.zeros(1, 2, dtype=torch.float64)
+    placed = {
+        view: few.placing(view, group.whole, still)
+        for group in groups
+        if group.whole == group.size
+        for view in group.views
+    }
+    for group in changed:
+        shift = _shift(group, few, many, placed, where)
+        size = group.whole if shift is None else group.size
+        shift = still if shift is None else shift[None]
+        placed |= {view: few.placing(view, size, shift) for view in group.views}
+        if size != group.whole:
+            _tell(group, shift[0], model.names, where)
+            model = cut(model, group.views, group.size, shift[0])
+    return model
+
+
+def resize_fits(whole: Size, width: int, height: int) -> bool:
+    """Tell whether a resize alone leads from a picture of one size to one of another."""
+    # Rounding a side to whole pixels changes the shape by less than this.
+    ratio = width / whole[0] / (height / whole[1])
+    return abs(ratio - 1) <= max(0.01, 2 / min(width, height))
+
+
+def cut(
+    model: SparseModel, views: Sequence[int], size: Size, shift: Float[Tensor, "2"]
+) -> SparseModel:
+    """Cut the pictures of some views: their lenses and observations follow, as another camera's.
+
+    Args:
+        model: Any.
+        views: Their numbers.
+        size: Width and height of what is cut out.
+        shift: Its corner, pixels of the pictures.
+    """
+    fresh = max(lens.camera for lens in model.lenses)
+    lenses = list(model.lenses)
+    for view in views:
+        lens = cropped_lens(lenses[view], *size, shift)
+        lenses[view] = lens.replace(camera=fresh + lens.camera)
+    here = torch.isin(model.observation_view, torch.tensor(views))
+    pixels = torch.where(here[:, None], model.observation_pixels - shift, model.observation_pixels)
+    return model.replace(lenses=tuple(lenses), observation_pixels=pixels)
+
+
+def _quarters(model: SparseModel, sizes_px: Sequence[Size], views: Views) -> list[int]:
+    """Turn photographs as EXIF does where the model's pictures lie across them otherwise."""
+    tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
+    return [
+        QUARTERS.get(tag, 0) if (width > height) != (lens.width > lens.height) else 0
+        for tag, (width, height), lens in zip(tags, sizes_px, model.lenses, strict=True)
+    ]
+
+
+def _groups(
+    model: SparseModel, sizes_px: Sequence[Size], quarters: Sequence[int], views: Views
+) -> list[_Group]:
+    """Group views by sizes, the largest group first."""
+    groups: dict[tuple[Size, Size], list[int]] = {}
+    for view, (lens, size) in enumerate(zip(model.lenses, sizes_px, strict=True)):
+        key = (lens.width, lens.height), turned_size(*size, quarters[view])
+        groups.setdefault(key, []).append(view)
+    found = [
+        _Group(
+            whole=whole,
+            size=size,
+            shrunk=max(size) / int(views.sizes_px[members[0]].max()),
+            views=tuple(members),
+        )
+        for (whole, size), members in groups.items()
+    ]
+    return sorted(found, key=lambda group: -len(group.views))
+
+
+def _shift(
+    group: _Group, few: _Points, many: _Points, placed: Mapping[int, _Placing], where: str
+) -> Float[Tensor, "2"] | None:
+    """Find where photographs were cut out of the model's pictures; ``None`` where they were not."""
+
+    def agreement(
+        points: _Points, shifts: Float[Tensor, "way 2"], size: Size = group.size
+    ) -> tuple[Float[Tensor, "way mine"], Float[Tensor, "way mine"]]:
+        mine = {view: points.placing(view, size, shifts) for view in group.views}
+        return points.agreement(group.views, {**placed, **mine})
+
+    def best(points: _Points, shifts: Float[Tensor, "way 2"]) -> Float[Tensor, "2"]:
+        scores = [agreement(points, part)[0] for part in torch.split(shifts, _AT_ONCE)]
+        own = torch.cat(scores)
+        seen = (own != 0).sum(dim=1).clamp_min(own.shape[1] / 4)
+        return shifts[(own.sum(dim=1) / seen).argmax()]
+
+    def sharp(
+        own: Float[Tensor, " mine"], shift: Float[Tensor, "2"], size: Size, reach_px: float
+    ) -> bool:
+        """Tell whether photographs that are placed a little beside agree worse."""
+        reach = max(reach_px * group.shrunk, _SHARP * max(group.size))
+        beside = agreement(many, shift + reach * _around(shift), size)[0]
+        told = own != 0
+        return min(standard_errors((own - one)[told]) for one in beside) > ERRORS
+
+    still, (shifts, level) = torch.zeros_like(group.room), _first(group)
+    resized = agreement(many, still[None], group.whole)[0][0]
+    fits = resize_fits(group.whole, *group.size)
+    if fits and len(shifts) > _AT_ONCE and sharp(resized, still, group.whole, _SHARP_PX):
+        return None  # without a long search
+    shift = best(few.at(level), shifts)
+    for finer in range(level, -1, -1):
+        shift = _climbed(group, shift, 2**finer, partial(best, few.at(finer)))
+    shift = _climbed(group, shift, 1, partial(best, many))
+    own, chance = (one[0] for one in agreement(many, shift[None]))
+    told = own != 0
+    if fits and standard_errors((own - resized)[told]) <= ERRORS:
+        return None
+    if float((own - chance)[told].mean()) < _LEAST:
+        return None
+    if any(sharp(own, shift, group.size, reach * _SHARP_PX) for reach in (1, 2)):
+        return _plain(group, shift)
+    if not fits:
+        return None
+    name = few.model.names[group.views[0]]
+    raise InputError(
+        f"{where} was made of pictures of {group.whole[0]}x{group.whole[1]}, but {name} is "
+        f"{group.size[0]}x{group.size[1]} ({len(group.views)} are). What they show round its "
+        "points fits a crop better than a resize, but does not tell which crop. Give the "
+        "photographs that the model was made from, resized if you like, but not cropped."
+    )
+
+
+def _around(like: Tensor) -> Float[Tensor, "8 2"]:
+    steps = torch.tensor([-1, 0, 1]).to(like)
+    ring = torch.cartesian_prod(steps, steps)
+    return ring[ring.abs().sum(dim=1) > 0]
+
+
+def _first(group: _Group) -> tuple[Float[Tensor, "way 2"], int]:
+    """List the shifts of the first search, and how often photographs are halved for it."""
+    room = group.room.abs() / group.shrunk
+    wanted = math.log2(max(1.0, float(room.max()) / (_STEP_PX * _STEPS)))
+    most = math.log2(max(1.0, min(group.size) / group.shrunk / _SMALLEST_PX))
+    level = min(math.ceil(wanted), math.floor(most))
+    counts = (room / (_STEP_PX * 2**level)).ceil().long() + 1
+    axes = [
+        torch.linspace(0, 1, count, dtype=torch.float64) * side
+        for count, side in zip(counts.tolist(), group.room, strict=True)
+    ]
+    return torch.cartesian_prod(*axes), level
+
+
+def _plain(group: _Group, shift: Float[Tensor, "2"]) -> Float[Tensor, "2"]:
+    """Round a shift to the middle or to a border of the picture, on each axis where it is near."""
+    usual = torch.stack([0 * group.room, group.room / 2, group.room])
+    nearest = usual.gather(0, (usual - shift).abs().argmin(dim=0)[None])[0]
+    return torch.where((nearest - shift).abs() <= _ROUND_PX * group.shrunk, nearest, shift)
+
+
+def _climbed(
+    group: _Group,
+    shift: Float[Tensor, "2"],
+    step: float,
+    best: Callable[[Float[Tensor, "way 2"]], Float[Tensor, "2"]],
+) -> Float[Tensor, "2"]:
+    """Step to the best shift round about until none is better, in whole pixels."""
+    low, high = group.room.clamp_max(0), group.room.clamp_min(0)
+    shift = shift.round()
+    for _ in range(_STEPS):
+        ring = shift + round(step * group.shrunk) * torch.cat(
+            [torch.zeros(1, 2).to(shift), _around(shift)]
+        )
+        found = best(torch.minimum(torch.maximum(ring, low), high))
+        if torch.equal(found, shift):
+            break
+        shift = found
+    return shift
+
+
+def _tell(group: _Group, shift: Float[Tensor, "2"], names: Sequence[str], where: str) -> None:
+    left, top = (round(side) for side in shift.tolist())
+    caution(
+        f"{where} was made of pictures of {group.whole[0]}x{group.whole[1]}. What photographs show "
+        f"round its points tells that {len(group.views)} of {len(names)} "
+        f"({some([names[view] for view in group.views], 4)}), of {group.size[0]}x{group.size[1]}, "
+        f"are no resized ones: their corner is at pixel ({left}, {top}) of these pictures. The "
+        "principal point and the observations follow. If that is wrong, give the photographs that "
+        "the model was made from.",
+        stacklevel=6,
+    )
