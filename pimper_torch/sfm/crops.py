@@ -40,6 +40,8 @@ _SHARP, _SHARP_PX = 0.01, 4.0
 # Correlation above chance: at crops of these scenes 0.37 to 0.87, of another object's photographs
 # up to 0.28.
 _LEAST = 0.2
+# Of the picture: where sizes differ by less, a crop that is taken for a resize is not warned of.
+SMALL = 0.02
 # By so much the shift that was found is off where the object is a glossy mug; else by 1 px.
 _ROUND_PX = 3.0
 
@@ -191,6 +193,25 @@ def follow_crops(
     return model
 
 
+def possible_crops(model: SparseModel, views: Views, sizes_px: Sequence[Size]) -> list[SparseModel]:
+    """Cut the pictures of a model without points in the usual ways; none where no size differs.
+
+    Takes what :func:`follow_crops` takes.
+
+    Returns:
+        Photographs from the middle, then from the borders and corners.
+    """
+    groups = _groups(model, sizes_px, _quarters(model, sizes_px, views), views)
+    changed = [group for group in groups if group.whole != group.size]
+    ways = []
+    for place in torch.tensor([0.5, 0.0, 1.0])[torch.cartesian_prod(*[torch.arange(3)] * 2)]:
+        way = model
+        for group in changed:
+            way = cut(way, group.views, group.size, place * group.room)
+        ways.append(way)
+    return ways if changed else []
+
+
 def resize_fits(whole: Size, width: int, height: int) -> bool:
     """Tell whether a resize alone leads from a picture of one size to one of another."""
     # Rounding a side to whole pixels changes the shape by less than this.
@@ -217,6 +238,16 @@ def cut(
     here = torch.isin(model.observation_view, torch.tensor(views))
     pixels = torch.where(here[:, None], model.observation_pixels - shift, model.observation_pixels)
     return model.replace(lenses=tuple(lenses), observation_pixels=pixels)
+
+
+def shifted_lenses(
+    model: SparseModel, views: Sequence[int], shift: Float[Tensor, "2"]
+) -> SparseModel:
+    """Move the pictures of some views; sizes, observations and numbers of cameras stay."""
+    lenses = list(model.lenses)
+    for view in views:
+        lenses[view] = cropped_lens(lenses[view], lenses[view].width, lenses[view].height, shift)
+    return model.replace(lenses=tuple(lenses))
 
 
 def _quarters(model: SparseModel, sizes_px: Sequence[Size], views: Views) -> list[int]:
@@ -270,7 +301,7 @@ def _shift(
     ) -> bool:
         """Tell whether photographs that are placed a little beside agree worse."""
         reach = max(reach_px * group.shrunk, _SHARP * max(group.size))
-        beside = agreement(many, shift + reach * _around(shift), size)[0]
+        beside = agreement(many, shift + reach * around(shift), size)[0]
         told = own != 0
         return min(standard_errors((own - one)[told]) for one in beside) > ERRORS
 
@@ -285,7 +316,10 @@ def _shift(
     shift = _climbed(group, shift, 1, partial(best, many))
     own, chance = (one[0] for one in agreement(many, shift[None]))
     told = own != 0
-    if fits and standard_errors((own - resized)[told]) <= ERRORS:
+    better = standard_errors((own - resized)[told])
+    if fits and better <= ERRORS:
+        if better > -ERRORS and float((group.room / torch.tensor(group.whole)).abs().max()) > SMALL:
+            tell_undecided(where, some([few.model.names[view] for view in group.views], 4))
         return None
     if float((own - chance)[told].mean()) < _LEAST:
         return None
@@ -302,7 +336,8 @@ def _shift(
     )
 
 
-def _around(like: Tensor) -> Float[Tensor, "8 2"]:
+def around(like: Tensor) -> Float[Tensor, "8 2"]:
+    """List the steps to the neighbours of a pixel."""
     steps = torch.tensor([-1, 0, 1]).to(like)
     ring = torch.cartesian_prod(steps, steps)
     return ring[ring.abs().sum(dim=1) > 0]
@@ -340,13 +375,23 @@ def _climbed(
     shift = shift.round()
     for _ in range(_STEPS):
         ring = shift + round(step * group.shrunk) * torch.cat(
-            [torch.zeros(1, 2).to(shift), _around(shift)]
+            [torch.zeros(1, 2).to(shift), around(shift)]
         )
         found = best(torch.minimum(torch.maximum(ring, low), high))
         if torch.equal(found, shift):
             break
         shift = found
     return shift
+
+
+def tell_undecided(where: str, names: str) -> None:
+    """Warn that photographs of another size are taken for resized ones."""
+    caution(
+        f"{where}: its pictures are of another size than {names}, and nothing tells "
+        "whether these were resized or cropped: they are taken as resized. If that is wrong, give "
+        "the photographs that it was made from.",
+        stacklevel=6,
+    )
 
 
 def _tell(group: _Group, shift: Float[Tensor, "2"], names: Sequence[str], where: str) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from PIL import Image
@@ -12,9 +13,9 @@ from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.crops import follow_crops
+from pimper_torch.sfm.crops import follow_crops, possible_crops
 from pimper_torch.sfm.model import SparseModel, match_names
-from pimper_torch.sfm.orientation import find_turns, possible_turns
+from pimper_torch.sfm.orientation import allowed_turns, find_turns, possible_turns
 from pimper_torch.sfm.quarter_turns import (
     turned_lens,
     turned_pixels,
@@ -40,15 +41,30 @@ def existing_model(views: Views, path: Path) -> SparseModel:
         ReconstructionError: There are cameras of fewer than 3 of the photographs.
         InputError: They do not belong to the photographs, or cannot be read.
     """
-    return existing_ways(views, path)[0]
+    return existing_ways(views, path).plain[0]
 
 
-def existing_ways(views: Views, path: Path) -> list[SparseModel]:
-    """Do what :func:`existing_model` does, in the two ways that cameras without points allow.
+class Ways(NamedTuple):
+    """Models that differ in how the photographs may have come from the pictures that they are of.
 
-    Returns:
-        One model where the points tell how photographs are turned, or nothing turns them; else
-        that of the photographs as they stand, and that of the pixels that files store.
+    Attributes:
+        plain: Resized; in the pixels of photographs as they stand, then as files store them, where
+            no points tell. Empty where no resize leads to a photograph's shape.
+        cropped: Cut out in the usual ways, where sizes differ and no points tell.
+    """
+
+    plain: list[SparseModel]
+    cropped: list[SparseModel]
+
+
+def existing_ways(views: Views, path: Path, *, matched: bool = False) -> Ways:
+    """Do what :func:`existing_model` does, in all ways that cameras without points allow.
+
+    Args:
+        views: As there.
+        path: As there.
+        matched: Photographs of another shape are no error yet: matches may tell that they were
+            cropped.
     """
     where = place(path)
     read = _model_of_file(views, path) if path.is_file() else colmap.read_model(path)
@@ -60,10 +76,18 @@ def existing_ways(views: Views, path: Path) -> list[SparseModel]:
             "holds more of them, or leave it out to run structure from motion."
         )
     shown = taken(views, model)
+    sizes = _whole_sizes(shown)
     if len(model.points_world):
-        model = follow_crops(model, shown, _whole_sizes(shown), where)
-        return [follow_pictures(model, shown, find_turns(model, shown, where))]
-    return [follow_pictures(model, shown, turns) for turns in possible_turns(model, shown)]
+        model = follow_crops(model, shown, sizes, where)
+        return Ways([follow_pictures(model, shown, find_turns(model, shown, where))], [])
+    crops = possible_crops(model, shown, sizes)
+    turned = [(one, turns) for one in crops for turns in possible_turns(one, shown)]
+    fits = all(one.any() for one in allowed_turns(model, shown))
+    plain = possible_turns(model, shown) if fits or not (matched and crops) else []
+    return Ways(
+        [follow_pictures(model, shown, turns) for turns in plain],
+        [follow_pictures(one, shown, turns) for one, turns in turned],
+    )
 
 
 def place(path: Path) -> str:

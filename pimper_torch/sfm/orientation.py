@@ -72,10 +72,10 @@ def possible_turns(model: SparseModel, views: Views) -> list[tuple[int, ...]]:
     return [tuple(one) for one in dict.fromkeys(tuple(way.tolist()) for way in ways)]
 
 
-def _allowed(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
-    """Mark the turns that the shapes of pictures allow."""
+def allowed_turns(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
+    """Mark the turns by which a resize leads from the model's pictures to the photographs."""
     sizes = [(width, height) for width, height in views.sizes_px.tolist()]
-    allowed = torch.tensor(
+    return torch.tensor(
         [
             [
                 resize_fits((lens.width, lens.height), *turned_size(*size, quarters))
@@ -84,6 +84,12 @@ def _allowed(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
             for lens, size in zip(model.lenses, sizes, strict=True)
         ]
     ).reshape(-1, 4)
+
+
+def _allowed(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
+    """Mark the turns that the shapes of pictures allow; refuse a photograph that has none."""
+    sizes = [(width, height) for width, height in views.sizes_px.tolist()]
+    allowed = allowed_turns(model, views)
     for name, lens, size, fits in zip(model.names, model.lenses, sizes, allowed, strict=True):
         if not bool(fits.any()):
             raise _other_shape(name, lens, size, "whichever way it is turned")

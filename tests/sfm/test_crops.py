@@ -1,5 +1,6 @@
 """Photographs that were cropped beside a model of whole ones, and those that were resized."""
 
+import json
 import warnings
 
 import numpy as np
@@ -15,6 +16,7 @@ from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
 from pimper_torch.sfm.colmap import write_binary
 from pimper_torch.sfm.existing import existing_model
+from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from tests.sfm.ball import (
     FOCAL,
     HEIGHT,
@@ -133,3 +135,72 @@ def test_a_crop_that_points_do_not_locate_is_refused(whole, sparse):
     blurred = whole.replace(images=avg_pool2d(whole.images, 61, 1, 30))
     with pytest.raises(InputError, match=r"400x300.*better than a resize.*which crop.*not cropped"):
         existing_model(cropped(blurred, 40, 30, 40, 30), sparse)
+
+
+@pytest.fixture
+def transforms(tmp_path):
+    """The cameras without points."""
+    cameras = cameras_on_an_arc()
+    world_from_cam = torch.linalg.inv(cameras.cam_from_world)
+    world_from_cam[:, :3, 1:3] *= -1
+    whole = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+    frames = [
+        {"file_path": f"{view}.png", "transform_matrix": pose.tolist()}
+        for view, pose in enumerate(world_from_cam)
+    ]
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({**whole, "frames": frames}))
+    return path
+
+
+RECONSTRUCT = Reconstruct(ReconstructConfig(threads=1))
+
+
+@pytest.mark.parametrize(
+    "borders", [(20, 20, 20, 20), (40, 30, 40, 30), (31, 7, 9, 23), (0, 0, 48, 36)]
+)
+def test_matches_tell_where_photographs_of_cameras_without_points_were_cropped(
+    whole, transforms, borders
+):
+    plain = photographs(cameras_on_an_arc(), lit=False)
+    with pytest.warns(PimperWarning) as told:
+        scene = RECONSTRUCT(cropped(plain, *borders), transforms)
+    about = [str(one.message) for one in told if "resized" in str(one.message)]
+    assert len(about) == 1
+    assert "6 of 6 photographs (0.png" in about[0]
+    assert "they are no resized ones" in about[0]
+    width, height = WIDTH - borders[0] - borders[2], HEIGHT - borders[1] - borders[3]
+    for lens in scene.lenses:
+        assert (lens.width, lens.height) == (width, height)
+        assert lens.params[:2] == (FOCAL, FOCAL)
+        principal = (WIDTH / 2 - borders[0], HEIGHT / 2 - borders[1])
+        assert lens.params[2:4] == pytest.approx(principal, abs=1.0)
+    off = (scene.points_world.norm(dim=1) - 1).abs()  # a pixel is 0.005 on the ball
+    assert float(off.median()) < 0.002
+
+
+def test_photographs_of_cameras_without_points_that_were_resized_are_no_crop(transforms):
+    plain = photographs(cameras_on_an_arc(), lit=False)
+    with pytest.warns(PimperWarning) as told:
+        scene = RECONSTRUCT(resized(plain, 341, 256), transforms)
+    assert not [one for one in told if "resized" in str(one.message)]
+    assert scene.lenses[0].params[2:4] == pytest.approx((170.5, 128))
+
+
+def test_where_nothing_tells_photographs_are_taken_as_resized_with_a_warning(
+    whole, sparse, transforms
+):
+    blank = cropped(whole.replace(images=torch.full_like(whole.images, 0.3)), 40, 30, 40, 30)
+    for path in (sparse, transforms):
+        with pytest.warns(PimperWarning) as told:
+            scene = RECONSTRUCT(blank, path)
+        assert "nothing tells whether these were resized or cropped" in str(told[0].message)
+        assert scene.lenses[0].params[0] == pytest.approx(FOCAL * 400 / 480)
+
+
+def test_photographs_of_another_shape_that_hardly_match_are_refused(whole, transforms):
+    blank = cropped(whole.replace(images=torch.full_like(whole.images, 0.3)), 40, 0, 0, 0)
+    with pytest.raises(InputError, match=r"6 of 6.*do not tell which crop.*not cropped"):
+        RECONSTRUCT(blank, transforms)
+    with pytest.raises(InputError, match=r"440x360.*480x360.*another shape"):
+        existing_model(blank, transforms)

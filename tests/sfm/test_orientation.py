@@ -190,11 +190,11 @@ def test_poses_of_other_photographs_are_warned_of(stored, sparse):
 def test_without_points_both_ways_are_left_open(stored, tmp_path):
     folder = written(tmp_path, points=0)
     views = turned(stored, [2] * 6)
-    upright, as_stored = existing_ways(views, folder)
+    upright, as_stored = existing_ways(views, folder).plain
     plain = existing_model(stored, folder)
     assert torch.equal(upright.cam_from_world, plain.cam_from_world)
     assert torch.equal(back(as_stored, [2] * 6), plain.cam_from_world)
-    assert len(existing_ways(stored, folder)) == 1
+    assert len(existing_ways(stored, folder).plain) == 1
 
 
 def test_of_a_model_of_two_cameras_the_photographs_folder_takes_its_own(stored, tmp_path):
