@@ -12,10 +12,11 @@ from functools import partial
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, normalize
+from torch.nn.functional import avg_pool2d
 
 from pimper_torch.errors import InputError, caution, some
 from pimper_torch.records import Views
+from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.quarter_turns import (
     QUARTERS,
@@ -24,7 +25,14 @@ from pimper_torch.sfm.quarter_turns import (
     turned_size,
     turned_vectors,
 )
-from pimper_torch.sfm.squares import ERRORS, SAMPLES, sides_of, squares_in, standard_errors
+from pimper_torch.sfm.squares import (
+    ERRORS,
+    SAMPLES,
+    others_of,
+    sides_of,
+    squares_in,
+    standard_errors,
+)
 
 # Points of each view in the search, and in what is made of it. Of potatoes in 8 views of 240x180,
 # cropped by 20 px, the best shift is a pixel off with 40, and right with 400: choices.
@@ -32,6 +40,8 @@ _FEW, _MANY = 40, 400
 # Pixels from one shift to the next in the first search, of pictures halved until they are so many
 # along an axis, or too small; shifts at a time: choices.
 _STEP_PX, _STEPS, _SMALLEST_PX, _AT_ONCE = 3, 12, 48, 64
+# Steps in a row: a choice that no search came near.
+_MOST_STEPS = 12
 # A shift that is off by so much of the picture, and 4 px at least, must be worse: choices. Where
 # photographs of potatoes, mug, jar and balls (8 and 12 views of 240x180 and 320x240) were cropped
 # to 0.95 to 0.5 of their size, of the shifts about a resize one at least is worse by 1.5 standard
@@ -48,12 +58,8 @@ _ROUND_PX = 3.0
 Size = tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Placing:
-    """A photograph's pixel is ``scale`` times what the model's is beyond ``shift``, in all ways."""
-
-    shift: Float[Tensor, "way 2"]
-    scale: Float[Tensor, "2"]
+# Where photographs were cut out of the model's pictures, in several ways, and the size of that.
+_Cut = tuple[Float[Tensor, "way 2"], Size]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +82,11 @@ class _Group:
     def room(self) -> Float[Tensor, "2"]:
         """The largest shift; negative where photographs reach beyond."""
         return torch.tensor(self.whole, dtype=torch.float64) - torch.tensor(self.size)
+
+    @property
+    def bounds(self) -> Float[Tensor, "2 2"]:
+        """The smallest and the largest shift."""
+        return torch.stack([self.room.clamp_max(0), self.room.clamp_min(0)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,35 +123,28 @@ class _Points:
         smaller = tuple(avg_pool2d(one, 2**level) for one in grey) if level else self.pictures
         return replace(self, pictures=smaller, level=level)
 
-    def placing(self, view: int, size: Size, shift: Float[Tensor, "way 2"]) -> _Placing:
-        """Place a photograph that was resized from a part of the model's picture of that size."""
-        before = shift.new_tensor(self._before(view))
-        return _Placing(shift=shift, scale=before / shift.new_tensor(size))
-
     def agreement(
-        self, views: Sequence[int], placings: Mapping[int, _Placing]
+        self, views: Sequence[int], cuts: Mapping[int, _Cut]
     ) -> tuple[Float[Tensor, "way mine"], Float[Tensor, "way mine"]]:
-        """Correlate some views' observations with all others of their points, and of another."""
-        point, count = self.model.observation_point, len(self.model.points_world)
-        squares = self._squares(placings)
-        sums = squares.new_zeros(len(squares), count, SAMPLES).index_add(1, point, squares)
-        others = normalize(sums[:, point] - squares, dim=-1)
-        strangers = normalize(sums, dim=-1)[:, point - 1]
+        """Correlate some views' observations with all others of their points, and of another.
+
+        Args:
+            views: Numbers of these views.
+            cuts: Of the photographs that take part.
+        """
+        ways = max(len(shift) for shift, _ in cuts.values())
+        squares = torch.zeros(ways, len(self.sides), SAMPLES)
+        for view, (shift, size) in cuts.items():
+            here = (self.model.observation_view == view).nonzero()[:, 0]
+            turns, before = self.quarters[view], self._before(view)
+            pixels = self.model.observation_pixels[here] - shift[:, None]
+            pixels = pixels * (pixels.new_tensor(before) / pixels.new_tensor(size))
+            centers = turned_pixels(pixels, *before, turns) / 2**self.level
+            across = turned_vectors(self.sides[here], turns)
+            squares[:, here] = squares_in(self.pictures[view], centers, across)
+        others, strangers = others_of(squares, self.model.observation_point)
         mine = torch.isin(self.model.observation_view, torch.tensor(views))
         return (squares * others).sum(dim=-1)[:, mine], (squares * strangers).sum(dim=-1)[:, mine]
-
-    def _squares(self, placings: Mapping[int, _Placing]) -> Float[Tensor, "way observation sample"]:
-        """Sample the squares of photographs that are placed; zero in the others."""
-        ways = max(len(one.shift) for one in placings.values())
-        found = torch.zeros(ways, len(self.sides), SAMPLES)
-        for view, placing in placings.items():
-            here = (self.model.observation_view == view).nonzero()[:, 0]
-            pixels = self.model.observation_pixels[here] - placing.shift[:, None]
-            turns, before = self.quarters[view], self._before(view)
-            centers = turned_pixels(pixels * placing.scale, *before, turns) / 2**self.level
-            across = turned_vectors(self.sides[here], turns)
-            found[:, here] = squares_in(self.pictures[view], centers, across)
-        return found
 
     def _before(self, view: int) -> Size:
         width, height = (int(side) for side in self.views.sizes_px[view])
@@ -176,20 +180,20 @@ def follow_crops(
         return model
     few, many = (_Points.of(model, views, quarters, count) for count in (_FEW, _MANY))
     still = torch.zeros(1, 2, dtype=torch.float64)
-    placed = {
-        view: few.placing(view, group.whole, still)
+    cuts: dict[int, _Cut] = {
+        view: (still, group.whole)
         for group in groups
         if group.whole == group.size
         for view in group.views
     }
     for group in changed:
-        shift = _shift(group, few, many, placed, where)
-        size = group.whole if shift is None else group.size
-        shift = still if shift is None else shift[None]
-        placed |= {view: few.placing(view, size, shift) for view in group.views}
-        if size != group.whole:
-            _tell(group, shift[0], model.names, where)
-            model = cut(model, group.views, group.size, shift[0])
+        shift = _shift(group, few, many, cuts, where)
+        cuts |= dict.fromkeys(
+            group.views, (still, group.whole) if shift is None else (shift[None], group.size)
+        )
+        if shift is not None:
+            model = cut(model, group.views, group.size, shift)
+            tell_crop(where, model, group.views, _EVIDENCE)
     return model
 
 
@@ -280,15 +284,15 @@ def _groups(
 
 
 def _shift(
-    group: _Group, few: _Points, many: _Points, placed: Mapping[int, _Placing], where: str
+    group: _Group, few: _Points, many: _Points, cuts: Mapping[int, _Cut], where: str
 ) -> Float[Tensor, "2"] | None:
     """Find where photographs were cut out of the model's pictures; ``None`` where they were not."""
 
     def agreement(
         points: _Points, shifts: Float[Tensor, "way 2"], size: Size = group.size
     ) -> tuple[Float[Tensor, "way mine"], Float[Tensor, "way mine"]]:
-        mine = {view: points.placing(view, size, shifts) for view in group.views}
-        return points.agreement(group.views, {**placed, **mine})
+        mine = dict.fromkeys(group.views, (shifts, size))
+        return points.agreement(group.views, {**cuts, **mine})
 
     def best(points: _Points, shifts: Float[Tensor, "way 2"]) -> Float[Tensor, "2"]:
         scores = [agreement(points, part)[0] for part in torch.split(shifts, _AT_ONCE)]
@@ -312,14 +316,15 @@ def _shift(
         return None  # without a long search
     shift = best(few.at(level), shifts)
     for finer in range(level, -1, -1):
-        shift = _climbed(group, shift, 2**finer, partial(best, few.at(finer)))
-    shift = _climbed(group, shift, 1, partial(best, many))
+        step = round(2**finer * group.shrunk)
+        shift = climbed(shift.round(), step, partial(best, few.at(finer)), group.bounds)
+    shift = climbed(shift, round(group.shrunk), partial(best, many), group.bounds)
     own, chance = (one[0] for one in agreement(many, shift[None]))
     told = own != 0
     better = standard_errors((own - resized)[told])
     if fits and better <= ERRORS:
         if better > -ERRORS and float((group.room / torch.tensor(group.whole)).abs().max()) > SMALL:
-            tell_undecided(where, some([few.model.names[view] for view in group.views], 4))
+            tell_undecided(where, few.model, group.views)
         return None
     if float((own - chance)[told].mean()) < _LEAST:
         return None
@@ -327,13 +332,7 @@ def _shift(
         return _plain(group, shift)
     if not fits:
         return None
-    name = few.model.names[group.views[0]]
-    raise InputError(
-        f"{where} was made of pictures of {group.whole[0]}x{group.whole[1]}, but {name} is "
-        f"{group.size[0]}x{group.size[1]} ({len(group.views)} are). What they show round its "
-        "points fits a crop better than a resize, but does not tell which crop. Give the "
-        "photographs that the model was made from, resized if you like, but not cropped."
-    )
+    raise refused_crop(where, few.model, group.views, _EVIDENCE)
 
 
 def around(like: Tensor) -> Float[Tensor, "8 2"]:
@@ -364,44 +363,64 @@ def _plain(group: _Group, shift: Float[Tensor, "2"]) -> Float[Tensor, "2"]:
     return torch.where((nearest - shift).abs() <= _ROUND_PX * group.shrunk, nearest, shift)
 
 
-def _climbed(
-    group: _Group,
+def climbed(
     shift: Float[Tensor, "2"],
     step: float,
     best: Callable[[Float[Tensor, "way 2"]], Float[Tensor, "2"]],
+    bounds: Float[Tensor, "2 2"],
 ) -> Float[Tensor, "2"]:
-    """Step to the best shift round about until none is better, in whole pixels."""
-    low, high = group.room.clamp_max(0), group.room.clamp_min(0)
-    shift = shift.round()
-    for _ in range(_STEPS):
-        ring = shift + round(step * group.shrunk) * torch.cat(
-            [torch.zeros(1, 2).to(shift), around(shift)]
-        )
-        found = best(torch.minimum(torch.maximum(ring, low), high))
+    """Step to the best shift round about until none is better.
+
+    Args:
+        shift: To begin with.
+        step: Pixels.
+        best: Chooses one of several.
+        bounds: Of shifts, the smallest and the largest.
+    """
+    for _ in range(_MOST_STEPS):
+        ring = torch.cat([torch.zeros(1, 2).to(shift), step * around(shift)])
+        found = best(torch.minimum(torch.maximum(shift + ring, bounds[0]), bounds[1]))
         if torch.equal(found, shift):
             break
         shift = found
     return shift
 
 
-def tell_undecided(where: str, names: str) -> None:
+_EVIDENCE = "what they show round its points"
+
+
+def tell_crop(where: str, model: SparseModel, views: Sequence[int], evidence: str) -> None:
+    """Warn that photographs are cropped ones, and where the principal point is in the first."""
+    lens = model.lenses[views[0]]
+    x, y = pinhole_of(lens)[:2, 2].tolist()
+    caution(
+        f"{where} is of pictures of another size than {_which(model, views)}, and {evidence} tells "
+        "that these are no resized ones, but cropped: the principal point is at "
+        f"({x:.0f}, {y:.0f}) of {lens.width}x{lens.height}. Cameras and observations follow. If "
+        "that is wrong, give the photographs that it was made from.",
+        stacklevel=6,
+    )
+
+
+def tell_undecided(where: str, model: SparseModel, views: Sequence[int]) -> None:
     """Warn that photographs of another size are taken for resized ones."""
     caution(
-        f"{where}: its pictures are of another size than {names}, and nothing tells "
+        f"{where} is of pictures of another size than {_which(model, views)}, and nothing tells "
         "whether these were resized or cropped: they are taken as resized. If that is wrong, give "
         "the photographs that it was made from.",
         stacklevel=6,
     )
 
 
-def _tell(group: _Group, shift: Float[Tensor, "2"], names: Sequence[str], where: str) -> None:
-    left, top = (round(side) for side in shift.tolist())
-    caution(
-        f"{where} was made of pictures of {group.whole[0]}x{group.whole[1]}. What photographs show "
-        f"round its points tells that {len(group.views)} of {len(names)} "
-        f"({some([names[view] for view in group.views], 4)}), of {group.size[0]}x{group.size[1]}, "
-        f"are no resized ones: their corner is at pixel ({left}, {top}) of these pictures. The "
-        "principal point and the observations follow. If that is wrong, give the photographs that "
-        "the model was made from.",
-        stacklevel=6,
+def refused_crop(where: str, model: SparseModel, views: Sequence[int], evidence: str) -> InputError:
+    """Refuse photographs that are no resized ones, and of which nothing tells the crop."""
+    return InputError(
+        f"{where} is of pictures of another size than {_which(model, views)}, and {evidence} fits "
+        "a crop better than a resize, but does not tell which crop. Give the photographs that it "
+        "was made from, resized if you like, but not cropped."
     )
+
+
+def _which(model: SparseModel, views: Sequence[int]) -> str:
+    names = some([model.names[view] for view in views], 4)
+    return f"{len(views)} of {model.num_views} photographs ({names})"

@@ -7,7 +7,7 @@ Cameras of whole photographs beside cropped ones are cropped until matches lie n
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,12 +16,20 @@ from kornia.geometry.epipolar import essential_from_Rt, fundamental_from_essenti
 from torch import Tensor
 
 from pimper_torch.camera_files.conventions import CameraMistake, camera_mistakes
-from pimper_torch.errors import InputError, caution, some
+from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
 from pimper_torch.sfm.agreement import undistorted_pixels
 from pimper_torch.sfm.colmap import pinhole_of
-from pimper_torch.sfm.crops import SMALL, around, shifted_lenses, tell_undecided
+from pimper_torch.sfm.crops import (
+    SMALL,
+    around,
+    climbed,
+    refused_crop,
+    shifted_lenses,
+    tell_crop,
+    tell_undecided,
+)
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.squares import ERRORS, standard_errors
@@ -156,69 +164,41 @@ def find_crop(
         found = [_errors(cameras, pair) for pair in matches.pairs]
         return torch.cat([*found, torch.zeros(0, dtype=torch.float64)]).clamp_max(max_error_px)
 
-    count = sum(pair.num_matches for pair in verified)
     usual = min(crops, key=lambda model: float(errors(model).mean()))
     cut = [one != other for one, other in zip(crops[0].lenses, crops[-1].lenses, strict=True)]
     views = torch.tensor(cut).nonzero()[:, 0].tolist()
-    shift, best = _shifted(usual, views, errors, _half_room(crops, views[0]))
-    if standard_errors(errors(usual) - best) <= ERRORS:
-        shift, best = torch.zeros_like(shift), errors(usual)
-    names, half = some([usual.names[view] for view in views], 4), _half_room(crops, views[0])
+
+    def shifted(shift: Float[Tensor, "2"]) -> SparseModel:
+        return shifted_lenses(usual, views, shift)
+
+    def nearest(shifts: Float[Tensor, "way 2"]) -> Float[Tensor, "2"]:
+        means = [errors(shifted(shift)).mean() for shift in shifts]
+        return shifts[torch.stack(means).argmin()]
+
+    middle, corner = (pinhole_of(model.lenses[views[0]])[:2, 2] for model in (crops[0], crops[-1]))
+    room = 2 * (middle - corner).abs()
+    shift, step = torch.zeros_like(room), float(room.max()) / 4
+    while step >= _STEP_PX:
+        shift = climbed(shift, step, nearest, torch.stack([-room, room]))
+        step /= 2
+    if standard_errors(errors(usual) - errors(shifted(shift))) <= ERRORS:
+        shift = torch.zeros_like(shift)
+    best = errors(shifted(shift))
     better = math.inf if plain is None else standard_errors(errors(plain) - best)
     if better <= ERRORS:
-        if better > -ERRORS and 2 * half > SMALL * usual.lenses[views[0]].width:
-            tell_undecided(where, names)
+        if better > -ERRORS and float(room.max()) > SMALL * max(
+            usual.lenses[views[0]].width, usual.lenses[views[0]].height
+        ):
+            tell_undecided(where, usual, views)
         return None
-    crop = shifted_lenses(usual, views, shift)
-    beside = [
-        errors(shifted_lenses(usual, views, shift + _BESIDE_PX * one)) for one in around(shift)
-    ]
+    crop, evidence = shifted(shift), "what their matches show"
+    beside = [errors(shifted(shift + _BESIDE_PX * one)) for one in around(shift)]
     sharp = min(standard_errors(one - best) for one in beside) > ERRORS
     fraction = _matches(crop, verified, max_error_px).agreeing(pinholes_of(crop))
-    lens = crop.lenses[views[0]]
-    which = f"{len(views)} of {crop.num_views} photographs ({names})"
     if fraction <= 1 - _MARGIN or not sharp:
-        raise InputError(
-            f"{where}: its cameras are of pictures of other sizes than {which}, and the matches "
-            f"between these ({count}) fit a crop better than a resize, but do not tell which crop: "
-            f"{fraction:.0%} lie within {max_error_px:g} px of the epipolar lines of the best. "
-            "Give the photographs that the cameras are of, resized if you like, but not cropped."
-        )
-    principal = pinhole_of(lens)[:2, 2].tolist()
-    caution(
-        f"{where}: its cameras are of pictures of other sizes than {which}, and {count} matches "
-        f"between these tell that they are no resized ones: {fraction:.0%} lie on the epipolar "
-        f"lines where they were cropped so that the principal point is at ({principal[0]:.0f}, "
-        f"{principal[1]:.0f}) of {lens.width}x{lens.height}. The cameras follow. If that is wrong, "
-        "give the photographs that the cameras are of.",
-        stacklevel=5,
-    )
+        raise refused_crop(where, usual, views, evidence)
+    tell_crop(where, crop, views, evidence)
     return crop
-
-
-def _half_room(crops: Sequence[SparseModel], view: int) -> float:
-    """Measure how far apart crops from the middle and from a corner are."""
-    one, other = (torch.tensor(model.lenses[view].params) for model in (crops[0], crops[-1]))
-    return float((one - other).abs().max())
-
-
-def _shifted(
-    model: SparseModel,
-    views: Sequence[int],
-    errors: Callable[[SparseModel], Float[Tensor, " match"]],
-    step: float,
-) -> tuple[Float[Tensor, "2"], Float[Tensor, " match"]]:
-    """Shift the pictures of some views until no step, nor a smaller one, makes errors smaller."""
-    shift, best = torch.zeros(2, dtype=torch.float64), errors(model)
-    while step >= _STEP_PX:
-        tried = [shift + step * one for one in around(shift)]
-        found = [errors(shifted_lenses(model, views, one)) for one in tried]
-        nearest = min(range(len(found)), key=lambda number: float(found[number].mean()))
-        if float(found[nearest].mean()) < float(best.mean()):
-            best, shift = found[nearest], tried[nearest]
-        else:
-            step /= 2
-    return shift, best
 
 
 def require_agreement(

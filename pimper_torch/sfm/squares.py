@@ -42,22 +42,34 @@ class Squares:
 
     def agreement(self, turns: Int[Tensor, " view"]) -> Float[Tensor, "observation 4"]:
         """Correlate each observation, turned each way, with the mean of the others of its point."""
-        own = self._taken(turns)
-        others = self._sums(own)[self.point] - own
-        return (self.patterns * normalize(others, dim=-1)[:, None]).sum(dim=-1)
+        others, _ = others_of(self._taken(turns), self.point)
+        return (self.patterns * others[:, None]).sum(dim=-1)
 
     def chance(self, turns: Int[Tensor, " view"]) -> Float[Tensor, " observation"]:
         """Correlate each observation with the mean of another point."""
         own = self._taken(turns)
-        sums = normalize(self._sums(own), dim=-1)
-        return (own * sums[self.point - 1]).sum(dim=-1)
+        return (own * others_of(own, self.point)[1]).sum(dim=-1)
 
     def _taken(self, turns: Int[Tensor, " view"]) -> Float[Tensor, "observation sample"]:
         return self.patterns[torch.arange(len(self.view)), turns[self.view]]
 
-    def _sums(self, own: Float[Tensor, "observation sample"]) -> Float[Tensor, "point sample"]:
-        count = int(self.point.max()) + 1 if len(self.point) else 0
-        return own.new_zeros(count, own.shape[1]).index_add(0, self.point, own)
+
+def others_of(
+    own: Float[Tensor, "*way observation sample"], point: Int[Tensor, " observation"]
+) -> tuple[Float[Tensor, "*way observation sample"], Float[Tensor, "*way observation sample"]]:
+    """Average the squares of each observation's point without its own, and those of another point.
+
+    Args:
+        own: Of each observation.
+        point: That it sees.
+
+    Returns:
+        Of unit length, or zero.
+    """
+    count = int(point.max()) + 1 if len(point) else 0
+    sums = own.new_zeros(*own.shape[:-2], count, own.shape[-1]).index_add(-2, point, own)
+    others = normalize(sums[..., point, :] - own, dim=-1)
+    return others, normalize(sums, dim=-1)[..., point - 1, :]
 
 
 def standard_errors(differences: Float[Tensor, " observation"]) -> float:
