@@ -364,15 +364,15 @@ def _read_masks(
     paths: Sequence[Path], photographs: Sequence[Path], headers: Sequence[Header]
 ) -> list[list[Float[Tensor, "_ _"]]]:
     """Read 1 on the object, 0 off it, in the ways in which each mask may lie on its photograph."""
-    found = [read_header(path) for path in paths]
+    masks = [read_header(path) for path in paths]
     # One of another size is refused without decoding it.
     levels = [
         _brightness(path)
         if sorted((mask.width, mask.height)) == sorted((header.width, header.height))
         else torch.zeros(mask.height, mask.width)
-        for path, mask, header in zip(paths, found, headers, strict=True)
+        for path, mask, header in zip(paths, masks, headers, strict=True)
     ]
-    each = zip(_on_object(levels), paths, found, photographs, headers, strict=True)
+    each = zip(_on_object(levels), paths, masks, photographs, headers, strict=True)
     return [mask_ways(*one) for one in each]
 
 
@@ -408,7 +408,7 @@ def _brightness(path: Path) -> Float[Tensor, "height width"]:
 
 
 def _on_object(levels: Sequence[Float[Tensor, "_ _"]]) -> list[Float[Tensor, "_ _"]]:
-    """Mark by 1 what is at least half as bright as the brightest of all masks."""
+    """Return 1 where a mask is at least half as bright as the brightest of all masks."""
     half = max(float(level.max()) for level in levels) / 2
     return [((level >= half) & (level > 0)).float() for level in levels]
 

@@ -217,7 +217,7 @@ def possible_crops(model: SparseModel, views: Views, sizes_px: Sequence[Size]) -
 
 
 def resize_fits(whole: Size, width: int, height: int) -> bool:
-    """Tell whether a resize alone leads from a picture of one size to one of another."""
+    """Return whether a resize alone leads from a picture of one size to one of another."""
     # Rounding a side to whole pixels changes the shape by less than this.
     ratio = width / whole[0] / (height / whole[1])
     return abs(ratio - 1) <= max(0.01, 2 / min(width, height))
@@ -297,17 +297,17 @@ def _shift(
     def best(points: _Points, shifts: Float[Tensor, "way 2"]) -> Float[Tensor, "2"]:
         scores = [agreement(points, part)[0] for part in torch.split(shifts, _AT_ONCE)]
         own = torch.cat(scores)
-        seen = (own != 0).sum(dim=1).clamp_min(own.shape[1] / 4)
-        return shifts[(own.sum(dim=1) / seen).argmax()]
+        count = (own != 0).sum(dim=1).clamp_min(own.shape[1] / 4)
+        return shifts[(own.sum(dim=1) / count).argmax()]
 
     def sharp(
         own: Float[Tensor, " mine"], shift: Float[Tensor, "2"], size: Size, reach_px: float
     ) -> bool:
-        """Tell whether photographs that are placed a little beside agree worse."""
+        """Return whether photographs that are placed a little beside agree worse."""
         reach = max(reach_px * group.shrunk, _SHARP * max(group.size))
         beside = agreement(many, shift + reach * around(shift), size)[0]
-        told = own != 0
-        return min(standard_errors((own - one)[told]) for one in beside) > ERRORS
+        seen = own != 0
+        return min(standard_errors((own - one)[seen]) for one in beside) > ERRORS
 
     still, (shifts, level) = torch.zeros_like(group.room), _first(group)
     resized = agreement(many, still[None], group.whole)[0][0]
@@ -320,13 +320,13 @@ def _shift(
         shift = climbed(shift.round(), step, partial(best, few.at(finer)), group.bounds)
     shift = climbed(shift, round(group.shrunk), partial(best, many), group.bounds)
     own, chance = (one[0] for one in agreement(many, shift[None]))
-    told = own != 0
-    better = standard_errors((own - resized)[told])
+    seen = own != 0
+    better = standard_errors((own - resized)[seen])
     if fits and better <= ERRORS:
         if better > -ERRORS and float((group.room / torch.tensor(group.whole)).abs().max()) > SMALL:
             tell_undecided(where, few.model, group.views)
         return None
-    if float((own - chance)[told].mean()) < _LEAST:
+    if float((own - chance)[seen].mean()) < _LEAST:
         return None
     if any(sharp(own, shift, group.size, reach * _SHARP_PX) for reach in (1, 2)):
         return _plain(group, shift)
@@ -379,10 +379,10 @@ def climbed(
     """
     for _ in range(_MOST_STEPS):
         ring = torch.cat([torch.zeros(1, 2).to(shift), step * around(shift)])
-        found = best(torch.minimum(torch.maximum(shift + ring, bounds[0]), bounds[1]))
-        if torch.equal(found, shift):
+        nearest = best(torch.minimum(torch.maximum(shift + ring, bounds[0]), bounds[1]))
+        if torch.equal(nearest, shift):
             break
-        shift = found
+        shift = nearest
     return shift
 
 

@@ -159,7 +159,7 @@ def _stored_size(views: Views, view: int) -> tuple[int, int]:
 
 
 def _whole_sizes(views: Views) -> list[tuple[int, int]]:
-    """Give the sizes of photographs before they were shrunk on reading, in their orientation."""
+    """Return the sizes of photographs before they were shrunk on reading, in their orientation."""
     sizes = []
     for view in range(views.num_views):
         width, height = (int(side) for side in views.sizes_px[view])

@@ -73,7 +73,7 @@ def possible_turns(model: SparseModel, views: Views) -> list[tuple[int, ...]]:
 
 
 def allowed_turns(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
-    """Mark the turns by which a resize leads from the model's pictures to the photographs."""
+    """Find the turns by which a resize leads from the model's pictures to the photographs."""
     sizes = [(width, height) for width, height in views.sizes_px.tolist()]
     return torch.tensor(
         [
@@ -87,7 +87,7 @@ def allowed_turns(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
 
 
 def _allowed(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
-    """Mark the turns that the shapes of pictures allow; refuse a photograph that has none."""
+    """Find the turns that the shapes of pictures allow; refuse a photograph that has none."""
     sizes = [(width, height) for width, height in views.sizes_px.tolist()]
     allowed = allowed_turns(model, views)
     for name, lens, size, fits in zip(model.names, model.lenses, sizes, allowed, strict=True):

@@ -1,4 +1,4 @@
-"""What photographs show round the points of a model: squares that views of a point compare.
+"""Squares of the photographs round the points of a model, which views of a point compare.
 
 A square lies on the plane across a point's mean viewing direction. It is correlated with the mean
 of those of the point's other views.

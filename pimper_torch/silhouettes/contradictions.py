@@ -60,16 +60,16 @@ class _Conflicts:
         count, most = denied.sum(dim=1), chosen.sum() - 1
         count = torch.where(seen.sum(dim=1) >= _SEEN * most, count, len(chosen))
         fewest = count.amin(dim=-1)
-        told = fewest < len(chosen)
-        best = (count == fewest[..., None]) & told[..., None]
+        valid = fewest < len(chosen)
+        best = (count == fewest[..., None]) & valid[..., None]
         share = (denied & best[:, None]).sum(dim=-1) / best.sum(dim=-1).clamp_min(1)[:, None]
-        total = told.sum(dim=-1).clamp_min(1)
-        own = (told & (fewest > 0)).sum(dim=-1) / total
+        total = valid.sum(dim=-1).clamp_min(1)
+        own = (valid & (fewest > 0)).sum(dim=-1) / total
         return own * chosen, share.sum(dim=-1) / total[:, None] * chosen[:, None]
 
 
 def contradictory(silhouettes: Silhouettes, cameras: Cameras) -> Bool[Tensor, " view"]:
-    """Mark the reliable views whose silhouettes clearly contradict those of the others.
+    """Find the reliable views whose silhouettes clearly contradict those of the others.
 
     Args:
         silhouettes: At least one pixel in every reliable view.
