@@ -103,7 +103,8 @@ def _conflicts(
 ) -> _Conflicts:
     """Follow rays through pixels of each silhouette in smaller pictures."""
     by = max(1, math.ceil(max(masks.shape[1:]) / _SIZE_PX))
-    small = max_pool2d(masks[:, None].float().cpu(), by, ceil_mode=True)[:, 0] > 0
+    pooled = (max_pool2d(mask[None].float().cpu(), by, ceil_mode=True)[0] > 0 for mask in masks)
+    small = torch.stack(list(pooled))
     cameras = cameras.to("cpu").to(torch.float32)
     cameras = cameras.replace(
         intrinsics=scale_intrinsics(cameras.intrinsics, 1 / by, 1 / by),
