@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning, caution, some
 from pimper_torch.file_names import match_files
-from pimper_torch.io.decode import SUFFIXES, Decoded, decode, read_header
+from pimper_torch.io.decode import SUFFIXES, decode, read_header
 from pimper_torch.io.extras import HEIC_SUFFIXES, RAW_SUFFIXES, extra_of, is_installed, load_extra
 from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.focal_lengths import focals_px
@@ -32,6 +32,9 @@ _LIT_FRACTION = 1e-3  # more than hot pixels
 _MIN_USABLE = 0.1
 # Masks are turned round where more than the rest of it is bright at the border, and less inside.
 _TELLING = 0.25
+# Levels below which masks hold labels, and from which on edges are soft: a choice. Masks stored as
+# 0 and 1 are labels, too.
+_MOST_LABELS = 32
 # What programs add to the name of a mask.
 _MASK = re.compile(r"[ _.-]?mask((\.[A-Za-z]+)+)$", re.IGNORECASE)
 # What people take for photographs, and is none of SUFFIXES: images and camera raw; video.
@@ -68,11 +71,13 @@ def load_views(
     response contradicts. Radiance 1 is saturation, in every colour: the level that is told, or at
     which values pile up, or full scale. Photographs of unlike sizes are padded.
 
-    Masks are images of the photographs' sizes, zero off the object (JPEG: below half). Where all
-    of them together are bright along the border and dark in the middle, they are turned round,
-    and a warning says so. Where no opaque pixel of a mask is bright, its alpha is the mask. Without
-    a folder of masks, alpha channels that are somewhere transparent are the masks, and a warning
-    says so; a photograph without one shows the object everywhere.
+    Masks are images of the photographs' sizes, at least half as bright on the object as the
+    brightest pixel of all masks. Files without loss whose levels are all below 32, of 255 or 65535,
+    hold labels: all but 0 is the object. In masks that are somewhere transparent it is what is
+    opaque by half and not black, or all that is opaque if that is nothing. Where all of them
+    together are bright along the border and dark in the middle, they are turned round, and a
+    warning says so. Without a folder of masks, alpha channels that are somewhere transparent are
+    the masks, and a warning says so; a photograph without one shows the object everywhere.
 
     Args:
         folder: With the photographs.
@@ -110,7 +115,7 @@ def load_views(
     drawn = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
     opacities = []
     if mask_paths is not None:
-        ways = [_read_mask(*one) for one in zip(mask_paths, paths, headers, strict=True)]
+        ways = _read_masks(mask_paths, paths, headers)
         opacities = _laid(ways, images, sizes, Path(str(masks)))
     if opacities and _is_dark(opacities, mask_object, Path(str(masks))):
         opacities = [1 - opacity for opacity in opacities]
@@ -382,24 +387,28 @@ def _is_dark(
 
 
 def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
-    """Read a drawn mask, true where it is opaque and brighter than half; shrunk as photographs are.
-
-    Where no opaque pixel is bright, alpha alone is the mask.
-    """
+    """Read a mask by the rule of :func:`load_views`; shrunk as photographs are."""
     path = Path(path)
-    drawn = _on_object(decode(path), lossless=OPAQUE) > 0
+    drawn = _on_object([_brightness(path)])[0]
     if max_size_px == 0:
-        return drawn
-    return resized_mask(drawn.float(), *shrunk_size(read_header(path), max_size_px))
+        return drawn > 0
+    return resized_mask(drawn, *shrunk_size(read_header(path), max_size_px))
 
 
-def _read_mask(path: Path, photograph: Path, header: Header) -> list[Float[Tensor, "_ _"]]:
-    """Give 1 on the object, 0 off it, in the ways in which it may lie on the photograph."""
-    found = read_header(path)
-    sides = sorted((found.width, found.height)) == sorted((header.width, header.height))
+def _read_masks(
+    paths: Sequence[Path], photographs: Sequence[Path], headers: Sequence[Header]
+) -> list[list[Float[Tensor, "_ _"]]]:
+    """Read 1 on the object, 0 off it, in the ways in which each mask may lie on its photograph."""
+    masks = [read_header(path) for path in paths]
     # One of another size is refused without decoding it.
-    drawn = _on_object(decode(path)) if sides else torch.zeros(found.height, found.width)
-    return mask_ways(drawn, path, found, photograph, header)
+    levels = [
+        _brightness(path)
+        if sorted((mask.width, mask.height)) == sorted((header.width, header.height))
+        else torch.zeros(mask.height, mask.width)
+        for path, mask, header in zip(paths, masks, headers, strict=True)
+    ]
+    each = zip(_on_object(levels), paths, masks, photographs, headers, strict=True)
+    return [mask_ways(*one) for one in each]
 
 
 def _laid(
@@ -420,20 +429,23 @@ def _laid(
     return [several[-1 if stored else 0] for several in ways]
 
 
-def _on_object(decoded: Decoded, lossless: float | None = None) -> Float[Tensor, "height width"]:
-    """Give 1 where a mask is opaque and bright, or where it is opaque if no such pixel is bright.
-
-    Args:
-        decoded: Of the mask.
-        lossless: From which level on files without loss are bright; ``None`` is above 0.
-    """
+def _brightness(path: Path) -> Float[Tensor, "height width"]:
+    """Read how bright a mask is; 1 on the object where labels or transparency tell it."""
+    decoded = decode(path)
     brightest = decoded.samples.amax(dim=0)
-    level = OPAQUE if decoded.lossy else lossless
-    drawn = brightest > 0 if level is None else brightest >= level
-    if decoded.alpha is not None:
-        opaque = decoded.alpha > 0 if lossless is None else decoded.alpha >= lossless
-        drawn = drawn & opaque if bool((drawn & opaque).any()) else opaque & ~opaque.all()
-    return drawn.float()
+    labelled = not decoded.lossy and float(brightest.max()) * decoded.full < _MOST_LABELS
+    coloured = (brightest > 0).float()
+    if decoded.alpha is None or bool((decoded.alpha >= OPAQUE).all()):
+        return coloured if labelled else brightest
+    opaque = (decoded.alpha >= OPAQUE).float()
+    drawn = opaque * coloured
+    return drawn if bool(drawn.any()) else opaque
+
+
+def _on_object(levels: Sequence[Float[Tensor, "_ _"]]) -> list[Float[Tensor, "_ _"]]:
+    """Return 1 where a mask is at least half as bright as the brightest of all masks."""
+    half = max(float(level.max()) for level in levels) / 2
+    return [((level >= half) & (level > 0)).float() for level in levels]
 
 
 def _refuse_black(
@@ -494,6 +506,6 @@ def _refuse_empty(
     if empty:
         where = f"{folder}: the masks" if folder else "the alpha channels"
         raise InputError(
-            f"{where} of {some(empty)} mark no pixel as object; needed: nonzero (opaque) on the "
-            "object, zero off it. Draw them again, or leave these photographs out."
+            f"{where} of {some(empty)} mark no pixel as object; needed: bright (opaque) on the "
+            "object, black off it. Draw them again, or leave these photographs out."
         )

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from PIL import Image
@@ -12,9 +13,10 @@ from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
+from pimper_torch.sfm.crops import follow_crops, possible_crops
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import names_by_folder
-from pimper_torch.sfm.orientation import find_turns, possible_turns
+from pimper_torch.sfm.orientation import allowed_turns, find_turns, possible_turns
 from pimper_torch.sfm.quarter_turns import (
     turned_lens,
     turned_pixels,
@@ -27,7 +29,20 @@ from pimper_torch.sfm.quarter_turns import (
 _MAX_SKEW_PX = 0.1
 
 
-def existing_ways(views: Views, path: Path) -> list[SparseModel]:
+class Ways(NamedTuple):
+    """Models that differ in how the photographs may have come from the pictures that they are of.
+
+    Attributes:
+        plain: Resized; in the pixels of photographs as they stand, then as files store them, where
+            no points tell. Empty where no resize leads to a photograph's shape.
+        cropped: Cut out in the usual ways, where sizes differ and no points tell.
+    """
+
+    plain: list[SparseModel]
+    cropped: list[SparseModel]
+
+
+def existing_ways(views: Views, path: Path, *, matched: bool = False) -> Ways:
     """Read cameras and put them in the photographs' order, sizes and orientations.
 
     Args:
@@ -36,10 +51,8 @@ def existing_ways(views: Views, path: Path) -> list[SparseModel]:
         path: Folder of a COLMAP model, or of several in folders, of which the one with most of the
             photographs is read; or a file of cameras, see
             :func:`~pimper_torch.camera_files.read_cameras.read_cameras`.
-
-    Returns:
-        One model where the points tell how photographs are turned, or nothing turns them; else
-        that of the photographs as they stand, and that of the pixels that files store.
+        matched: Photographs of another shape are no error yet: matches may tell that they were
+            cropped.
 
     Raises:
         ReconstructionError: There are cameras of fewer than 3 of the photographs.
@@ -56,9 +69,18 @@ def existing_ways(views: Views, path: Path) -> list[SparseModel]:
             "holds more of them, or leave it out to run structure from motion."
         )
     shown = taken(views, model)
+    sizes = _whole_sizes(shown)
     if len(model.points_world):
-        return [follow_pictures(model, shown, find_turns(model, shown, where))]
-    return [follow_pictures(model, shown, turns) for turns in possible_turns(model, shown)]
+        model = follow_crops(model, shown, sizes, where)
+        return Ways([follow_pictures(model, shown, find_turns(model, shown, where))], [])
+    crops = possible_crops(model, shown, sizes)
+    turned = [(one, turns) for one in crops for turns in possible_turns(one, shown)]
+    fits = all(one.any() for one in allowed_turns(model, shown))
+    plain = possible_turns(model, shown) if fits or not (matched and crops) else []
+    return Ways(
+        [follow_pictures(model, shown, turns) for turns in plain],
+        [follow_pictures(one, shown, turns) for one, turns in turned],
+    )
 
 
 def _largest(views: Views, folder: Path) -> Path:
@@ -146,6 +168,17 @@ def _stored_size(views: Views, view: int) -> tuple[int, int]:
             return picture.size if max(picture.size) >= max(width, height) else (width, height)
     except (OSError, ValueError, Image.DecompressionBombError):
         return width, height
+
+
+def _whole_sizes(views: Views) -> list[tuple[int, int]]:
+    """Return the sizes of photographs before they were shrunk on reading, in their orientation."""
+    sizes = []
+    for view in range(views.num_views):
+        width, height = (int(side) for side in views.sizes_px[view])
+        whole = _stored_size(views, view)
+        across = (whole[0] > whole[1]) != (width > height)
+        sizes.append(turned_size(*whole, int(across)))
+    return sizes
 
 
 def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:

@@ -3,13 +3,15 @@
 Matches that an epipolar geometry of their own explains are found without the cameras. With the
 right cameras most of them lie on these cameras' epipolar lines and before both; with wrong ones a
 few do by chance. Cameras of another convention are put right in every usual way, and tried again.
+Cameras of whole photographs beside cropped ones are cropped until matches lie nearest to the lines.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from kornia.geometry.epipolar import essential_from_Rt, fundamental_from_essential
 from torch import Tensor
 
@@ -19,8 +21,18 @@ from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
 from pimper_torch.sfm.agreement import undistorted_pixels
 from pimper_torch.sfm.colmap import pinhole_of
+from pimper_torch.sfm.crops import (
+    SMALL,
+    around,
+    climbed,
+    refused_crop,
+    shifted_lenses,
+    tell_crop,
+    tell_undecided,
+)
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.squares import ERRORS, standard_errors
 from pimper_torch.sfm.static_background import sampson_errors
 
 # Fraction of the matches that right cameras explain: 0.97 to 1.00 at 2 px in five scenes (the
@@ -32,6 +44,10 @@ MIN_AGREEMENT = 0.5
 _LEFT, _MARGIN = 0.6, 0.05
 # Matches below which nothing is said: a choice.
 _FEWEST = 30
+# Cameras whose crop is off by so much must explain matches worse: a choice.
+_BESIDE_PX = 8.0
+# The last steps of the search for a crop: a choice.
+_STEP_PX = 0.5
 # Pairs that are looked at, those with most matches. A choice: enough, and a second.
 _PAIRS = 200
 
@@ -60,10 +76,7 @@ def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool
     """
     one, other = pair.views
     K, poses = cameras.intrinsics, cameras.cam_from_world
-    motion = [part for view in pair.views for part in (poses[view, :3, :3], poses[view, :3, 3:])]
-    essential = essential_from_Rt(*motion)
-    geometry = fundamental_from_essential(essential, K[one], K[other])
-    near = sampson_errors(geometry, pair.first, pair.second) <= max_error_px
+    near = _errors(cameras, pair) <= max_error_px
     between = poses[other] @ torch.linalg.inv(poses[one])
     rays = homogeneous(pair.first) @ torch.linalg.inv(K[one]).mT @ between[:3, :3].mT
     back = homogeneous(pair.second) @ torch.linalg.inv(K[other]).mT
@@ -73,6 +86,18 @@ def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool
     ahead = (torch.linalg.cross(back, shift) * normal).sum(dim=1) > 0
     ahead_there = (torch.linalg.cross(rays, shift) * normal).sum(dim=1) > 0
     return near & ahead & ahead_there
+
+
+def _errors(cameras: Cameras, pair: VerifiedPair) -> Float[Tensor, " match"]:
+    """Measure Sampson's distances of matches, in pixels."""
+    motion = [
+        part
+        for view in pair.views
+        for part in (cameras.cam_from_world[view, :3, :3], cameras.cam_from_world[view, :3, 3:])
+    ]
+    one, other = (cameras.intrinsics[view] for view in pair.views)
+    geometry = fundamental_from_essential(essential_from_Rt(*motion), one, other)
+    return sampson_errors(geometry, pair.first, pair.second)
 
 
 def pinholes_of(model: SparseModel) -> Cameras:
@@ -105,6 +130,75 @@ def best_of(
         _matches(model, verified, max_error_px).agreeing(pinholes_of(model)) for model in models
     ]
     return scores.index(max(scores))
+
+
+def find_crop(
+    plain: SparseModel | None,
+    crops: Sequence[SparseModel],
+    verified: Sequence[VerifiedPair],
+    max_error_px: float,
+    where: str,
+) -> SparseModel | None:
+    """Find where photographs were cut out of the pictures that cameras are of, by their matches.
+
+    From the best of the usual crops on, all of them are shifted together until matches lie nearest
+    to the epipolar lines.
+
+    Args:
+        plain: Cameras of resized photographs, if such a shape is possible: the plain explanation.
+        crops: Cameras of photographs that were cropped in the usual ways; at least two.
+        verified: Matches that an epipolar geometry of their own explains.
+        max_error_px: Distance from epipolar lines that is not told from a larger one.
+        where: The cameras are, for messages.
+
+    Returns:
+        ``None`` where a resize explains the matches as well.
+
+    Raises:
+        InputError: A crop explains them better, but none explains them, or several do.
+    """
+    strongest = sorted(verified, key=lambda pair: -pair.num_matches)[:_PAIRS]
+
+    def errors(model: SparseModel) -> Float[Tensor, " match"]:
+        matches, cameras = _matches(model, strongest, max_error_px), pinholes_of(model)
+        found = [_errors(cameras, pair) for pair in matches.pairs]
+        return torch.cat([*found, torch.zeros(0, dtype=torch.float64)]).clamp_max(max_error_px)
+
+    usual = min(crops, key=lambda model: float(errors(model).mean()))
+    cut = [one != other for one, other in zip(crops[0].lenses, crops[-1].lenses, strict=True)]
+    views = torch.tensor(cut).nonzero()[:, 0].tolist()
+
+    def shifted(shift: Float[Tensor, "2"]) -> SparseModel:
+        return shifted_lenses(usual, views, shift)
+
+    def nearest(shifts: Float[Tensor, "way 2"]) -> Float[Tensor, "2"]:
+        means = [errors(shifted(shift)).mean() for shift in shifts]
+        return shifts[torch.stack(means).argmin()]
+
+    middle, corner = (pinhole_of(model.lenses[views[0]])[:2, 2] for model in (crops[0], crops[-1]))
+    room = 2 * (middle - corner).abs()
+    shift, step = torch.zeros_like(room), float(room.max()) / 4
+    while step >= _STEP_PX:
+        shift = climbed(shift, step, nearest, torch.stack([-room, room]))
+        step /= 2
+    if standard_errors(errors(usual) - errors(shifted(shift))) <= ERRORS:
+        shift = torch.zeros_like(shift)
+    best = errors(shifted(shift))
+    better = math.inf if plain is None else standard_errors(errors(plain) - best)
+    if better <= ERRORS:
+        if better > -ERRORS and float(room.max()) > SMALL * max(
+            usual.lenses[views[0]].width, usual.lenses[views[0]].height
+        ):
+            tell_undecided(where, usual, views)
+        return None
+    crop, evidence = shifted(shift), "what their matches show"
+    beside = [errors(shifted(shift + _BESIDE_PX * one)) for one in around(shift)]
+    sharp = min(standard_errors(one - best) for one in beside) > ERRORS
+    fraction = _matches(crop, verified, max_error_px).agreeing(pinholes_of(crop))
+    if fraction <= 1 - _MARGIN or not sharp:
+        raise refused_crop(where, usual, views, evidence)
+    tell_crop(where, crop, views, evidence)
+    return crop
 
 
 def require_agreement(

@@ -74,8 +74,7 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
     vectors in the picture are turned: ``p2, p1`` and ``sx1, sy1``.
     """
     size = lens.width, lens.height
-    values = list(lens.params)
-    focals = 1 if lens.model.startswith(_ONE_FOCAL) else 2
+    values, focals = list(lens.params), _focals(lens)
     if focals == 2 and quarters % 2:
         values[0], values[1] = values[1], values[0]
     center = torch.tensor(values[focals : focals + 2], dtype=torch.float64)
@@ -85,6 +84,26 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
         values[first], values[second] = turned_vectors(vector, quarters).tolist()
     width, height = turned_size(*size, quarters)
     return lens.replace(params=tuple(values), width=width, height=height)
+
+
+def cropped_lens(lens: Lens, width: int, height: int, corner: Float[Tensor, "2"]) -> Lens:
+    """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves.
+
+    Args:
+        lens: Of the whole picture.
+        width: Of what is cut out.
+        height: Of what is cut out.
+        corner: Its pixel in the whole picture.
+    """
+    values, focals = list(lens.params), _focals(lens)
+    values[focals] -= float(corner[0])
+    values[focals + 1] -= float(corner[1])
+    return lens.replace(params=tuple(values), width=width, height=height)
+
+
+def _focals(lens: Lens) -> int:
+    """Count the focal lengths, behind which the principal point stands."""
+    return 1 if lens.model.startswith(_ONE_FOCAL) else 2
 
 
 def turning(width: int, height: int, quarters: int) -> Float[Tensor, "3 3"]:

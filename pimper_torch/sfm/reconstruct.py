@@ -244,21 +244,28 @@ class Reconstruct(Stage):
 
     def _given(self, views: Views, path: Path) -> SparseModel:
         """Read cameras, and triangulate points where they come without."""
-        ways = existing_ways(views, path)
-        if not lacks_points(ways[0]):
-            return ways[0]
-        return self._triangulated(taken(views, ways[0]), ways, place(path))
+        plain, cropped = existing_ways(views, path, matched=True)
+        first = (plain or cropped)[0]
+        if not lacks_points(first):
+            return first
+        return self._triangulated(taken(views, first), plain, place(path), cropped)
 
-    def _triangulated(self, views: Views, ways: list[SparseModel], where: str) -> SparseModel:
+    def _triangulated(
+        self,
+        views: Views,
+        ways: list[SparseModel],
+        where: str,
+        crops: Sequence[SparseModel] = (),
+    ) -> SparseModel:
         """Take points that were kept, or triangulate them and keep them."""
         settings = self.config.triangulation
         alone = replace(settings, features=replace(settings.features, threads=0))
         alone = replace(alone, matching=replace(alone.matching, threads=0))
-        hashed = digest(code_of(__name__), views, ways, alone) if self.store else None
+        hashed = digest(code_of(__name__), views, ways, crops, alone) if self.store else None
         found, _ = kept_model(
             self.store,
             f"triangulate-{hashed}" if hashed else None,
-            lambda: triangulate(views, ways, settings, where),
+            lambda: triangulate(views, ways, settings, where, crops),
         )
         return found
 

@@ -34,6 +34,7 @@ from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.photograph_agreement import (
     best_of,
     explained,
+    find_crop,
     pinholes_of,
     require_agreement,
     undistorted_pairs,
@@ -74,7 +75,11 @@ def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED
 
 
 def triangulate(
-    views: Views, models: Sequence[SparseModel], settings: TriangulationSettings, where: str
+    views: Views,
+    models: Sequence[SparseModel],
+    settings: TriangulationSettings,
+    where: str,
+    crops: Sequence[SparseModel] = (),
 ) -> SparseModel:
     """Triangulate what photographs show, with cameras held fixed.
 
@@ -89,6 +94,7 @@ def triangulate(
             that fits best is taken. Points that it has are replaced where more are found.
         settings: How.
         where: The cameras are, for messages.
+        crops: Of them, those of photographs that may have been cropped.
 
     Returns:
         Poses and lenses bit for bit as given. With the points as they were where no more are
@@ -97,7 +103,7 @@ def triangulate(
     Raises:
         InputError: Cameras and photographs do not belong together.
     """
-    if too_small(views):
+    if too_small(views) and models:
         _tell_nothing(0, where)
         return models[0]
     lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
@@ -108,8 +114,12 @@ def triangulate(
             match_pairs(space, all_pairs(views.num_views), settings.matching)
             enter_room(leave_out_room(space.database, settings.matching))
         verified = verified_pairs(space)
-        given = _way(models, verified, settings, where)
-        require_agreement(given, verified, settings.matching.max_error_px, where)
+        given = _way(models, verified, settings, where) if models else None
+        limit = settings.matching.max_error_px
+        crop = find_crop(given, crops, verified, limit, where) if crops else None
+        given = given if crop is None else crop
+        assert given is not None, "a crop is found, or refused, where no resize is possible"
+        require_agreement(given, verified, limit, where)
         offset = local_origin(given.cam_from_world, given.points_world)
         local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
         _match_along_lines(space, local, verified, settings)

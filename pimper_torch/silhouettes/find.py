@@ -1,7 +1,7 @@
 """Which pixels of every view show the object."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
@@ -10,13 +10,17 @@ from pimper_torch.ledger import leave_out
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
 from pimper_torch.silhouettes.by_series import by_series
+from pimper_torch.silhouettes.contours import box_round
+from pimper_torch.silhouettes.contradictions import contradictory
 from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import cut_in_iterations
+from pimper_torch.silhouettes.hull import margins, visual_hull
 from pimper_torch.silhouettes.probabilities import silhouettes_of
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.stage import Stage
 
 _USED = 0.25  # probability above which a pixel is used as the object's
+_BY_HULL = "The hull of the other masks stands in for them, and they do not constrain the surface"
 
 
 class FindSilhouettes(Stage):
@@ -37,10 +41,11 @@ class FindSilhouettes(Stage):
             scene: Photographs, cameras and cloud.
 
         Returns:
-            Everything where that is asked for. Where silhouettes cannot be reliable, everything
-            above the plane that the object stands on, or everything where none is found, with a
-            :class:`~pimper_torch.errors.PimperWarning` that says why. Where the object was moved
-            between series of photographs, each series is looked at by itself.
+            Everything where that is asked for. A mask that clearly contradicts those of the others
+            is not believed: the hull of these stands in for it. Where silhouettes cannot be
+            reliable, everything above the plane that the object stands on, or everything where none
+            is found, with a :class:`~pimper_torch.errors.PimperWarning` that says why. Where the
+            object was moved between series of photographs, each series is looked at by itself.
 
         Raises:
             InputError: Masks are asked for, and none are given.
@@ -51,13 +56,43 @@ class FindSilhouettes(Stage):
         if masks is not None:
             reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
             found = Silhouettes(inside=masks.float(), reliable=reliable, source="masks")
-            return _believed(found, scene.views.names)
+            return self._agreeing(_believed(found, scene.views.names), scene)
         if config.object == "masks":
             raise InputError(
                 "`silhouettes.object` is masks, but the photographs come without any. Give a "
                 "folder of masks, or let silhouettes be found: `silhouettes.object` auto."
             )
         return by_series(scene, lambda part, _: self._found(part))
+
+    def _agreeing(self, silhouettes: Silhouettes, scene: SparseScene) -> Silhouettes:
+        """Replace masks that clearly contradict the others by what the hull of these shows."""
+        doubted = contradictory(silhouettes, scene.cameras)
+        if not bool(doubted.any()):
+            return silhouettes
+        if torch.equal(doubted, silhouettes.reliable):
+            caution(
+                "The masks contradict one another, and no more than half of them agree: all are "
+                "believed. Look whether they show the same object in all photographs, and whether "
+                "the cameras are those of these.",
+                stacklevel=3,
+            )
+            return silhouettes
+        _tell(doubted, scene.views.names, "its mask contradicts those of the others", _BY_HULL)
+        others = silhouettes.replace(reliable=silhouettes.reliable & ~doubted)
+        cameras, box = scene.cameras.to(torch.float32), box_round(others, scene.cameras)
+        hull = None
+        if box is not None:
+            hull = visual_hull(others, cameras, box.float(), num_voxels=self.details.num_voxels)
+        # What looks past a photograph's edge once it is undistorted is black.
+        shown = scene.views.inside & (scene.views.images.detach().amax(dim=1) > 0)
+        inside = silhouettes.inside.clone()
+        for view in doubted.nonzero()[:, 0].tolist():
+            inside[view] = shown[view].to(inside)
+            if hull is not None:
+                width, height = (int(side) for side in scene.views.sizes_px[view])
+                K, pose = cameras.intrinsics[view], cameras.cam_from_world[view]
+                inside[view, :height, :width] *= margins(hull, K, pose, (width, height)) > 0
+        return others.replace(inside=inside)
 
     def _found(self, scene: SparseScene) -> Silhouettes:
         """Find silhouettes in photographs between which the object was not moved."""
@@ -114,11 +149,14 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
 
     Args:
         scene: With photographs.
-        silhouettes: Masks that a person gave stay as they are, whether or not they are the object.
+        silhouettes: Where they are masks that a person gave, those stay as they are, but for masks
+            that were not believed.
     """
-    if silhouettes.source != "found":
+    used = silhouettes.inside > _USED
+    given = scene.views.masks
+    if silhouettes.source == "everything" or (given is not None and torch.equal(used, given)):
         return scene
-    return scene.replace(views=scene.views.replace(masks=silhouettes.inside > _USED))
+    return scene.replace(views=scene.views.replace(masks=used))
 
 
 def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
@@ -128,19 +166,17 @@ def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
     leave_out("silhouettes.empty", empty, names=names)
     if not bool(empty.any()):
         return silhouettes
+    _tell(empty, names, "its silhouette is empty", "These silhouettes do not constrain the surface")
+    return silhouettes.replace(reliable=silhouettes.reliable & ~empty)
+
+
+def _tell(views: Bool[Tensor, " view"], names: tuple[str, ...], reason: str, done: str) -> None:
     skipped(
         *(
-            Failure(
-                stage="silhouettes",
-                what="view",
-                name=names[view],
-                reason="its silhouette is empty",
-                done="These silhouettes do not constrain the surface",
-            )
-            for view in empty.nonzero()[:, 0].tolist()
+            Failure(stage="silhouettes", what="view", name=names[view], reason=reason, done=done)
+            for view in views.nonzero()[:, 0].tolist()
         )
     )
-    return silhouettes.replace(reliable=silhouettes.reliable & ~empty)
 
 
 def _warn(why: str, on_plane: bool) -> None:

@@ -15,7 +15,7 @@ class SilhouetteConfig:
         object: Find silhouettes and fall back to everything (``auto``), take the masks that come
             with the photographs (``masks``), or take all that the photographs show for the object
             (``everything``), as for walls, height fields and scenes. Masks that are given are
-            believed by ``auto``, too.
+            taken by ``auto``, too.
         region: Box that the object is inside: smallest x, y, z, then largest, in the cameras'
             frame; none unless given.
         size_px: Longer side of the pictures that are cut.

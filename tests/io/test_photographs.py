@@ -156,6 +156,59 @@ def test_masks_are_found_by_stem_and_mark_what_is_not_zero(photos, tmp_path):
     assert torch.equal(masks, torch.from_numpy(drawn > 0).expand(3, 8, 12))
 
 
+def soft_disc():
+    """Coverage of the pixels by a disc, 0 to 1, and the pixels that it covers by half."""
+    rows, columns = np.mgrid[:384, :512] / 8
+    fine = np.hypot(rows - 23, columns - 31) < 15
+    coverage = fine.reshape(48, 8, 64, 8).mean(axis=(1, 3))
+    return coverage, torch.from_numpy(coverage >= 0.5)
+
+
+@pytest.mark.parametrize(
+    "form", ["8", "16", "grey", "jpg", "alpha", "cut out", "labels", "0 and 1"]
+)
+def test_masks_mark_what_is_half_covered_in_whatever_files_they_are(tmp_path, form):
+    coverage, truth = soft_disc()
+    bytes_ = (255 * coverage).round().astype(np.uint8)
+    texture = np.random.default_rng(3).integers(1, 255, (48, 64, 3), dtype=np.uint8)
+    array = {
+        "16": (65535 * coverage).round().astype(np.uint16),
+        "grey": bytes_ // 2,
+        "alpha": np.stack([bytes_ * 0] * 3 + [bytes_], axis=-1),
+        "cut out": np.concatenate([texture, bytes_[..., None]], axis=-1),
+        "labels": (coverage >= 0.5) * np.where(np.arange(64) < 30, np.uint8(1), np.uint8(7)),
+        "0 and 1": (coverage >= 0.5).astype(np.uint8),
+    }.get(form, bytes_)
+    for number in range(3):
+        save(tmp_path / "photos" / f"{number}.png", texture)
+        name = f"{number}.{'jpg' if form == 'jpg' else 'png'}"
+        save(tmp_path / "masks" / name, array, **({"quality": 60} if form == "jpg" else {}))
+    masks = load_views(tmp_path / "photos", masks=tmp_path / "masks").masks
+    # The border is 94 pixels long; one above zero beside it is 0.88, one of rounding 0.998.
+    assert overlap(masks[1], truth) > (0.98 if form == "jpg" else 0.995)
+    read = read_mask(tmp_path / "masks" / name)
+    assert torch.equal(read, masks[2])
+
+
+def test_a_mask_of_faint_levels_is_measured_by_the_brightest_of_all(tmp_path):
+    """A soft edge at the photograph's border is no object of its own."""
+    coverage, truth = soft_disc()
+    bytes_ = (255 * coverage).round().astype(np.uint8)
+    for number in range(3):
+        save(tmp_path / "photos" / f"{number}.png", np.full((48, 64, 3), 90, dtype=np.uint8))
+        save(tmp_path / "masks" / f"{number}.png", bytes_)
+    edge = np.zeros((48, 64), dtype=np.uint8)
+    edge[:, 0], edge[:3, 0] = 100, 200
+    save(tmp_path / "masks" / "2.png", edge)
+    masks = load_views(tmp_path / "photos", masks=tmp_path / "masks").masks
+    assert torch.equal(masks[2].nonzero(), torch.tensor([[0, 0], [1, 0], [2, 0]]))
+    assert overlap(masks[0], truth) > 0.995
+
+
+def overlap(one, other):
+    return float((one & other).sum() / (one | other).sum())
+
+
 def test_masks_drawn_before_or_after_turning_fit(photos, tmp_path, pixels):
     exif = Image.Exif()
     exif[274] = 6

@@ -26,7 +26,7 @@ EXIF = {quarters: tag for tag, quarters in QUARTERS.items()}
 
 
 def existing_model(views, path):
-    return existing_ways(views, path)[0]
+    return existing_ways(views, path).plain[0]
 
 
 @pytest.fixture(scope="module")
@@ -175,10 +175,13 @@ def test_a_mirrored_photograph_beside_a_model_of_stored_pixels_is_refused_by_nam
         existing_model(views, sparse)
 
 
-def test_a_cropped_photograph_is_refused(stored, sparse):
-    views = stored.replace(sizes_px=stored.sizes_px - torch.tensor([40, 0]))
+def test_a_photograph_of_another_shape_is_refused(stored, sparse):
+    blank = stored.replace(
+        images=torch.full_like(stored.images, 0.3),
+        sizes_px=stored.sizes_px - torch.tensor([40, 0]),
+    )
     with pytest.raises(InputError, match=r"440x360.*480x360.*whichever way it is turned"):
-        existing_model(views, sparse)
+        existing_model(blank, sparse)
 
 
 def test_poses_of_other_photographs_are_warned_of(stored, sparse):
@@ -191,11 +194,11 @@ def test_poses_of_other_photographs_are_warned_of(stored, sparse):
 def test_without_points_both_ways_are_left_open(stored, tmp_path):
     folder = written(tmp_path, points=0)
     views = turned(stored, [2] * 6)
-    upright, as_stored = existing_ways(views, folder)
+    upright, as_stored = existing_ways(views, folder).plain
     plain = existing_model(stored, folder)
     assert torch.equal(upright.cam_from_world, plain.cam_from_world)
     assert torch.equal(back(as_stored, [2] * 6), plain.cam_from_world)
-    assert len(existing_ways(stored, folder)) == 1
+    assert len(existing_ways(stored, folder).plain) == 1
 
 
 def test_of_a_model_of_two_cameras_the_photographs_folder_takes_its_own(stored, tmp_path):

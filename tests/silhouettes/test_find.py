@@ -54,17 +54,85 @@ def test_used_masks_are_a_little_wider_than_silhouettes(staged):
     assert masked(staged.scene, Silhouettes.everything(staged.scene.views)) is staged.scene
 
 
+def with_masks(scene, masks):
+    return scene.replace(views=scene.views.replace(masks=masks))
+
+
 def test_masks_that_are_given_are_believed(staged):
-    drawn = torch.zeros_like(staged.truth)
-    drawn[:, 20:60, 30:90] = True  # nothing like the ball
-    scene = staged.scene.replace(views=staged.scene.views.replace(masks=drawn))
-    silhouettes = FindSilhouettes()(scene)
-    assert silhouettes is not None
-    assert silhouettes.source == "masks"
-    assert silhouettes.reliable.all()
-    assert torch.equal(silhouettes.masks, drawn)
-    assert masked(scene, silhouettes) is scene
+    drawn = staged.truth.clone()
+    drawn[:, :90] &= pixel_centers(240, 180, like=torch.ones(()))[:90, :, 0] < 120  # of the ball
+    for masks in (staged.truth, drawn):
+        scene = with_masks(staged.scene, masks)
+        silhouettes = FindSilhouettes()(scene)
+        assert silhouettes.source == "masks"
+        assert silhouettes.reliable.all()
+        assert torch.equal(silhouettes.masks, masks)
+        assert masked(scene, silhouettes) is scene
     assert FindSilhouettes(SilhouetteConfig(object="everything"))(scene).source == "everything"
+
+
+def wrong(truth, kind, view):
+    """One mask of these in place of the right one."""
+    one = torch.zeros_like(truth[0])
+    if kind == "inverted":
+        one = ~truth[view]
+    elif kind == "all":
+        one = torch.ones_like(one)
+    elif kind == "pixel":
+        row, column = truth[view].nonzero()[truth[view].sum() // 2].tolist()
+        one[row, column] = True
+    else:
+        one[100:, 30:90] = truth[view, 60:140, 90:150]  # of something beside the ball
+    return one
+
+
+@pytest.mark.parametrize("kind", ["inverted", "all", "pixel", "another"])
+@pytest.mark.parametrize("views", [[5], [0, 7]])
+def test_masks_that_contradict_the_others_are_not_believed(staged, kind, views):
+    masks = staged.truth.clone()
+    for view in views:
+        masks[view] = wrong(staged.truth, kind, view)
+    scene = with_masks(staged.scene, masks)
+    names = ", ".join(staged.scene.views.names[view] for view in views)
+    with pytest.warns(PimperWarning, match=rf"\(view {names}\): its mask contradicts.*The hull of"):
+        silhouettes = FindSilhouettes()(scene)
+    assert (~silhouettes.reliable).nonzero()[:, 0].tolist() == views
+    used = masked(scene, silhouettes).views.masks
+    assert used is not None
+    for view in range(12):
+        if view in views:  # what the others leave: the ball, and a little where an arc ends
+            assert (used[view] | ~staged.truth[view]).float().mean() > 0.999
+            assert overlap(used[view][None], staged.truth[view][None]) > 0.85
+        else:
+            assert torch.equal(used[view], staged.truth[view])
+
+
+def test_a_mask_of_a_view_that_the_border_cuts_is_right(staged):
+    """Half of the photographs end at the middle of the ball."""
+    sizes, masks = staged.scene.views.sizes_px.clone(), staged.truth.clone()
+    sizes[::2, 0] = 120
+    masks[::2, :, 120:] = False
+    images = staged.scene.views.images.clone()
+    images[::2, :, :, 120:] = 0
+    views = staged.scene.views.replace(images=images, masks=masks, sizes_px=sizes)
+    cameras = staged.scene.cameras.replace(sizes_px=sizes)
+    scene = staged.scene.replace(views=views, cameras=cameras)
+    assert FindSilhouettes()(scene).reliable.all()
+    masks[4] = views.inside[4]  # all of it
+    with pytest.warns(PimperWarning, match=r"\(view 04\.png\): its mask contradicts"):
+        silhouettes = FindSilhouettes()(with_masks(scene, masks))
+    assert not silhouettes.inside[4, :, 120:].any()
+    assert overlap(silhouettes.masks[4, :, :120][None], staged.truth[4, :, :120][None]) > 0.85
+
+
+def test_masks_of_which_no_majority_agrees_are_believed_with_a_warning(staged):
+    masks = staged.truth.clone()
+    masks[::2] = ~masks[::2]
+    scene = with_masks(staged.scene, masks)
+    with pytest.warns(PimperWarning, match="masks contradict one another, and no more than half"):
+        silhouettes = FindSilhouettes()(scene)
+    assert silhouettes.reliable.all()
+    assert masked(scene, silhouettes) is scene
 
 
 def test_masks_are_asked_for_and_missing(staged):
