@@ -106,7 +106,7 @@ SETS = {
     "zoomed": Set("potatoes", 16, 480, PATTERN, ("sfm.one_lens",), zoomed),
     "foreign": Set("jar", 16, 480, PATTERN, ("sfm.weak_views", "sfm.misplaced"), foreign),
     "inverted": Set("mug", 16, 480, PATTERN, ("remesh.outside",), inverted, masks=True),
-    "mouth": Set("mug", 20, 640, ROUND | PATTERN, ("remesh.contradicted", "coarse.seen_through")),
+    "mouth": Set("mug", 20, 640, ROUND | PATTERN, ("coarse.seen_through",)),
     "flaps": Set("skull", 8, 900, {}, ("extract.borders", "coarse.fringes", "extract.pieces")),
     "shadows": Set(
         "limbs", 24, 480, ROUND | PATTERN, ("silhouettes.shadows", "photometry.shadows")

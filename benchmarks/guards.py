@@ -75,7 +75,6 @@ PATCHES: dict[str, dict[str, object]] = {
     "remesh.outside": {
         "coarse.remesh.within": lambda *given: torch.ones(given[2], dtype=torch.bool)
     },
-    "remesh.contradicted": {"coarse.remesh.contradicted": nothing(1)},
     "remesh.data": {"coarse.remesh._with_data": everything(1)},
     "fuse.outvoted": {"fusion.blend._agreement": lambda found, *_: torch.ones_like(found.height)},
     "repair": {"meshing.repair.Repair.forward": lambda _, surface: surface},

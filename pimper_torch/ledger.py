@@ -67,7 +67,6 @@ GUARDS: dict[str, tuple[What, str]] = {
     "fuse.albedo": ("points", "without albedo"),
     "repair": ("points", "in folds or spikes"),
     "remesh.outside": ("facets", "outside the hull"),
-    "remesh.contradicted": ("facets", "light does not explain them"),
     "remesh.data": ("facets", "no data"),
     "extract.support": ("faces", "no photograph supports them"),
     "extract.expected_error": ("faces", "expected to be far off"),

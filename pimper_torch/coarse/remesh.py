@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.coarse.contradicted import contradicted, misfit_of
 from pimper_torch.coarse.inherit import fitted_normals, normal_weights, with_points
 from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.coarse.trim import enclosed_holes
@@ -14,7 +13,6 @@ from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_edges, vertex_fans
-from pimper_torch.geometry.visibility import ambient_occlusion
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import total
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
@@ -94,31 +92,20 @@ class Remesh(Stage):
 
         Lengths count in samples of these patches; the residual is their photometry's. Inside the
         silhouettes' visual hull all facets stay, seen or not: the coarse surface is closed as far
-        as it should be. Facets outside the hull are dropped, and so are those that the photographs
-        contradict (:mod:`~pimper_torch.coarse.contradicted`). Without a hull a facet that two views
-        see has data, illuminated or not.
+        as it should be, and facets outside the hull are dropped. Without a hull a facet that two
+        views see has data, illuminated or not.
         """
         patches, mesh = swept.patches, swept.patches.coarse.mesh
         residual = surface.information.new_full((patches.num_patches,), torch.nan)
-        misfit, seen = residual.clone(), torch.zeros_like(residual, dtype=torch.bool)
+        seen = torch.full_like(residual, contours.confine, dtype=torch.bool)
         for templates, found, heights in zip(
             patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
         ):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual[templates.facet] = known.detach().to(residual)
-            misfit[templates.facet] = misfit_of(found).to(misfit)
-            seen[templates.facet] = heights.num_views >= _MIN_VIEWS
+            seen[templates.facet] |= heights.num_views >= _MIN_VIEWS
         inside = within(contours.hull, surface, patches.num_patches)
         leave_out("remesh.outside", ~inside, at=(mesh.vertices_world, mesh.faces))
-        if contours.confine:
-            seen = torch.ones_like(seen)
-            if patches.coarse.support is not None:
-                occlusion = ambient_occlusion(mesh.vertices_world, mesh.faces).to(misfit)
-                centers = mesh.vertices_world[mesh.faces].mean(dim=1).detach()
-                support = patches.coarse.support
-                against = contradicted(centers, mesh.faces, support, misfit, occlusion)
-                leave_out("remesh.contradicted", against, at=centers)
-                inside &= ~against
         return remesh(
             patches.coarse,
             surface,

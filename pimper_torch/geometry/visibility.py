@@ -14,14 +14,9 @@ from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.directions import cosine_fan
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
-from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.records import Cameras, Mesh, Record
-
-# How far above its face a ray starts, in fractions of the face's longest side.
-_CLEARANCE = 1e-3
 
 # Distance of a mesh from the origin, in its own diagonals, from which single precision moves it by
 # more than a millionth of its diagonal.
@@ -191,28 +186,6 @@ def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
     ).reshape(height, width, 3)
     caster = RayCaster(mesh.vertices_world, mesh.faces)
     return caster.cast(cameras.centers_world[view], rays)
-
-
-def ambient_occlusion(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], num_rays: int = 128
-) -> Float[Tensor, " face"]:
-    """Give the fraction of the light from everywhere that the mesh itself keeps from each face.
-
-    Directions weigh as much as a matte surface weighs their light: 0 on a convex mesh, 1 - a / b
-    on the inside of an open sphere of area b of which a is missing. Constant to autograd.
-
-    Args:
-        vertices: Of the mesh.
-        faces: Of it, counter-clockwise from outside.
-        num_rays: From each face's centre; the fraction is a multiple of one over them.
-    """
-    corners = vertices.detach()[faces]
-    normals = unit_face_normals(vertices.detach(), faces)
-    fan = cosine_fan(normals, torch.zeros_like(normals[:, 0]), num_rays)
-    clearance = _CLEARANCE * side_lengths(corners).amax(dim=1, keepdim=True)
-    start = (corners.mean(dim=1) + clearance * normals)[:, None]
-    infinite = torch.full_like(fan[..., 0], torch.inf)
-    return RayCaster(vertices, faces).blocked(start, fan, infinite).to(vertices).mean(dim=1)
 
 
 def _origin(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "3"] | None:

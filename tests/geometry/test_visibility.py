@@ -5,8 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.meshes import icosphere, table
 from pimper_torch.evidence.scenes.shapes import Sphere
-from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.geometry.visibility import RayCaster, ambient_occlusion, cast_view
+from pimper_torch.geometry.visibility import RayCaster, cast_view
 from pimper_torch.records import Mesh
 
 
@@ -116,21 +115,6 @@ def test_a_ray_is_blocked_where_its_first_hit_is_within_reach(generator):
     found = caster.blocked(origins, directions, reach)
     assert 0.1 < found.float().mean() < 0.9
     assert (found == (first < reach))[(first - reach).abs() > 1e-5].all()
-
-
-def test_ambient_occlusion_of_an_open_sphere_is_the_share_that_is_there():
-    vertices, faces = icosphere(4)
-    assert_close(ambient_occlusion(vertices, faces), torch.zeros(len(faces)).to(vertices))
-    centre = vertices[faces].mean(dim=1)
-    area = face_normals(vertices, faces).norm(dim=1)
-    for height in (-0.5, 0.0, 0.6):
-        bowl = centre[:, 2] < height
-        fraction = (
-            area[bowl].sum() / area.sum()
-        )  # a sphere's form factors are fractions of its area
-        found = ambient_occlusion(vertices, faces[bowl].flip(1), num_rays=512)
-        assert (found - fraction).abs().max() < 0.03  # the fan's rays, and edges of the opening
-        assert (found - fraction).mean().abs() < 0.005
 
 
 def test_rays_meet_a_mesh_far_from_the_origin_as_one_near_it(generator):
