@@ -45,8 +45,8 @@ _WHOLE = 0.98  # a mask that covers more of the photograph is ignored
 _MATCH_ERROR = 0.004  # distance from the epipolar line, a fraction of the longer side: a choice
 # Right normals agree with those of a mesh to a mean cosine above 0.95, and no hypothesis halves the
 # rest; mirrored ones reach 0.9 where a surface is rather flat.
-_LEFT_OF_NORMALS = 0.5
-_FACING = 0.75
+_LEFT_OF_NORMALS, _BETTER_COSINE = 0.5, 0.03
+_FACING, _ALL_FACING = 0.75, 0.95  # fractions of normals, choices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -109,8 +109,8 @@ def check_capture(capture: Capture) -> CheckReport:
     if not bool(cameras.intrinsics.isfinite().all() & cameras.cam_from_world.isfinite().all()):
         return CheckReport(findings=(_NOT_FINITE,), tested=())
     scores = _camera_scores(views, cameras, truth)
-    found, cameras = _put_right(cameras, scores)
-    findings = [*_not_rigid(capture.cameras), *found]
+    of_cameras, cameras = _put_right(cameras, scores)
+    findings = [*_not_rigid(capture.cameras), *of_cameras]
     findings += [*_inward_mesh(truth.mesh, cameras), *_normals(truth, cameras)]
     return CheckReport(findings=tuple(findings), tested=(*scores, *_tested_normals(truth)))
 
@@ -295,12 +295,12 @@ def _inward_mesh(mesh: Mesh | None, cameras: Cameras) -> Iterator[Finding]:
     if mesh is None or len(mesh.faces) == 0:
         return
     caster, faces, vertices = RayCaster(mesh.vertices_world, mesh.faces), [], []
+    normals = unit_face_normals(mesh.vertices_world, mesh.faces)
     for view in range(cameras.num_views):
         rays = _rays(cameras, view, _grid(cameras, view))
         hits = caster.cast(cameras.centers_world[view], rays)
         hit = hits.face >= 0
-        flat = unit_face_normals(mesh.vertices_world, mesh.faces)[hits.face[hit]]
-        faces.append((flat.to(rays) * rays[hit]).sum(dim=1) < 0)
+        faces.append((normals[hits.face[hit]].to(rays) * rays[hit]).sum(dim=1) < 0)
         if mesh.normals_world is not None:
             smooth = hits.interpolate(mesh.normals_world.to(rays), mesh.faces)[hit]
             vertices.append((smooth * rays[hit]).sum(dim=1) < 0)
@@ -363,11 +363,13 @@ def _normals(truth: Truth, cameras: Cameras | None) -> Iterator[Finding]:
 
     Facing alone does not distinguish mirrored normals, and the first of equal mistakes is named.
     """
-    maps, mesh = truth.normals_world, truth.mesh if cameras is not None else None
+    maps, mesh, caster, flat = truth.normals_world, truth.mesh, None, None
     if maps is None:
         return
-    caster = RayCaster(mesh.vertices_world, mesh.faces) if mesh and len(mesh.faces) else None
-    samples = [_normal_samples(maps, mesh, caster, cameras, view) for view in range(len(maps))]
+    if cameras is not None and mesh is not None and len(mesh.faces):
+        caster = RayCaster(mesh.vertices_world, mesh.faces)
+        flat = unit_face_normals(mesh.vertices_world, mesh.faces)
+    samples = [_normal_samples(maps, caster, flat, cameras, view) for view in range(len(maps))]
 
     def score(signs: tuple[int, int, int], in_camera_frame: bool) -> float:
         cosines = []
@@ -383,8 +385,12 @@ def _normals(truth: Truth, cameras: Cameras | None) -> Iterator[Finding]:
     mistakes = _NORMAL_MISTAKES if caster else _NORMAL_MISTAKES[:3]
     values = [score(signs, in_camera) for *_, signs, in_camera in mistakes]
     best = int(np.argmax(values))
-    wrong = 1 - values[best] < _LEFT_OF_NORMALS * (1 - given) and values[best] > given + _MARGIN
-    if not wrong or (caster is None and given >= _FACING):
+    if caster:
+        halved = 1 - values[best] < _LEFT_OF_NORMALS * (1 - given)
+        wrong = halved and values[best] > given + _BETTER_COSINE
+    else:
+        wrong = given < _FACING and values[best] > _ALL_FACING
+    if not wrong:
         return
     name, meaning, remedy, *_ = mistakes[best]
     close = [
@@ -403,8 +409,8 @@ def _normals(truth: Truth, cameras: Cameras | None) -> Iterator[Finding]:
 
 def _normal_samples(
     maps: Float[Tensor, "view height width 3"],
-    mesh: Mesh | None,
     caster: RayCaster | None,
+    face_normals: Float[Tensor, "face 3"] | None,
     cameras: Cameras | None,
     view: int,
 ) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"], Float[Tensor, "3 3"]]:
@@ -417,10 +423,10 @@ def _normal_samples(
     pixels = _grid(cameras, view)
     rays, normals = _rays(cameras, view, pixels), _at(maps[view], pixels).to(pixels)
     known, expected = normals.norm(dim=1) > 0, -rays
-    if mesh is not None and caster is not None:
+    if caster is not None and face_normals is not None:
         hits = caster.cast(cameras.centers_world[view], rays)
-        faces = unit_face_normals(mesh.vertices_world, mesh.faces)[hits.face.clamp_min(0)].to(rays)
-        expected = faces * -(faces * rays).sum(dim=1, keepdim=True).sign()
+        met = face_normals[hits.face.clamp_min(0)].to(rays)
+        expected = met * -(met * rays).sum(dim=1, keepdim=True).sign()
         known = known & (hits.face >= 0)
     return normals[known], expected[known], cameras.cam_from_world[view, :3, :3]
 

@@ -282,6 +282,13 @@ def test_without_a_surface_normals_have_to_face_the_camera(whole, name):
     assert names(blind(whole, normals_world=NORMALS[name](whole))) == [name]
 
 
+def test_normals_of_which_no_convention_makes_all_face_the_camera_are_not_accused(whole):
+    """Three of four rows negated: a quarter faces the camera, three quarters where all are."""
+    normals = whole.truth.normals_world.clone()
+    normals[:, torch.arange(HEIGHT) % 4 > 0] *= -1
+    assert names(blind(whole, normals_world=normals)) == []
+
+
 def test_normals_are_judged_with_the_cameras_set_right(whole):
     capture = with_pose(whole, "opengl_axes")
     truth = capture.truth.replace(normals_world=-whole.truth.normals_world)
