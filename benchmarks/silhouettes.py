@@ -1,4 +1,4 @@
-"""Compare silhouettes that are found, and corrected, with masks that are known.
+"""Compare silhouettes that are found with masks that are known.
 
 Run as ``python benchmarks/silhouettes.py PHOTOS=MASKS [PHOTOS=MASKS ...]``; prints a Markdown
 table, one row a folder of photographs. Masks go by the photographs' names; alpha channels serve.
@@ -33,8 +33,8 @@ def main() -> None:
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--overlays", type=Path)
     options = parser.parse_args()
-    say("| photographs | views | reliable | found | worst | corrected | worst | CPU s a view |")
-    say("|---|--:|--:|--:|--:|--:|--:|--:|")
+    say("| photographs | views | reliable | found | worst | CPU s a view |")
+    say("|---|--:|--:|--:|--:|--:|")
     config = CoarseToFineConfig(silhouettes=SilhouetteConfig(size_px=options.size_px))
     chain = CoarseToFine(config, cache=options.cache)
     for pair in options.folders:
@@ -44,17 +44,15 @@ def main() -> None:
         began = time.process_time()
         with warnings.catch_warnings(record=True) as cautions:
             warnings.simplefilter("always", PimperWarning)
-            found = chain.silhouettes(scene)
-            silhouettes = chain.corrected(scene, found)
+            silhouettes = chain.silhouettes(scene)
         seconds = (time.process_time() - began) / scene.views.num_views
         if silhouettes.source == "everything":
-            say(f"| {photos} | {scene.views.num_views} | none: {cautions[-1].message} | | | | | |")
+            say(f"| {photos} | {scene.views.num_views} | none: {cautions[-1].message} | | | |")
             continue
-        before, after = overlaps(found, known), overlaps(silhouettes, known)
+        overlap = overlaps(silhouettes, known)
         say(
             f"| {photos} | {scene.views.num_views} | {int(silhouettes.reliable.sum())} "
-            f"| {before.mean():.4f} | {before.min():.4f} | {after.mean():.4f} | {after.min():.4f} "
-            f"| {seconds:.2f} |",
+            f"| {overlap.mean():.4f} | {overlap.min():.4f} | {seconds:.2f} |",
         )
         if options.overlays:
             draw(silhouettes, scene, options.overlays / Path(photos).parent.name)

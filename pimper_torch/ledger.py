@@ -37,7 +37,6 @@ GUARDS: dict[str, tuple[What, str]] = {
     "silhouettes.shadows": ("pixels", "the hull denies them"),
     "silhouettes.unreliable": ("photographs", "their silhouette contradicts the others"),
     "silhouettes.empty": ("photographs", "their silhouette is empty"),
-    "silhouettes.unconfirmed": ("photographs", "the draft does not confirm the new cut"),
     "contours.hull": ("doubt", "silhouettes have no place in common"),
     "depth_points.doubt": ("doubt", "depth maps agree by chance"),
     "depth_points.points": ("points", "too few views show them"),

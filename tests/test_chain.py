@@ -23,7 +23,6 @@ from pimper_torch.evidence.scenes import (
 )
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
-from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Plane, Shape, Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
@@ -236,43 +235,6 @@ def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
     assert off.abs().mean() < 0.25 * chords.abs().mean()
     assert angles_deg(mesh.normals_world, normalize(mesh.vertices_world, dim=1)).median() < 1.3
     assert result.report[-1].figures["openings"] == 0
-
-
-@pytest.mark.parametrize("source", ["found", "masks", "everything"])
-def test_silhouettes_that_were_found_are_corrected_by_a_draft_of_the_surface(source):
-    """Or by the mesh that is given; masks of a person and everything stay."""
-    scene = ball.photographed(ball.all_round())
-    silhouettes = ball.silhouettes_of(scene.cameras).replace(source=source)
-    better = silhouettes.replace(inside=0.9 * silhouettes.inside)
-    pimper, seen = pt.load_chain("default"), []
-    drawn, given_mesh = icosphere(1), icosphere(2)
-
-    class Draft(nn.Module):
-        def forward(self, scene, contours, mesh):
-            seen.append((contours.silhouettes, scene.views.masks, mesh))
-            return SimpleNamespace(mesh=mesh or drawn)
-
-    class Correct(nn.Module):
-        def forward(self, scene, silhouettes, mesh):
-            seen.append((scene, silhouettes, mesh))
-            return better
-
-    pimper.draft, pimper.correct = Draft(), Correct()
-    for given in (None, given_mesh):
-        seen.clear()
-        corrected = pimper.corrected(scene, silhouettes, given)
-        if source != "found":
-            assert corrected is silhouettes
-            assert not seen
-            continue
-        assert corrected is better
-        (contour, masks, passed), (placed, before, drafted) = seen
-        assert contour is silhouettes
-        assert before is silhouettes
-        assert masks is not None  # the draft is of what silhouettes show
-        assert placed.views.masks is None  # and the cut of the photographs as they are
-        assert passed is given
-        assert drafted is (given or drawn)
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from pimper_torch.chains.streaming import (
     Warping,
     photometry_and_heights,
 )
-from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.remesh import Remesh, RemeshConfig
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.config import require
@@ -43,16 +42,10 @@ from pimper_torch.records import (
 from pimper_torch.reporting import Observer
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours, TraceContours
-from pimper_torch.silhouettes.correct import CorrectSilhouettes
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.silhouettes.settings import SilhouetteConfig
 from pimper_torch.store import Store, opened
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
-
-# The draft's depth maps are of photographs half as large as the coarse surface's: a quarter of the
-# work. Of the armadillo of one colour, 24 views of 800x600, it corrects silhouettes from 0.974 to
-# 0.976; the surface of a whole first pass to 0.977.
-DRAFT = DensifyConfig(levels=2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,12 +105,6 @@ class CoarseToFine(Chain):
         self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
-        self.draft: Callable[[SparseScene, Contours, Mesh | None], CoarseMesh] = CoarseSurface(
-            config.coarse_surface, DRAFT
-        )
-        self.correct: Callable[[SparseScene, Silhouettes, Mesh], Silhouettes] = CorrectSilhouettes(
-            config.silhouettes
-        )
         self.coarse_surface: Callable[[SparseScene, Contours, Mesh | None], CoarseMesh] = (
             CoarseSurface(config.coarse_surface)
         )
@@ -138,7 +125,6 @@ class CoarseToFine(Chain):
         placed = self.placed(views, sparse_model, mesh)
         silhouettes = self.kept(self.silhouettes, placed)
         mesh = self.given_mesh(mesh, views, placed, silhouettes)
-        silhouettes = self.corrected(placed, silhouettes, mesh)
         scene = masked(placed, silhouettes)
         cameras = scene.cameras
         contours = self.contours(silhouettes, cameras)
@@ -180,20 +166,3 @@ class CoarseToFine(Chain):
                 heights=heights,
                 surface=surface,
             )
-
-    def corrected(
-        self, placed: SparseScene, silhouettes: Silhouettes, mesh: Mesh | None = None
-    ) -> Silhouettes:
-        """Correct silhouettes that were found by a draft of the surface that they lead to.
-
-        Args:
-            placed: Photographs, not masked, with cameras and cloud.
-            silhouettes: Of all views.
-            mesh: A surface in the scene's frame, in the place of a draft.
-        """
-        if silhouettes.source != "found":
-            return silhouettes
-        scene = masked(placed, silhouettes)
-        contours = self.contours(silhouettes, scene.cameras)
-        draft = self.kept(self.draft, scene, contours, mesh)
-        return self.kept(self.correct, placed, silhouettes, draft.mesh)

@@ -152,9 +152,10 @@ def fine_surface(
         factor = densify.factors(max(part.views.images.shape[-2:]))[-1]
         pixel, level = factor * pixel_size_at(centre, scene.cameras), level_of(part, factor)
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
-    counts = view_counts(vertices, faces, level, maps)
+    reach = REACH_PX * pixel
+    counts = view_counts(vertices, faces, level, maps, cloud.points_world, reach)
     centres = vertices[faces].mean(dim=1)
-    support = supports(centres, cloud, contour, counts, REACH_PX * pixel)
+    support = supports(centres, cloud, contour, counts, reach)
     inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
     leave_out("coarse.outside", ~inside, at=centres)
     if not contours.confine:

@@ -13,7 +13,7 @@ from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import require, require_at_most
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.surfaces import face_normals, side_lengths, unit_face_normals
-from pimper_torch.geometry.topology import corners_of, face_edges, vertex_fans
+from pimper_torch.geometry.topology import face_edges, vertex_fans
 from pimper_torch.geometry.visibility import ambient_occlusion
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import total
@@ -92,11 +92,11 @@ class Remesh(Stage):
     ) -> CoarseMesh:
         """Remesh the patches' coarse mesh to the surface that was reconstructed on it.
 
-        Lengths count in samples of these patches; the residual is their photometry's. A facet
-        that two views see has data, illuminated or not. Inside the silhouettes' visual hull one
-        view is enough, as at the ends of an arc, or none beside a facet that is seen: contours
-        run through both. Facets outside the hull are dropped, and so are those that the
-        photographs contradict (:mod:`~pimper_torch.coarse.contradicted`).
+        Lengths count in samples of these patches; the residual is their photometry's. Inside the
+        silhouettes' visual hull all facets stay, seen or not: the coarse surface is closed as far
+        as it should be. Facets outside the hull are dropped, and so are those that the photographs
+        contradict (:mod:`~pimper_torch.coarse.contradicted`). Without a hull a facet that two views
+        see has data, illuminated or not.
         """
         patches, mesh = swept.patches, swept.patches.coarse.mesh
         residual = surface.information.new_full((patches.num_patches,), torch.nan)
@@ -107,11 +107,11 @@ class Remesh(Stage):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual[templates.facet] = known.detach().to(residual)
             misfit[templates.facet] = misfit_of(found).to(misfit)
-            seen[templates.facet] = heights.num_views >= (1 if contours.confine else _MIN_VIEWS)
+            seen[templates.facet] = heights.num_views >= _MIN_VIEWS
         inside = within(contours.hull, surface, patches.num_patches)
         leave_out("remesh.outside", ~inside, at=(mesh.vertices_world, mesh.faces))
         if contours.confine:
-            seen = corners_of(mesh.faces, seen, len(mesh.vertices_world))[mesh.faces].any(dim=1)
+            seen = torch.ones_like(seen)
             if patches.coarse.support is not None:
                 occlusion = ambient_occlusion(mesh.vertices_world, mesh.faces).to(misfit)
                 centers = mesh.vertices_world[mesh.faces].mean(dim=1).detach()

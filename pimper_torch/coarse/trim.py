@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.matching import Level
-from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.surfaces import component_areas, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import dilated, face_components, face_pairs, graph_components
 from pimper_torch.geometry.visibility import RayCaster
@@ -37,7 +37,7 @@ class ViewCounts(Record):
     Attributes:
         seen: In which the face is unoccluded, within the picture, and facing.
         lit: In which, of these, its pixel is illuminated.
-        behind: Whose depth map lies behind the face: they look through it.
+        behind: Whose depth map shows a matched point behind the face: they look through it.
     """
 
     seen: Int[Tensor, " face"]
@@ -50,14 +50,21 @@ def view_counts(
     faces: Int[Tensor, "face 3"],
     level: Level,
     maps: DepthMaps | None,
+    matched_world: Float[Tensor, "point 3"],
+    reach: float,
 ) -> ViewCounts:
     """Count the views that see the centre of each face, see it lit, and see through it.
+
+    Depth maps of surface without texture are wrong in places, for single views: a depth counts only
+    where it meets the cloud that all views have in common.
 
     Args:
         vertices: Of the surface.
         faces: Of it.
         level: Photographs, at the resolution of the depth maps.
         maps: Of all views; without, none sees through a face.
+        matched_world: Points of the cloud.
+        reach: Distance from these up to which a depth map meets them, scene units.
     """
     cameras = level.cameras
     centre = vertices[faces].mean(dim=1)
@@ -78,7 +85,11 @@ def view_counts(
         if maps is not None:
             nearest = maps.inverse_depth[view, row, column] + _BEHIND_STEPS * maps.step[view]
             through = maps.valid[view, row, column] & (1 / depth[chosen] > nearest)
-            behind[chosen] = through.long()
+            frame, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
+            rays = rays_through(pixels[chosen][through], frame, intrinsics)
+            shown = maps.inverse_depth[view, row, column][through, None]
+            met = point_distances(center + rays / shown, matched_world) <= reach
+            behind[chosen[through]] = met.long()
         free = ~caster.occluded(centre[chosen], center, 0.5 * side[chosen])
         free &= level.usable[view, row, column]
         seen[chosen] = free.long()

@@ -2,9 +2,10 @@ r"""Where a surface ends: what sticks out of its borders.
 
 A surface ends where its facets end, in teeth of their size, shreds and flaps. The distance from the
 border, smoothed with a kernel that falls by e a length, is that length on a straight border, less
-where the surface sticks out, and more in notches. What lies below is cut off, until nothing does:
-borders move by their curvature, as by thresholded diffusion (Merriman, Bence & Osher, Computational
-Crystal Growers Workshop, 1992), but inwards alone.
+where the surface sticks out, and more in notches. Surface below it that photographs do not
+determine is cut off, until there is none: borders move by their curvature, as by thresholded
+diffusion (Merriman, Bence & Osher, Computational Crystal Growers Workshop, 1992), but inwards
+alone, and never through surface that is determined.
 """
 
 import math
@@ -32,9 +33,12 @@ _MIN_SHAPE = 0.01  # of a needle's longest edge squared is taken for its area at
 
 
 def protruding(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], length: float
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    length: float,
+    unsure: Bool[Tensor, " face"],
 ) -> Bool[Tensor, " face"]:
-    """Mark what sticks out of the borders of a surface.
+    """Find what sticks out of the borders of a surface and is not determined.
 
     Borders shorter than a circle of that radius are small holes, which do not count, and faces that
     are as large do not show what is narrower. A constant to autograd.
@@ -43,11 +47,12 @@ def protruding(
         vertices: Of the surface.
         faces: Of it.
         length: What sticks out is about as wide, or narrower; scene units.
+        unsure: False for faces that photographs determine, which stay.
     """
     points, corners = vertices.detach().double().cpu(), faces.cpu()
     marked = torch.zeros(len(faces), dtype=torch.bool)
     sides = (points[corners] - points[corners].roll(1, dims=1)).norm(dim=-1)
-    if float(sides.median()) >= length:
+    if float(sides.median()) >= length or not bool(unsure.any()):
         return marked.to(faces.device)
     border = _long_borders(points, corners, length)
     if len(border):
@@ -56,7 +61,7 @@ def protruding(
         inner = torch.zeros_like(distance, dtype=torch.bool)
         inner[corners[~near]] = True
         used, local = torch.unique(corners[near], return_inverse=True)
-        marked[near] = _repeatedly(points[used], local, inner[used], length)
+        marked[near] = _repeatedly(points[used], local, inner[used], length, unsure.cpu()[near])
     return marked.to(faces.device)
 
 
@@ -65,6 +70,7 @@ def _repeatedly(
     faces: Int[Tensor, "face 3"],
     inner: Bool[Tensor, " vertex"],
     length: float,
+    unsure: Bool[Tensor, " face"],
 ) -> Bool[Tensor, " face"]:
     """Cut off what sticks out until nothing does; borders along inner vertices are none."""
     out, smooth = torch.zeros(len(faces), dtype=torch.bool), None
@@ -76,7 +82,7 @@ def _repeatedly(
             break
         distance = _distance(vertices, vertices[border], torch.inf)
         smooth = _smoothed(vertices, faces[left], distance, length, smooth)
-        some = (smooth < _STRAIGHT * length)[faces[left]].any(dim=1)
+        some = (smooth < _STRAIGHT * length)[faces[left]].any(dim=1) & unsure[left]
         if not bool(some.any()):
             break
         out[left[some]] = True

@@ -25,9 +25,6 @@ _BEYOND = 1 / 25  # what is further outside the hull's projection is background
 _DEEP = 1 / 50  # parallax this far inside the projection tells object
 _GRAIN = 1 / 200  # what is smaller in parallax is noise
 _GAPS = 1 / 50  # in what does not show the plane, as beyond its far border
-# About the projection of a surface, of the root of its area. Measured on an animal of one colour:
-# background from 4 % on in place of 10 corrects less.
-_INSIDE, _AROUND = 0.04, 0.1
 _FOOT = 1 / 200  # parallax says nothing of an object's foot that is so high
 # Half a window of agreement: next to the object a window that holds some of it agrees no more. On
 # rendered scenes of 24 views (armadillo, mug, balls, potatoes) twice as much is no better.
@@ -90,30 +87,6 @@ def labels_from_hull(
     labels[margin < -_BEYOND * longer] = BACKGROUND
     discs = discs_at(object_px, _DISC * longer, (width, height))
     labels[discs & (margin > 0)] = OBJECT
-    return labels
-
-
-def labels_from_surface(
-    seen: Bool[Tensor, "height width"],
-    cut: Bool[Tensor, "height width"],
-    agreement: Float[Tensor, "height width"] | None,
-) -> UInt8[Tensor, "height width"]:
-    """Seed with the projection of a surface, the cut that it came from, and parallax.
-
-    Args:
-        seen: Where the view shows the surface.
-        cut: The view's last cut.
-        agreement: With the plane's texture.
-    """
-    size = float(seen.sum()) ** 0.5
-    either, both = signed_distance(seen | cut), signed_distance(seen & cut)
-    labels = torch.full(seen.shape, PERHAPS_BACKGROUND, dtype=torch.uint8)
-    labels[either > 0] = PERHAPS_OBJECT
-    labels[both > _INSIDE * size] = OBJECT
-    if agreement is not None:
-        labels[_grainless(agreement > _ON_PLANE)] = PERHAPS_BACKGROUND
-        labels[_surely_on_plane(agreement)] = BACKGROUND
-    labels[either < -_AROUND * size] = BACKGROUND
     return labels
 
 

@@ -5,10 +5,16 @@ import torch
 import trimesh
 
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.meshing.borders import protruding
+from pimper_torch.meshing import borders
 from tests.meshing.sheets import sheet_of
 
 LENGTH = 3.0
+
+
+def protruding(vertices, faces, length, unsure=None):
+    """Mark what sticks out, where nothing is determined unless it is said."""
+    unsure = torch.ones(len(faces), dtype=torch.bool) if unsure is None else unsure
+    return borders.protruding(vertices, faces, length, unsure)
 
 
 def sheet(side=61):
@@ -55,6 +61,17 @@ def test_flaps_and_shreds_go_as_far_as_they_are_narrow():
     assert found[x[kept] > 30 + LENGTH].all()
     inside = (x > 8) & (x < 28) & (y > 8) & (y < 52)
     assert not found[inside[kept]].any()
+
+
+def test_what_is_determined_stays_and_so_does_what_it_holds():
+    vertices, faces, middle = sheet()
+    x, y = middle.unbind(dim=1)
+    kept = (x < 30) | ((y - 30).abs() < 0.7 * LENGTH)
+    unsure = (x > 40)[kept]
+    found = protruding(vertices, faces[kept], LENGTH, unsure)
+    assert not found[~unsure].any()
+    assert found[(x > 44)[kept]].all()
+    assert not protruding(vertices, faces[kept], LENGTH, torch.zeros_like(unsure)).any()
 
 
 def test_small_holes_are_no_borders_and_neither_is_a_closed_surface():
