@@ -4,13 +4,49 @@ Depth is a sum of Gaussian bumps, or a ball's, so its slopes are exact; albedo i
 region. Camera frame: x right, y down, z forward, normals facing the viewer.
 """
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.evidence.scenes.noise import Waves
+from pimper_torch.evidence.scenes.shapes import Plane
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
+
+_NEWTON_STEPS = 30  # quadratic convergence needs about 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WavyPlane:
+    """A gently wavy plane in the world: ``z = height field(x, y)``.
+
+    The first hit is found by Newton's method from the plane ``z = 0``, so the rays must be
+    steeper than the height field everywhere.
+    """
+
+    height_field: Waves
+
+    def intersect(
+        self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*#batch 3"]
+    ) -> Float[Tensor, "*batch"]:
+        """Follow the ray until it is level with the height field."""
+        start = Plane().intersect(origins, directions)
+        distance = torch.where(start.isfinite(), start, 0)
+        for _ in range(_NEWTON_STEPS):
+            points = origins + distance[..., None] * directions
+            gap = points[..., 2] - self.height_field(points[..., :2])
+            slope = self.height_field.gradient(points[..., :2])
+            closing = directions[..., 2] - (slope * directions[..., :2]).sum(-1)
+            distance = distance - gap / closing
+        return torch.where(start.isfinite(), distance, torch.inf)
+
+    def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Lean against the gradient."""
+        slope = self.height_field.gradient(points[..., :2])
+        return normalize(torch.cat([-slope, torch.ones_like(slope[..., :1])], dim=-1), dim=-1)
 
 
 def ball(
