@@ -16,19 +16,12 @@ import time
 from collections.abc import Callable
 
 import torch
+from reliefs import align_reliefs, ball, bumps, bumps_in_perspective, regions
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import (
-    OneView,
-    ball,
-    bumps,
-    bumps_in_perspective,
-    photograph,
-    point_lights,
-    regions,
-)
-from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_reliefs
+from pimper_torch.evidence.scenes.one_view import OneView, photograph, point_lights
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles

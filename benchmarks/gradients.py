@@ -11,10 +11,10 @@ import sys
 import warnings
 
 import torch
+from probes import probes, small_scene
 
 import pimper_torch as pt
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.bench.gradients import probes, small_scene
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from reliefs import align_reliefs
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -31,7 +32,7 @@ from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.single_view.factorization.ambiguity import align_factorizations
-from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_reliefs
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo import PhotometricStereo, photometric_stereo
 from pimper_torch.single_view.photometric_stereo.methods import METHODS
 

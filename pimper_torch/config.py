@@ -2,7 +2,7 @@
 
 A setting is a field of the config dataclass beside its stage; its default is the method's.
 A YAML file holds only what differs. Unknown keys and wrong types are refused when the file
-is read, impossible values when the dataclass is made (:func:`require`).
+is read, impossible values when the dataclass is made (:func:`require_ranges`, :func:`require`).
 """
 
 import dataclasses
@@ -56,6 +56,56 @@ def require_at_most(config: object, section: str = "", /, **most: int | float) -
         value = getattr(config, name)
         field = f"{section}.{name}" if section else name
         require(value <= bound, field, value, f"{bound:,.12g} at most")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Range:
+    """Numbers that a field takes: ``steps: Annotated[int, Range(least=1, most=1000)] = 4``.
+
+    Attributes:
+        least: The smallest value; or
+        above: a number that every value exceeds.
+        below: A number that exceeds every value.
+        most: The largest value. Beyond it memory or time does not suffice, iterations have
+            converged, photographs or processors are not that many, or a product with zero
+            is undefined.
+    """
+
+    least: int | float | None = None
+    above: int | float | None = None
+    below: int | float | None = None
+    most: int | float = math.inf
+
+    def needed(self, value: int | float) -> str:
+        """Return the bound that a value exceeds, in words; nothing where it is inside."""
+        low = self.above if self.least is None else self.least
+        assert low is not None, "a range has a lower bound"
+        enough = value > low if self.least is None else value >= low
+        if self.below is not None:
+            bracket = "(" if self.least is None else "["
+            inside = enough and value < self.below
+            return "" if inside else f"in {bracket}{low:g}, {self.below:g})"
+        if not enough:
+            return f"above {low:g}" if self.least is None else f"{low:g} or more"
+        return "" if value <= self.most else f"{self.most:,.12g} at most"
+
+
+def require_ranges(config: object, section: str = "") -> None:
+    """Refuse values outside the :class:`Range` that annotates their field.
+
+    Args:
+        config: Whose fields they are; ``None`` is in every range.
+        section: Of the config, for the message.
+
+    Raises:
+        ConfigError: Names the field, its value and the bound.
+    """
+    for name, hint in typing.get_type_hints(type(config), include_extras=True).items():
+        for mark in getattr(hint, "__metadata__", ()):
+            value = getattr(config, name)
+            if isinstance(mark, Range) and value is not None:
+                needed = mark.needed(value)
+                require(not needed, _join(section, name), value, needed)
 
 
 def build(cls: type[Config], mapping: Mapping[str, object], where: str) -> Config:

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import pimper_torch
-from pimper_torch.config import build, require_at_most, to_yaml
+from pimper_torch.config import Range, build, require_at_most, require_ranges, to_yaml
 from pimper_torch.errors import ConfigError
 
 ABSURD = (10**11, -1, 0, math.nan, math.inf)
@@ -130,3 +130,33 @@ def test_the_bound_itself_is_allowed():
         require_at_most(Some(), "some", count=2)
     with pytest.raises(ConfigError, match="count is nan"):
         require_at_most(Some(count=math.nan), count=2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranged:
+    steps: typing.Annotated[int | None, Range(least=1, most=1000)] = 3
+    tilt: typing.Annotated[float, Range(above=0, below=90)] = 45.0
+    prior: typing.Annotated[float, Range(above=0)] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("values", "needed"),
+    [
+        ({"steps": 0}, "some.steps is 0; needed: 1 or more."),
+        ({"steps": 1001}, "some.steps is 1001; needed: 1,000 at most."),
+        ({"tilt": 90.0}, r"some.tilt is 90.0; needed: in \(0, 90\)."),
+        ({"tilt": 0.0}, r"some.tilt is 0.0; needed: in \(0, 90\)."),
+        ({"prior": 0.0}, "some.prior is 0.0; needed: above 0."),
+        ({"prior": math.nan}, "some.prior is nan; needed: above 0."),
+    ],
+)
+def test_a_value_outside_the_range_of_its_field_is_refused_with_the_bound(values, needed):
+    with pytest.raises(ConfigError, match=needed):
+        require_ranges(Ranged(**values), "some")
+
+
+@pytest.mark.parametrize(
+    "values", [{"steps": 1}, {"steps": 1000}, {"steps": None}, {"tilt": 89.9}, {"prior": math.inf}]
+)
+def test_a_value_inside_the_range_of_its_field_is_taken(values):
+    require_ranges(Ranged(**values))

@@ -1,11 +1,11 @@
 """What every round would warn of is said once, as the last round has it."""
 
 import pytest
+from probes import small_scene
 from torch import nn
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.errors import PimperWarning, caution, held
-from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.records import Silhouettes
 from pimper_torch.stage import Given
 

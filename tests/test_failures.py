@@ -7,12 +7,12 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from probes import small_scene
 from torch.testing import assert_close
 
 import pimper_torch as pt
 from pimper_torch.chains.streaming import photometry_and_heights
 from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
-from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.failures import (
     by_data,
     distinct,

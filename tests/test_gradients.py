@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from probes import probes, small_scene
 
 import pimper_torch as pt
-from pimper_torch.evidence.bench.gradients import probes, small_scene
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
 
 # What is promised of the chain whole; single stages do far better. Kinks that are too small to tell

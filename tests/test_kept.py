@@ -4,10 +4,10 @@ import warnings
 
 import pytest
 import torch
+from probes import small_scene
 
 import pimper_torch as pt
 from pimper_torch.errors import PimperWarning, caution
-from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.meshing.extract import Extract
 from pimper_torch.records import Mesh, Surface
 from pimper_torch.reporting import Silent

@@ -1,10 +1,10 @@
 import mmap
 
 import pytest
+from probes import small_scene
 
 import pimper_torch as pt
 from pimper_torch.errors import ConfigError, ReconstructionError
-from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.memory import bytes_of, require_memory, resident_bytes
 from pimper_torch.patches.decompose import Decompose
 

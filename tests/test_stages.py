@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from probes import small_scene
 from torch import nn
 
 import pimper_torch as pt
-from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.stage import Given
 
 # Some of the few patches are not lit in enough views.

@@ -1,12 +1,12 @@
 import pytest
 import torch
+from probes import small_scene
 from torch import nn
 from torch.testing import assert_close
 
 import pimper_torch as pt
 from pimper_torch.chains.streaming import photometry_and_heights
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.kernels.switch import using
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.projection import project
 from tests.sfm.ball import cameras_on_an_arc, photographs

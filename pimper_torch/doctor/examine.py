@@ -7,7 +7,7 @@ from pimper_torch.doctor.each import each_alone
 from pimper_torch.doctor.findings import Finding
 from pimper_torch.doctor.light import light, variations
 from pimper_torch.doctor.machine import available_gb
-from pimper_torch.doctor.overlap import match_all, overlap
+from pimper_torch.doctor.overlap import match_copies, overlap
 from pimper_torch.doctor.photograph import Photograph, of_views, read_all
 from pimper_torch.doctor.samples import samples
 from pimper_torch.errors import InputError
@@ -45,7 +45,7 @@ def examine_folder(
         for error in read
         if isinstance(error, InputError)
     ]
-    matches = match_all(photographs)
+    matches = match_copies([one.small for one in photographs])
     return [
         *findings,
         *samples(paths, encoding),

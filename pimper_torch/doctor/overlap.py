@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.doctor.findings import Finding, listed
-from pimper_torch.doctor.photograph import Photograph
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Record
@@ -45,11 +44,11 @@ class Match(Record):
     second: Float[Tensor, "feature 2"]
 
 
-def match_all(photographs: Sequence[Photograph]) -> list[Match]:
-    """Match photographs with one another; pairs that have nothing in common are left out."""
+def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[Match]:
+    """Match small copies with one another; pairs that have nothing in common are left out."""
     with quiet():
-        features = list(side_by_side(lambda one: _features(one.small), photographs))
-        pairs = _pairs(len(photographs))
+        features = list(side_by_side(_features, copies))
+        pairs = _pairs(len(copies))
         found = side_by_side(lambda pair: _matched(features, pair), pairs)
         return [match for match in found if match is not None]
 

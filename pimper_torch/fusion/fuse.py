@@ -5,13 +5,14 @@ coarser subdivided mesh, then the surface is solved for at full size, and its ex
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import solved_or
 from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.contacts import Contacts, cloud_points, contour_tangents, passing
@@ -60,26 +61,18 @@ class FuseConfig:
     heights: bool = True
     points: bool = True
     contours: bool = True
-    bias_iterations: int = 2
-    noise_iterations: int = 3
-    error_draws: int = 8
+    bias_iterations: Annotated[int, Range(least=0, most=1000)] = 2
+    noise_iterations: Annotated[int, Range(least=1, most=1000)] = 3
+    error_draws: Annotated[int, Range(least=0, most=1000)] = 8
 
     def __post_init__(self) -> None:
+        require_ranges(self, "fuse")
         each = self.samples_per_vertex
         # The number of vertices goes with the square: 16 a sample tell all that it says.
         sound = 0.25 <= each <= 65_535
         require(sound, "fuse.samples_per_vertex", each, "at least 0.25, at most 65,535")
-        require(
-            self.bias_iterations >= 0, "fuse.bias_iterations", self.bias_iterations, "0 or more"
-        )
-        require(self.error_draws >= 0, "fuse.error_draws", self.error_draws, "0 or more")
-        require(
-            self.noise_iterations >= 1, "fuse.noise_iterations", self.noise_iterations, "1 or more"
-        )
         some = self.slopes or self.heights or self.points or self.contours
         require(some, "fuse.slopes", self.slopes, "true unless heights or points are")
-        # A solve each.
-        require_at_most(self, "fuse", bias_iterations=1000, noise_iterations=1000, error_draws=1000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -5,12 +5,13 @@ The faces stay as they are, so that a closed surface stays closed.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.config import require
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, corners_of, vertex_components
 from pimper_torch.ledger import leave_out
@@ -36,12 +37,11 @@ class RepairConfig:
             ones are spikes.
     """
 
-    max_extent: float = 0.1
-    max_stretch: float = 10.0
+    max_extent: Annotated[float, Range(least=0)] = 0.1
+    max_stretch: Annotated[float, Range(above=1)] = 10.0
 
     def __post_init__(self) -> None:
-        require(self.max_extent >= 0, "repair.max_extent", self.max_extent, "0 or more")
-        require(self.max_stretch > 1, "repair.max_stretch", self.max_stretch, "above 1")
+        require_ranges(self, "repair")
 
 
 class Repair(Stage):

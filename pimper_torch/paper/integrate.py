@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.geometry.surfaces import slopes_from_normals
@@ -41,12 +42,10 @@ class IntegrateConfig:
             0 is the published method.
     """
 
-    iterations: int = 8
+    iterations: Annotated[int, Range(least=0, most=1000)] = 8  # a solve each
 
     def __post_init__(self) -> None:
-        require(self.iterations >= 0, "iterations", self.iterations, "0 or more")
-        # A solve each.
-        require_at_most(self, iterations=1000)
+        require_ranges(self)
 
 
 class Integrate(Stage):

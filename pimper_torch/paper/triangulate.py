@@ -1,6 +1,7 @@
 """Coarse mesh: a few hundred facets through the cloud, seen from the frontal view."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,7 +10,7 @@ from torch.nn.functional import grid_sample, normalize
 
 from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.surface import smoothed_normals
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
@@ -72,13 +73,11 @@ class TriangulateConfig:
     """
 
     reference: str = ""
-    num_points: int = 250
+    num_points: Annotated[int, Range(least=4, most=1_000_000)] = 250  # the largest clouds
     fill: bool = True
 
     def __post_init__(self) -> None:
-        require(self.num_points >= 4, "num_points", self.num_points, "4 or more")
-        # As many points as the largest clouds have.
-        require_at_most(self, num_points=1_000_000)
+        require_ranges(self)
 
 
 class Triangulate(Stage):

@@ -1,13 +1,14 @@
 """Decomposition: every facet of the coarse mesh becomes a patch with a template."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.failures import skipped
 from pimper_torch.geometry.frames import rigid, transform
@@ -33,22 +34,13 @@ class DecomposeConfig:
             for a processor's cache.
     """
 
-    samples_per_pixel: float = 1.0
-    overlap_samples: float = 2.0
-    max_samples: float = 4.5e7
-    bucket_entries: int = 300_000
+    samples_per_pixel: Annotated[float, Range(above=0, most=8)] = 1.0
+    overlap_samples: Annotated[float, Range(least=1, most=65_535)] = 2.0  # the widest photograph
+    max_samples: Annotated[float, Range(least=1)] = 4.5e7
+    bucket_entries: Annotated[int, Range(least=1, most=100_000_000)] = 300_000  # 100 bytes each
 
     def __post_init__(self) -> None:
-        require(self.samples_per_pixel > 0, "samples_per_pixel", self.samples_per_pixel, "above 0")
-        require(self.overlap_samples >= 1, "overlap_samples", self.overlap_samples, "1 or more")
-        require(self.max_samples >= 1, "max_samples", self.max_samples, "1 or more")
-        require(self.bucket_entries >= 1, "bucket_entries", self.bucket_entries, "1 or more")
-        # Memory goes with the square; photographs hold nothing between their pixels.
-        require_at_most(self, samples_per_pixel=8.0)
-        # Wider than any photograph.
-        require_at_most(self, overlap_samples=65_535.0)
-        # A hundred bytes each, of every batch that is worked on.
-        require_at_most(self, bucket_entries=100_000_000)
+        require_ranges(self)
 
 
 class Decompose(Stage):

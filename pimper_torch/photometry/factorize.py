@@ -4,13 +4,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import by_data, out_of_memory, over_patches, reason_of, skipped
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
@@ -120,45 +120,24 @@ class FactorizeConfig:
 
     light: Literal["auto", "soft", "point_light"] = "auto"
     solver: Literal["variable-projection", "balm"] = "variable-projection"
-    light_prior: float = 1.0
-    geometry_weight: float = 0.1
+    light_prior: Annotated[float, Range(least=0, most=1e12)] = 1.0
+    geometry_weight: Annotated[float, Range(least=0, most=1e12)] = 0.1
     loss: Literal["squares", "cauchy"] = "cauchy"
-    loss_scale: float = 2.385  # 95 % efficient on Gaussian noise
+    loss_scale: Annotated[float, Range(above=0, most=1e12)] = (
+        2.385  # 95 % efficient on Gaussian noise
+    )
     shadows: bool = True
-    min_views: int = 4
-    min_light_variation: float = 0.02
-    max_iterations: int = 60
-    tolerance: float = 1e-3
+    min_views: Annotated[int, Range(least=3, most=100_000)] = 4
+    min_light_variation: Annotated[float, Range(least=0, below=1)] = 0.02
+    max_iterations: Annotated[int, Range(least=1, most=100_000)] = 60
+    tolerance: Annotated[float, Range(above=0, most=1)] = 1e-3
 
     def __post_init__(self) -> None:
+        require_ranges(self, "factorize")
         models = ("auto", "soft", "point_light")
         require(self.light in models, "factorize.light", self.light, "auto, soft or point_light")
         require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
         require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
-        for name in ("light_prior", "geometry_weight"):
-            value = getattr(self, name)
-            require(value >= 0, f"factorize.{name}", value, "0 or more")
-        require(self.loss_scale > 0, "factorize.loss_scale", self.loss_scale, "above 0")
-        require(self.min_views >= 3, "factorize.min_views", self.min_views, "3 or more")
-        least = self.min_light_variation
-        require(0 <= least < 1, "factorize.min_light_variation", least, "in [0, 1)")
-        limit = self.max_iterations
-        require(limit >= 1, "factorize.max_iterations", limit, "1 or more")
-        require(self.tolerance > 0, "factorize.tolerance", self.tolerance, "above 0")
-        # More photographs than fit a machine's memory.
-        require_at_most(self, "factorize", min_views=100_000)
-        # It has converged, or never will.
-        require_at_most(self, "factorize", max_iterations=100_000)
-        # Finite, so that no product with zero is undefined; squares are a loss of their
-        # own.
-        require_at_most(
-            self,
-            "factorize",
-            light_prior=1e12,
-            geometry_weight=1e12,
-            loss_scale=1e12,
-            tolerance=1.0,
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -1,12 +1,13 @@
 """Robust losses, and robust estimates of scale."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.linalg.sums import along_last
 
 # Scale of Cauchy's loss in standard deviations, at which it is 95 % efficient on Gaussian noise
@@ -47,12 +48,10 @@ class Cauchy:
         scale: ``s`` in standard deviations of the residuals.
     """
 
-    scale: float = CAUCHY_TUNING
+    scale: Annotated[float, Range(above=0, most=1e12)] = CAUCHY_TUNING
 
     def __post_init__(self) -> None:
-        require(self.scale > 0, "scale", self.scale, "above 0")
-        # Finite, so that no product with zero is undefined.
-        require_at_most(self, scale=1e12)
+        require_ranges(self)
 
     def weights(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]

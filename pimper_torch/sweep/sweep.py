@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches, skipped
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
@@ -76,17 +77,14 @@ class SweepConfig:
         min_views: A sample that fewer usable views have gets no height.
     """
 
-    steps: int = 4
-    num_views: int = 16
-    min_views: int = 3
+    steps: Annotated[int, Range(least=1, most=1000)] = 4
+    num_views: Annotated[int, Range(least=2, most=100_000)] = 16
+    min_views: Annotated[int, Range(least=2)] = 3
 
     def __post_init__(self) -> None:
-        require(self.steps >= 1, "sweep.steps", self.steps, "1 or more")
-        require(self.min_views >= 2, "sweep.min_views", self.min_views, "2 or more")
+        require_ranges(self, "sweep")
         least = self.min_views
         require(self.num_views >= least, "sweep.num_views", self.num_views, "min_views or more")
-        # Memory and time go with both; it moves by half a sample a step.
-        require_at_most(self, "sweep", steps=1000, num_views=100_000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

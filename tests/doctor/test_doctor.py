@@ -13,7 +13,7 @@ from pimper_torch.doctor.each import blur, exposure, lenses, number, saturation
 from pimper_torch.doctor.examine import examine_folder, examine_views
 from pimper_torch.doctor.light import light, light_variation
 from pimper_torch.doctor.machine import available_gb, machine, total_gb
-from pimper_torch.doctor.overlap import Match, match_all, overlap
+from pimper_torch.doctor.overlap import Match, match_copies, overlap
 from pimper_torch.doctor.photograph import Photograph, of_views, summarize
 from pimper_torch.doctor.sharpness import edge_blur_px
 from pimper_torch.evidence.scenes.meshes import icosphere
@@ -225,7 +225,7 @@ def test_matches_lie_on_the_same_points(scenes):
     """Of a photograph and itself, shifted, every match is off by the shift."""
     one = of_views(load_views(scenes["moving"]))[0]
     shifted = one.replace(small=one.small.roll((3, 5), dims=(0, 1)))
-    (match,) = match_all([one, shifted])
+    (match,) = match_copies([one.small, shifted.small])
     assert len(match.first) > 50
     off = (match.second - match.first).median(dim=0).values
     torch.testing.assert_close(off, torch.tensor([5.0, 3.0]), atol=0.1, rtol=0)

@@ -6,11 +6,11 @@ import typing
 import pytest
 import torch
 from jaxtyping import AbstractArray
+from probes import small_scene
 from torch.utils import _pytree as pytree
 
 import pimper_torch as pt
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.bench.gradients import small_scene
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import (
     Cameras,

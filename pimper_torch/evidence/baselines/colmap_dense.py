@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_at_most, require_ranges
 from pimper_torch.cores import usable_cores
 from pimper_torch.errors import MissingProgramError, ReconstructionError
 from pimper_torch.evidence.baselines.exchange import (
@@ -64,26 +64,18 @@ class ColmapDenseConfig:
     mesher: Literal["poisson", "delaunay", "none"] = "poisson"
     poisson_trim: float | None = None
     gpu: str = "-1"
-    threads: int = 0
-    max_minutes: float = 120.0
+    threads: Annotated[int, Range(least=0, most=1024)] = 0
+    max_minutes: Annotated[float, Range(above=0)] = 120.0
     keep_in: Path | None = None
 
     def __post_init__(self) -> None:
-        require(
-            self.max_size_px == -1 or self.max_size_px > 0,
-            "max_size_px",
-            self.max_size_px,
-            "-1, or above 0",
-        )
+        require_ranges(self)
+        size = self.max_size_px
+        require(size == -1 or size > 0, "max_size_px", size, "-1, or above 0")
+        require_at_most(self, max_size_px=65_535)
         trim = self.poisson_trim
         within = trim is None or 0 <= trim <= 32
         require(within, "poisson_trim", trim, "0 to 32, as deep as octrees are, or nothing")
-        require(self.threads >= 0, "threads", self.threads, "0 or more")
-        require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
-        # Photographs end there.
-        require_at_most(self, max_size_px=65_535)
-        # More processors than COLMAP counts.
-        require_at_most(self, threads=1024)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,13 +2,13 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.evidence.baselines.anchoring import (
     apply_bas_relief,
@@ -71,36 +71,20 @@ class GlobalStereoConfig:
         warp: Which samples a view may contribute.
     """
 
-    samples_per_pixel: float = 1.0
+    samples_per_pixel: Annotated[float, Range(above=0, most=8)] = 1.0
     start: Literal["mesh", "svd"] = "mesh"
-    start_samples: int = 30_000
-    min_views: int = 4
-    max_iterations: int = 200
-    tolerance: float = 1e-3
-    max_tilt_deg: float = 75.0
-    upgrades: int = 2
-    integration_steps: int = 30
+    start_samples: Annotated[int, Range(least=0, most=100_000_000)] = 30_000
+    min_views: Annotated[int, Range(least=4, most=100_000)] = 4
+    max_iterations: Annotated[int, Range(least=1, most=100_000)] = 200
+    tolerance: Annotated[float, Range(above=0, most=1)] = 1e-3
+    max_tilt_deg: Annotated[float, Range(above=0, below=90)] = 75.0
+    upgrades: Annotated[int, Range(least=0, most=100_000)] = 2
+    integration_steps: Annotated[int, Range(least=0, most=100_000)] = 30
     warp: WarpConfig = field(default_factory=lambda: WarpConfig(occlusion_stride=2))
 
     def __post_init__(self) -> None:
-        require(self.samples_per_pixel > 0, "samples_per_pixel", self.samples_per_pixel, "above 0")
+        require_ranges(self)
         require(self.start in ("mesh", "svd"), "start", self.start, "mesh or svd")
-        require(self.start_samples >= 0, "start_samples", self.start_samples, "0 or more")
-        require(self.min_views >= 4, "min_views", self.min_views, "4 or more")
-        require(self.max_iterations >= 1, "max_iterations", self.max_iterations, "1 or more")
-        require(self.tolerance > 0, "tolerance", self.tolerance, "above 0")
-        require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
-        require(self.upgrades >= 0, "upgrades", self.upgrades, "0 or more")
-        steps = self.integration_steps
-        require(steps >= 0, "integration_steps", steps, "0 or more")
-        # Memory goes with the square.
-        require_at_most(self, samples_per_pixel=8.0, start_samples=100_000_000)
-        # More photographs than fit a machine's memory.
-        require_at_most(self, min_views=100_000)
-        # They have converged, or never will.
-        require_at_most(
-            self, max_iterations=100_000, upgrades=100_000, integration_steps=100_000, tolerance=1.0
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.evidence.baselines.anchoring import (
     apply_bas_relief,
     bas_relief_through,
@@ -73,29 +74,18 @@ class LimConfig:
     """
 
     samples_per_pixel: tuple[float, ...] = (0.25, 0.25, 0.5, 0.5, 1.0)
-    light_samples: int = 40_000
-    min_views: int = 4
-    alternations: int = 100
-    max_tilt_deg: float = 75.0
-    integration_steps: int = 30
+    light_samples: Annotated[int, Range(least=16, most=100_000_000)] = 40_000
+    min_views: Annotated[int, Range(least=3, most=100_000)] = 4
+    alternations: Annotated[int, Range(least=1, most=100_000)] = 100
+    max_tilt_deg: Annotated[float, Range(above=0, below=90)] = 75.0
+    integration_steps: Annotated[int, Range(least=0, most=100_000)] = 30
     warp: WarpConfig = field(default_factory=lambda: WarpConfig(occlusion_stride=2))
 
     def __post_init__(self) -> None:
+        require_ranges(self)
         scales = self.samples_per_pixel
         within = len(scales) > 0 and all(0 < scale <= 8 for scale in scales)
         require(within, "samples_per_pixel", scales, "above 0, at most 8 each")
-        require(self.light_samples >= 16, "light_samples", self.light_samples, "16 or more")
-        require(self.min_views >= 3, "min_views", self.min_views, "3 or more")
-        require(self.alternations >= 1, "alternations", self.alternations, "1 or more")
-        require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
-        steps = self.integration_steps
-        require(steps >= 0, "integration_steps", steps, "0 or more")
-        # A sample takes 100 bytes in every photograph.
-        require_at_most(self, light_samples=100_000_000)
-        # More photographs than fit a machine's memory.
-        require_at_most(self, min_views=100_000)
-        # They have converged, or never will.
-        require_at_most(self, alternations=100_000, integration_steps=100_000)
 
 
 class Lim(Stage):

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.cores import usable_cores
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.evidence.baselines.exchange import (
@@ -60,24 +61,15 @@ class OpenMvsConfig:
     """
 
     folder: Path | None = None
-    resolution_level: int = 1
-    min_resolution_px: int = 640
+    resolution_level: Annotated[int, Range(least=0, most=16)] = 1  # halvings: a pixel is left
+    min_resolution_px: Annotated[int, Range(least=1, most=65_535)] = 640
     refine: bool = True
-    threads: int = 0
-    max_minutes: float = 120.0
+    threads: Annotated[int, Range(least=0, most=1024)] = 0
+    max_minutes: Annotated[float, Range(above=0)] = 120.0
     keep_in: Path | None = None
 
     def __post_init__(self) -> None:
-        require(self.resolution_level >= 0, "resolution_level", self.resolution_level, "0 or more")
-        require(
-            self.min_resolution_px >= 1, "min_resolution_px", self.min_resolution_px, "1 or more"
-        )
-        require(self.threads >= 0, "threads", self.threads, "0 or more")
-        require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
-        # Photographs end there; 16 halvings leave a pixel.
-        require_at_most(self, resolution_level=16, min_resolution_px=65_535)
-        # More than there are processors.
-        require_at_most(self, threads=1024)
+        require_ranges(self)
 
 
 class OpenMvs(Stage):

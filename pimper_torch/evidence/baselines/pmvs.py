@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.cores import usable_cores
 from pimper_torch.evidence.baselines.exchange import (
     estimate_of,
@@ -52,33 +53,23 @@ class PmvsConfig:
     """
 
     program: Path | None = None
-    level: int = 1
-    csize: int = 2
+    level: Annotated[int, Range(least=0, most=16)] = 1  # halvings: a pixel is left
+    csize: Annotated[int, Range(least=1, most=65_535)] = 2
     threshold: float = 0.7
-    wsize: int = 7
-    min_images: int = 3
+    wsize: Annotated[int, Range(least=3, most=65_535)] = 7
+    min_images: Annotated[int, Range(least=2, most=100_000)] = 3
     max_angle_deg: float = 10.0
-    quad: float = 2.5
-    threads: int = 0
-    max_minutes: float = 120.0
+    quad: Annotated[float, Range(above=0, most=1e6)] = 2.5
+    threads: Annotated[int, Range(least=0, most=1024)] = 0
+    max_minutes: Annotated[float, Range(above=0)] = 120.0
     keep_in: Path | None = None
 
     def __post_init__(self) -> None:
-        require(self.level >= 0, "level", self.level, "0 or more")
-        require(self.csize >= 1, "csize", self.csize, "1 or more")
+        require_ranges(self)
         require(-1 <= self.threshold <= 1, "threshold", self.threshold, "in [-1, 1]")
-        require(self.wsize >= 3, "wsize", self.wsize, "3 or more")
-        require(self.min_images >= 2, "min_images", self.min_images, "2 or more")
         require(
             0 < self.max_angle_deg < 180, "max_angle_deg", self.max_angle_deg, "above 0, below 180"
         )
-        require(self.quad > 0, "quad", self.quad, "above 0")
-        require(self.threads >= 0, "threads", self.threads, "0 or more")
-        require(self.max_minutes > 0, "max_minutes", self.max_minutes, "above 0")
-        # 16 halvings leave a pixel of any photograph.
-        require_at_most(self, level=16, csize=65_535, wsize=65_535, min_images=100_000, quad=1e6)
-        # More than there are processors.
-        require_at_most(self, threads=1024)
 
 
 class Pmvs(Stage):

@@ -15,13 +15,14 @@ for the discrete plate; the rim's term is ours.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
@@ -51,19 +52,12 @@ class SmoothedConfig:
         filled_fidelity: ``w`` of vertices that were filled in between.
     """
 
-    num_vertices: int = 20_000
-    fidelity: float = 1000.0
-    filled_fidelity: float = 1000.0
+    num_vertices: Annotated[int, Range(least=4, most=10_000_000)] = 20_000  # half a kilobyte each
+    fidelity: Annotated[float, Range(above=0, most=1e12)] = 1000.0
+    filled_fidelity: Annotated[float, Range(least=0, most=1e12)] = 1000.0
 
     def __post_init__(self) -> None:
-        require(self.num_vertices >= 4, "num_vertices", self.num_vertices, "4 or more")
-        require(self.fidelity > 0, "fidelity", self.fidelity, "above 0")
-        filled = self.filled_fidelity
-        require(filled >= 0, "filled_fidelity", filled, "0 or more")
-        # Half a kilobyte each.
-        require_at_most(self, num_vertices=10_000_000)
-        # Finite, so that no product with zero is undefined.
-        require_at_most(self, fidelity=1e12, filled_fidelity=1e12)
+        require_ranges(self)
 
 
 class Smoothed(Stage):

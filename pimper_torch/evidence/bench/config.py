@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.evidence.metrics.evaluate import EvaluateConfig
 from pimper_torch.evidence.scenes.config import SceneConfig
 
@@ -49,22 +49,18 @@ class BenchConfig:
     methods: tuple[str, ...] | None = None
     masks: bool = False
     cameras: Literal["found", "features", "true"] = "found"
-    seed: int = 0
-    samples: int = 50_000
-    processes: int = 2
+    seed: Annotated[int, Range(least=0, most=2**32 - 1)] = 0  # 32 bits
+    samples: Annotated[int, Range(least=1, most=10_000_000)] = 50_000  # 100 bytes each
+    processes: Annotated[int, Range(least=1, most=1024)] = 2
 
     def __post_init__(self) -> None:
         """Refuse a table without rows."""
+        require_ranges(self)
         require(len(self.scenes) > 0, "scenes", self.scenes, "one scene or more")
         require(len(self.chosen_methods) > 0, "methods", self.methods, "one method or more")
         for name, given in (("scenes", self.scenes), ("methods", self.chosen_methods)):
             labels = {Path(one).stem for one in given}
             require(len(labels) == len(given), name, given, "each name only once, of files too")
-        require(self.seed >= 0, "seed", self.seed, "0 or more")
-        require(self.samples >= 1, "samples", self.samples, "1 or more")
-        require(self.processes >= 1, "processes", self.processes, "1 or more")
-        # A seed has 32 bits; a sample takes 100 bytes.
-        require_at_most(self, seed=2**32 - 1, samples=10_000_000, processes=1024)
 
     @property
     def chosen_methods(self) -> tuple[str, ...]:

@@ -2,9 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.evidence.scenes.sensor import SensorConfig
 
 # 64 GB, in which no photograph of a camera is rendered.
@@ -70,10 +70,10 @@ class SceneConfig:
             conductor, else none.
     """
 
-    num_views: int = 30
+    num_views: Annotated[int, Range(least=1, most=100_000)] = 30
     width: int = 1600
     height: int = 1200
-    seed: int = 0
+    seed: Annotated[int, Range(least=0, most=2**32 - 1)] = 0
     path: Literal["arc", "turntable", "handheld"] = "arc"
     span_deg: float = 50.0
     elevation_deg: float = 30.0
@@ -87,7 +87,7 @@ class SceneConfig:
     pan_jitter_px: float = 0.0
     crop_jitter_px: float = 0.0
     light: Literal["point", "directional"] = "point"
-    point_light_distance: float = 2.5
+    point_light_distance: Annotated[float, Range(least=1, most=1000)] = 2.5
     irradiance: float = 0.85
     ambient: float = 0.1
     flash: float = 0.0
@@ -109,7 +109,7 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be photographed."""
-        require(self.num_views >= 1, "num_views", self.num_views, "1 or more")
+        require_ranges(self)
         require(8 <= self.width <= 65_535, "width", self.width, "8 to 65,535, as of a JPEG")
         require(8 <= self.height <= 65_535, "height", self.height, "8 to 65,535, as of a JPEG")
         # Rays of a photograph take 100 bytes each.
@@ -120,7 +120,6 @@ class SceneConfig:
             self.supersample,
             f"{most} at most with {self.width} x {self.height} pixels; or fewer of these",
         )
-        require(self.seed >= 0, "seed", self.seed, "0 or more")
         require(math.isfinite(self.rotation_deg), "rotation_deg", self.rotation_deg, "finite")
         for name in ("specular", "roughness"):
             value = getattr(self, name)
@@ -161,12 +160,6 @@ class SceneConfig:
             self.constant_light,
             "no fixed_point_light, under which the light goes round the object",
         )
-        require(
-            self.point_light_distance >= 1,
-            "point_light_distance",
-            self.point_light_distance,
-            "1 or more",
-        )
         for name in ("irradiance", "ambient", "flash"):
             value = getattr(self, name)
             require(0 <= value < float("inf"), name, value, "0 or more")
@@ -186,8 +179,6 @@ class SceneConfig:
             "none with albedo or specular: a metal has no matte part, and its own reflectance",
         )
         require(0 <= self.bounces <= 8, "bounces", self.bounces, "between 0 and 8")
-        # A seed has 32 bits; lights farther than a thousand sizes are the sun's.
-        require_at_most(self, num_views=100_000, seed=2**32 - 1, point_light_distance=1000.0)
 
     @property
     def surrounded(self) -> Literal["none", "constant", "changing"]:

@@ -1,7 +1,6 @@
-r"""One viewpoint under many distant lights, in closed form: the truth of photometric stereo.
+"""Normals and albedo photographed from one viewpoint under many distant lights.
 
-Depth is a sum of Gaussian bumps, or a ball's, so its slopes are exact; albedo is one colour a
-region. Camera frame: x right, y down, z forward, normals facing the viewer.
+Camera frame: x right, y down, z forward, normals facing the viewer.
 """
 
 from dataclasses import dataclass
@@ -9,9 +8,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.records import Record
 
 
@@ -67,91 +64,6 @@ def photograph(
     return OneView(images=images, mask=mask, normals=n, albedo=rho, lights=lights)
 
 
-def ball(
-    size: int, rim_deg: float = 75.0
-) -> tuple[Float[Tensor, "size size 3"], Bool[Tensor, "size size"]]:
-    """Give the normals of a ball that fills a square image, orthographic, and its mask.
-
-    Args:
-        size: Of the image.
-        rim_deg: The mask ends where the normals turn away from the viewer by this.
-    """
-    side = torch.sin(torch.deg2rad(torch.tensor(rim_deg, dtype=torch.float64)))
-    xy = side * (_grid(size) * 2 / size - 1)
-    square = xy.square().sum(dim=-1, keepdim=True)
-    normals = torch.cat([xy, -(1 - square).clamp_min(0).sqrt()], dim=-1)
-    return normalize(normals, dim=-1), square[..., 0] < side**2
-
-
-def bumps(
-    size: int, generator: torch.Generator, steepest: float = 1.0, count: int = 8
-) -> tuple[Float[Tensor, "size size 3"], Bool[Tensor, "size size"]]:
-    """Give the normals of a field of Gaussian bumps and hollows, orthographic, and a full mask.
-
-    Args:
-        size: Of the image.
-        generator: On the CPU.
-        steepest: Slope.
-        count: Of bumps.
-    """
-    _, slopes = _depth(size, generator, count)
-    slopes = slopes * steepest / slopes.norm(dim=-1).max()
-    normals = normalize(torch.cat([slopes, -torch.ones_like(slopes[..., :1])], dim=-1), dim=-1)
-    return normals, torch.ones(size, size, dtype=torch.bool)
-
-
-def bumps_in_perspective(
-    size: int,
-    generator: torch.Generator,
-    field_deg: float = 40.0,
-    steepest: float = 1.0,
-    count: int = 8,
-) -> tuple[Float[Tensor, "size size 3"], Bool[Tensor, "size size"], Float[Tensor, "3 3"], Tensor]:
-    r"""Give a field of bumps as a pinhole sees it.
-
-    Depth is :math:`z = e^{f(x, y)}` over the normalised image plane; the normal of
-    :math:`z\,(x, y, 1)` is along :math:`(f_x, f_y, -1 - x f_x - y f_y)`.
-
-    Args:
-        size: Of the image.
-        generator: On the CPU.
-        field_deg: Angle that the image's width spans.
-        steepest: Of the slopes of ``f``.
-        count: Of bumps.
-
-    Returns:
-        Normals, a full mask, intrinsics, and depth of unit order.
-    """
-    half = torch.tan(torch.deg2rad(torch.tensor(field_deg / 2, dtype=torch.float64)))
-    focal = size / 2 / half
-    intrinsics = torch.eye(3, dtype=torch.float64)
-    intrinsics[:2] = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]]).double() * focal
-    intrinsics[:2, 2] = size / 2
-    height, slopes = _depth(size, generator, count)
-    scale = steepest / slopes.norm(dim=-1).max()
-    # From slopes a unit of half the width to slopes a unit of the image plane.
-    slopes, height = slopes * scale, height * scale * half
-    xy = (_grid(size) - size / 2) / focal
-    last = -1 - (xy * slopes).sum(dim=-1, keepdim=True)
-    normals = normalize(torch.cat([slopes, last], dim=-1), dim=-1)
-    return normals, torch.ones(size, size, dtype=torch.bool), intrinsics, height.exp()
-
-
-def regions(
-    size: int, generator: torch.Generator, colours: int = 5, seeds: int = 14
-) -> Float[Tensor, "size size 3"]:
-    """Paint a square image with a few colours, one for each cell of random points.
-
-    Hues are evenly spread and brightness is drawn, so that colours differ in chromaticity.
-    """
-    points = torch.rand(seeds, 2, generator=generator, dtype=torch.float64) * size
-    nearest = (_grid(size)[:, :, None] - points).norm(dim=-1).argmin(dim=-1)
-    hue = torch.arange(colours, dtype=torch.float64)[:, None] / colours + torch.arange(3) / 3
-    brightness = 0.3 + 0.6 * torch.rand(colours, 1, generator=generator, dtype=torch.float64)
-    palette = brightness * (1 + 0.5 * torch.cos(2 * torch.pi * hue)) / 1.5
-    return palette[torch.arange(seeds) % colours][nearest]
-
-
 def point_lights(
     views: int, generator: torch.Generator, widest_deg: float = 50.0
 ) -> Float[Tensor, "view 3"]:
@@ -162,20 +74,3 @@ def point_lights(
     angle, radius = 2 * torch.pi * drawn[1], (1 - z * z).sqrt()
     directions = torch.stack([radius * angle.cos(), radius * angle.sin(), -z], dim=1)
     return (0.7 + 0.6 * drawn[2])[:, None] * directions
-
-
-def _depth(
-    size: int, generator: torch.Generator, count: int
-) -> tuple[Float[Tensor, "size size"], Float[Tensor, "size size 2"]]:
-    """Sum Gaussians on the square from -1 to 1: values and gradient."""
-    drawn = torch.rand(4, count, generator=generator, dtype=torch.float64)
-    center = 1.8 * drawn[:2].mT - 0.9
-    width = 0.25 + 0.35 * drawn[2]
-    height = (1 - 2 * (torch.arange(count) % 2)) * (0.5 + drawn[3]) * width
-    offset = (_grid(size) * 2 / size - 1)[:, :, None] - center
-    value = height * torch.exp(-offset.square().sum(dim=-1) / (2 * width**2))
-    return value.sum(dim=-1), -(value / width**2)[..., None].mul(offset).sum(dim=2)
-
-
-def _grid(size: int) -> Float[Tensor, "size size 2"]:
-    return pixel_centers(size, size, torch.zeros(0, dtype=torch.float64))

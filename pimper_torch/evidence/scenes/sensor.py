@@ -1,12 +1,13 @@
 """How radiance becomes a photograph."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,21 +22,14 @@ class SensorConfig:
         exposure: Radiance is multiplied by it before it saturates at 1.
     """
 
-    supersample: int = 2
-    read_noise: float = 0.002
-    shot_noise: float = 0.0001
-    exposure: float = 1.0
+    supersample: Annotated[int, Range(least=1, most=16)] = 2
+    read_noise: Annotated[float, Range(least=0, most=1)] = 0.002
+    shot_noise: Annotated[float, Range(least=0, most=1)] = 0.0001
+    exposure: Annotated[float, Range(above=0, most=1000)] = 1.0
 
     def __post_init__(self) -> None:
         """Refuse what no sensor does."""
-        require(self.supersample >= 1, "supersample", self.supersample, "1 or more")
-        require(self.read_noise >= 0, "read_noise", self.read_noise, "0 or more")
-        require(self.shot_noise >= 0, "shot_noise", self.shot_noise, "0 or more")
-        require(self.exposure > 0, "exposure", self.exposure, "more than 0")
-        # In multiples of full scale.
-        require_at_most(self, read_noise=1.0, shot_noise=1.0, exposure=1000.0)
-        # Rays a pixel and direction: 256 tell all that 8 or 16 bits can.
-        require_at_most(self, supersample=16)
+        require_ranges(self)
 
 
 def expose(

@@ -11,12 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.noise import Waves
 
-_NEWTON_STEPS = 30  # quadratic convergence needs about 6
-
-
-@runtime_checkable
 @runtime_checkable
 class Shape(Protocol):
     """A surface in the world."""
@@ -75,33 +70,3 @@ class Plane:
     def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Repeat the plane's own."""
         return normalize(points.new_tensor(self.normal), dim=-1).expand_as(points)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bumps:
-    """A gently wavy plane: ``z = height field(x, y)``.
-
-    The first hit is found by Newton's method from the plane ``z = 0``, so the rays must be
-    steeper than the height field everywhere.
-    """
-
-    height_field: Waves
-
-    def intersect(
-        self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*#batch 3"]
-    ) -> Float[Tensor, "*batch"]:
-        """Follow the ray until it is level with the height field."""
-        start = Plane().intersect(origins, directions)
-        distance = torch.where(start.isfinite(), start, 0)
-        for _ in range(_NEWTON_STEPS):
-            points = origins + distance[..., None] * directions
-            gap = points[..., 2] - self.height_field(points[..., :2])
-            slope = self.height_field.gradient(points[..., :2])
-            closing = directions[..., 2] - (slope * directions[..., :2]).sum(-1)
-            distance = distance - gap / closing
-        return torch.where(start.isfinite(), distance, torch.inf)
-
-    def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Lean against the gradient."""
-        slope = self.height_field.gradient(points[..., :2])
-        return normalize(torch.cat([-slope, torch.ones_like(slope[..., :1])], dim=-1), dim=-1)

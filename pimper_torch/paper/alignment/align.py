@@ -1,12 +1,13 @@
 """Alignment: bas-relief transforms that make neighbouring patches agree."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.linalg.sums import average
 from pimper_torch.paper.alignment.anchors import (
     Anchors,
@@ -80,24 +81,15 @@ class AlignConfig:
 
     offset: bool = True
     curvature: bool = True
-    iterations: int = 3
-    anchor: float = 1.0
-    points: float = 1.0
-    prior: float = 3e-4
-    scale_limit: float = 4.0
-    outlier: float = 5.0
+    iterations: Annotated[int, Range(least=1, most=1000)] = 3  # a solve each
+    anchor: Annotated[float, Range(least=0, most=1e12)] = 1.0
+    points: Annotated[float, Range(least=0, most=1e12)] = 1.0
+    prior: Annotated[float, Range(above=0, most=1e12)] = 3e-4
+    scale_limit: Annotated[float, Range(above=1)] = 4.0
+    outlier: Annotated[float, Range(above=0)] = 5.0
 
     def __post_init__(self) -> None:
-        require(self.iterations >= 1, "iterations", self.iterations, "1 or more")
-        require(self.anchor >= 0, "anchor", self.anchor, "0 or more")
-        require(self.points >= 0, "points", self.points, "0 or more")
-        require(self.prior > 0, "prior", self.prior, "above 0")
-        require(self.scale_limit > 1, "scale_limit", self.scale_limit, "above 1")
-        require(self.outlier > 0, "outlier", self.outlier, "above 0")
-        # A solve each.
-        require_at_most(self, iterations=1000)
-        # Finite, so that no product with zero is undefined.
-        require_at_most(self, anchor=1e12, points=1e12, prior=1e12)
+        require_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

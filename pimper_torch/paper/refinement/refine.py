@@ -1,13 +1,14 @@
 """Refinement: height field of all patches in, one joined surface out."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.fusion.continuation import about_mean
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
@@ -38,16 +39,12 @@ class RefineConfig:
             outvote it, where three or more meet; infinite for the plain mean.
     """
 
-    smoothing_radius_samples: float = 1.0
+    smoothing_radius_samples: Annotated[float, Range(above=0, most=65_535)] = 1.0
     keep_planes: bool = True
-    outlier_samples: float = 4.0
+    outlier_samples: Annotated[float, Range(above=0)] = 4.0
 
     def __post_init__(self) -> None:
-        for name in ("smoothing_radius_samples", "outlier_samples"):
-            value = getattr(self, name)
-            require(value > 0, name, value, "above 0")
-        # Wider than any template.
-        require_at_most(self, smoothing_radius_samples=65_535.0)
+        require_ranges(self)
 
 
 class Refine(Stage):

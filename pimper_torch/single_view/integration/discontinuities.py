@@ -20,12 +20,13 @@ components follow from the weights and are never fixed. Kinks and twists are our
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.linalg.multigrid import Iterate
 from pimper_torch.paper.poisson import differences, differences_transposed
 from pimper_torch.progress import report
@@ -65,24 +66,16 @@ class DiscontinuityConfig:
         max_iterations: Linear systems at most.
     """
 
-    scale_px: float = 0.3
-    noise_scales: float = 6.0
-    kink: float = 2.0
-    twist: float = 1.0
-    tie: float = 1e-4
-    tolerance: float = 5e-4
-    max_iterations: int = 40
+    scale_px: Annotated[float, Range(above=0, most=1e12)] = 0.3
+    noise_scales: Annotated[float, Range(above=0, most=1e12)] = 6.0
+    kink: Annotated[float, Range(above=0, most=1e12)] = 2.0
+    twist: Annotated[float, Range(above=0, most=1e12)] = 1.0
+    tie: Annotated[float, Range(above=0, below=1)] = 1e-4
+    tolerance: Annotated[float, Range(above=0, most=1)] = 5e-4
+    max_iterations: Annotated[int, Range(least=1, most=100_000)] = 40
 
     def __post_init__(self) -> None:
-        for name in ("scale_px", "noise_scales", "kink", "twist", "tolerance"):
-            value = getattr(self, name)
-            require(value > 0, name, value, "above 0")
-        require(0 < self.tie < 1, "tie", self.tie, "in (0, 1)")
-        require(self.max_iterations >= 1, "max_iterations", self.max_iterations, "1 or more")
-        # Finite, so that no product with zero is undefined.
-        require_at_most(self, scale_px=1e12, noise_scales=1e12, kink=1e12, twist=1e12)
-        # It has converged, or never will.
-        require_at_most(self, tolerance=1.0, max_iterations=100_000)
+        require_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -2,17 +2,18 @@ from functools import cache
 
 import pytest
 import torch
+from reliefs import WavyPlane
 
 from pimper_torch.evidence.metrics.relative import compare_in_view
 from pimper_torch.evidence.scenes import render_shape, sparse_scene
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.noise import random_speckle, random_waves
-from pimper_torch.evidence.scenes.shapes import Bumps, Sphere
+from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 
 SPHERE = Sphere()
-BUMPS = Bumps(
+BUMPS = WavyPlane(
     height_field=random_waves(
         torch.Generator().manual_seed(3), wavelength=0.5, root_mean_square=0.03, axes=2
     )

@@ -1,9 +1,10 @@
 import pytest
 import torch
+from reliefs import WavyPlane
 from torch.testing import assert_close
 
 from pimper_torch.evidence.scenes.noise import random_waves
-from pimper_torch.evidence.scenes.shapes import Bumps, Plane, Sphere
+from pimper_torch.evidence.scenes.shapes import Plane, Sphere
 
 
 def rays_from_above(generator, count=500):
@@ -68,7 +69,7 @@ def test_a_ray_from_inside_a_sphere_meets_its_far_side():
 
 def test_bumps_are_met_on_the_height_field_with_normals_across_it(generator):
     height_field = waves(generator)
-    shape = Bumps(height_field=height_field)
+    shape = WavyPlane(height_field=height_field)
     origins, directions = rays_from_above(generator)
     points = origins + shape.intersect(origins, directions)[:, None] * directions
     assert points[:, 2].std() > 0.02  # a plane would pass otherwise

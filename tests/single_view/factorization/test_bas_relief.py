@@ -1,7 +1,8 @@
 import torch
+from reliefs import align_reliefs
 from torch.testing import assert_close
 
-from pimper_torch.single_view.factorization.bas_relief import BasRelief, align_reliefs
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
 
 def some(generator):

@@ -1,9 +1,9 @@
 import pytest
 import torch
+from reliefs import ball, bumps, regions
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import ball, bumps, regions
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     albedo_entropy,

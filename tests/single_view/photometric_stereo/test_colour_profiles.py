@@ -1,9 +1,10 @@
 import pytest
 import torch
+from reliefs import ball, bumps, regions
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.scenes.one_view import ball, bumps, photograph, point_lights, regions
+from pimper_torch.evidence.scenes.one_view import photograph, point_lights
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.chromaticity import (
     chromaticities,

@@ -1,9 +1,9 @@
 import pytest
 import torch
+from reliefs import align_reliefs
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.single_view.factorization.bas_relief import align_reliefs
 from pimper_torch.single_view.photometric_stereo.integrability import (
     curls,
     integrable,

@@ -1,15 +1,11 @@
 import pytest
 import torch
+from reliefs import bumps_in_perspective, regions
 from torch.autograd.functional import jvp
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import (
-    bumps_in_perspective,
-    photograph,
-    point_lights,
-    regions,
-)
+from pimper_torch.evidence.scenes.one_view import photograph, point_lights
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.photometric_stereo.perspective import (

@@ -1,9 +1,10 @@
 import pytest
 import torch
+from reliefs import ball, regions
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import ball, photograph, point_lights, regions
+from pimper_torch.evidence.scenes.one_view import photograph, point_lights
 from pimper_torch.single_view.photometric_stereo.visibility_subspaces import (
     _common_lights,
     find_subspaces,

@@ -1,15 +1,9 @@
 import pytest
 import torch
+from reliefs import ball, bumps, bumps_in_perspective, regions
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.one_view import (
-    ball,
-    bumps,
-    bumps_in_perspective,
-    photograph,
-    point_lights,
-    regions,
-)
+from pimper_torch.evidence.scenes.one_view import photograph, point_lights
 
 
 @pytest.fixture
