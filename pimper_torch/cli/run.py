@@ -79,7 +79,7 @@ def _examine(job: Job, views: Views) -> None:
     config, own = job.config, set()
     if job.inputs.sparse is not None or config.reconstruct.shared_camera:
         own.add("lenses")
-    if not isinstance(config, CoarseToFineConfig):
+    if not isinstance(config, CoarseToFineConfig) or config.scales[-1] < 1:
         own.add("cost")  # which is that of `default`
     for finding in examine_views(views):
         if finding.severity == "warning" and finding.check not in own:

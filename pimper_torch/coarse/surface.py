@@ -42,13 +42,17 @@ class CoarseSurfaceConfig:
     Attributes:
         reference: Name or stem of the frontal photograph; empty chooses it.
         num_facets: About so many are left after simplification.
+        levels: Resolutions of the depth maps, the longer side of the first about 100 pixels, each
+            other one twice that before.
     """
 
     reference: str = ""
     num_facets: int = 3000
+    levels: int = 3
 
     def __post_init__(self) -> None:
         require(self.num_facets >= 4, "num_facets", self.num_facets, "4 or more")
+        DensifyConfig(levels=self.levels)
         # A facet of fewer samples than 45 says nothing of its light: 45 million are a
         # pass's.
         require_at_most(self, "coarse_surface", num_facets=1_000_000)
@@ -65,7 +69,8 @@ class CoarseSurface(Stage):
     ) -> None:
         super().__init__()
         self.config = config or CoarseSurfaceConfig()
-        self.densify, self.fine = densify or DensifyConfig(), fine or FineSurfaceConfig()
+        self.densify = densify or DensifyConfig(levels=self.config.levels)
+        self.fine = fine or FineSurfaceConfig()
 
     @torch.no_grad()
     def forward(

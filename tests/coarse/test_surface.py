@@ -151,6 +151,14 @@ def test_settings_out_of_range_are_refused():
         DensifyConfig(coarsest_px=31)
     with pytest.raises(ConfigError, match="num_facets"):
         CoarseSurfaceConfig(num_facets=3)
+    with pytest.raises(ConfigError, match="levels"):
+        CoarseSurfaceConfig(levels=0)
+
+
+def test_the_levels_of_a_configuration_are_those_of_the_depth_maps():
+    stage = CoarseSurface(CoarseSurfaceConfig(levels=2))
+    assert stage.densify.levels == 2
+    assert CoarseSurface().densify == DensifyConfig()
 
 
 def test_of_three_faces_at_an_edge_the_smallest_goes():
