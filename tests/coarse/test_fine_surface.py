@@ -138,6 +138,24 @@ def test_pieces_that_neither_points_nor_contours_support_go():
     assert bool((kept == first).all())
 
 
+@pytest.mark.parametrize(("share", "stays"), [(0.2, False), (0.05, True)])
+def test_a_piece_in_the_air_that_views_see_through_goes(share, stays):
+    vertices, faces = icosphere(2)
+    two = torch.cat([vertices, 0.3 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
+    index = torch.arange(len(two[1]))
+    first, through = index < len(faces), index >= (2 - share) * len(faces)
+    count = torch.full((len(two[1]),), 3)
+    support = torch.where(first, Support.POINTS, Support.CONTOUR)
+    config, everywhere = FineSurfaceConfig(), torch.ones_like(first)
+
+    def kept(behind):
+        counts = ViewCounts(seen=count, lit=count, behind=behind.long())
+        return seen_surface(*two, support, counts, everywhere, 1.0, config)
+
+    assert bool((kept(through) == (first | stays)).all())  # of one view each
+    assert bool(kept(first).all())  # depth maps behind points are wrong
+
+
 def test_the_crop_shows_the_same_at_the_same_places(round_about):
     silhouettes = silhouettes_of(round_about.cameras)
     part = cropped(round_about, silhouettes)
