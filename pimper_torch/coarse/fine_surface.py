@@ -64,9 +64,10 @@ _MIN_POINTS = 16
 # may be wrong.
 _MIN_BEHIND, _MIN_LIT = 2, 2
 
-# Fraction of a component's faces that a view sees through, from which it floats in the air: 0.32 of
-# a lump before potatoes (8 photographs of 240x180), 0.01 at most of the potatoes. A choice between.
-_MOST_THROUGH = 0.1
+# Fraction of a region that views see through, from which all of it is in the air: by two views,
+# 0.56 of the lid over a mug's mouth, and at most 0.1 of regions without points that are there (mug,
+# cow, jar); by one, 0.32 of a lump before potatoes, and 0.03 of pieces that are there.
+_MOST_THROUGH = 0.25
 
 # Without silhouettes a face without points is dropped where it is further than the first from all
 # points, with all connected to it that are further than the second. Spans over gaps in potatoes
@@ -274,6 +275,16 @@ def poisson(
     return vertices.to(points) + centre, faces.to(points.device)
 
 
+def mostly(
+    faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], through: Bool[Tensor, " face"]
+) -> Bool[Tensor, " face"]:
+    """Find the connected regions of some faces that are seen through over enough of them."""
+    (index,) = torch.nonzero(some, as_tuple=True)
+    region = face_components(faces[index])
+    share = torch.bincount(region, through[index].double()) / torch.bincount(region)
+    return torch.zeros_like(some).index_put((index,), (share >= _MOST_THROUGH)[region])
+
+
 def near_points(
     faces: Int[Tensor, "face 3"],
     centre: Float[Tensor, "face 3"],
@@ -343,10 +354,10 @@ def seen_surface(
 ) -> Bool[Tensor, " face"]:
     """Mark the faces that stay: in the visual hull, and seen or supported.
 
-    A face without points that views see through is dropped: it closes an opening. Faces that no
-    view sees stay where they close a small hole; the back of an object seen from one side is a
-    large one. Narrow strips along the border are dropped, and components that float before what
-    views see through them.
+    Surface without points that views see through is dropped: it closes an opening, or floats in
+    the air, and all of it goes where they see through enough of it. Faces that no view sees stay
+    where they close a small hole; the back of an object seen from one side is a large one. Narrow
+    strips along the border are dropped.
 
     Args:
         vertices: Of the closed surface.
@@ -360,9 +371,11 @@ def seen_surface(
     """
     known = support >= Support.CONTOUR
     small = (config.hole_px * pixel) ** 2
-    possible = inside & ((counts.behind < _MIN_BEHIND) | (support == Support.POINTS))
+    bare = inside & (support != Support.POINTS)
+    through = bare & (counts.behind >= _MIN_BEHIND)
+    through |= mostly(faces, bare & (counts.seen > 0), through)
+    possible = without_small_holes(vertices, faces, inside & ~through, small)
     leave_out("coarse.seen_through", inside & ~possible, at=(vertices, faces))
-    possible = without_small_holes(vertices, faces, possible, small)
     kept = possible & ((counts.seen > 0) | known)
     leave_out("coarse.unseen", possible & ~kept, at=(vertices, faces))
     area = float(total(face_normals(vertices, faces[kept]).norm(dim=1))) / 2
@@ -370,14 +383,14 @@ def seen_surface(
     kept = kept | (holes & ~connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
     rings = int(config.hole_px / (2 * CELL_PX))
+    floating = mostly(faces, kept, bare & (counts.behind > 0))
+    leave_out("coarse.floating", floating, at=(vertices, faces))
+    kept &= ~floating
     strips = fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)
     leave_out("coarse.fringes", strips, at=(vertices, faces))
     kept &= ~strips
     (chosen,) = torch.nonzero(kept, as_tuple=True)
     stays = supported_components(vertices, faces[chosen], known[chosen], fraction)
-    label = face_components(faces[chosen])
-    through = ((counts.behind > 0) & (support != Support.POINTS))[chosen].double()
-    stays &= (torch.bincount(label, through) < _MOST_THROUGH * torch.bincount(label))[label]
     leave_out("coarse.components", ~stays, at=(vertices, faces[chosen]))
     kept[chosen[~stays]] = False
     return kept

@@ -50,8 +50,6 @@ _SHARP, _SHARP_PX = 0.01, 4.0
 # Correlation above chance: at crops of these scenes 0.37 to 0.87, of another object's photographs
 # up to 0.28.
 _LEAST = 0.2
-# Of the picture: where sizes differ by less, a crop that is taken for a resize is not warned of.
-SMALL = 0.02
 # By so much the shift that was found is off where the object is a glossy mug; else by 1 px.
 _ROUND_PX = 3.0
 
@@ -323,8 +321,6 @@ def _shift(
     seen = own != 0
     better = standard_errors((own - resized)[seen])
     if fits and better <= ERRORS:
-        if better > -ERRORS and float((group.room / torch.tensor(group.whole)).abs().max()) > SMALL:
-            tell_undecided(where, few.model, group.views)
         return None
     if float((own - chance)[seen].mean()) < _LEAST:
         return None
@@ -398,16 +394,6 @@ def tell_crop(where: str, model: SparseModel, views: Sequence[int], evidence: st
         "that these are no resized ones, but cropped: the principal point is at "
         f"({x:.0f}, {y:.0f}) of {lens.width}x{lens.height}. Cameras and observations follow. If "
         "that is wrong, give the photographs that it was made from.",
-        stacklevel=6,
-    )
-
-
-def tell_undecided(where: str, model: SparseModel, views: Sequence[int]) -> None:
-    """Warn that photographs of another size are taken for resized ones."""
-    caution(
-        f"{where} is of pictures of another size than {_which(model, views)}, and nothing tells "
-        "whether these were resized or cropped: they are taken as resized. If that is wrong, give "
-        "the photographs that it was made from.",
         stacklevel=6,
     )
 

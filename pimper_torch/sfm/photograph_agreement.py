@@ -22,13 +22,11 @@ from pimper_torch.records import Cameras
 from pimper_torch.sfm.agreement import undistorted_pixels
 from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.crops import (
-    SMALL,
     around,
     climbed,
     refused_crop,
     shifted_lenses,
     tell_crop,
-    tell_undecided,
 )
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
@@ -186,10 +184,6 @@ def find_crop(
     best = errors(shifted(shift))
     better = math.inf if plain is None else standard_errors(errors(plain) - best)
     if better <= ERRORS:
-        if better > -ERRORS and float(room.max()) > SMALL * max(
-            usual.lenses[views[0]].width, usual.lenses[views[0]].height
-        ):
-            tell_undecided(where, usual, views)
         return None
     crop, evidence = shifted(shift), "what their matches show"
     beside = [errors(shifted(shift + _BESIDE_PX * one)) for one in around(shift)]

@@ -23,7 +23,7 @@ NAMES = ("10.png", "2.png", "a b.png")
 
 
 def existing_model(views: Views, path: Path) -> SparseModel:
-    return existing_ways(views, path)[0]
+    return existing_ways(views, path).plain[0]
 
 
 @pytest.fixture

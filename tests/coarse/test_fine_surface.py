@@ -138,21 +138,22 @@ def test_pieces_that_neither_points_nor_contours_support_go():
     assert bool((kept == first).all())
 
 
-@pytest.mark.parametrize(("share", "stays"), [(0.2, False), (0.05, True)])
-def test_a_piece_in_the_air_that_views_see_through_goes(share, stays):
+@pytest.mark.parametrize(("share", "stays"), [(0.3, False), (0.2, True)])
+@pytest.mark.parametrize("views", [1, 2])
+def test_a_piece_in_the_air_goes_whole_where_views_see_through_enough_of_it(share, stays, views):
     vertices, faces = icosphere(2)
-    two = torch.cat([vertices, 0.3 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
+    two = torch.cat([vertices, 0.9 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
     index = torch.arange(len(two[1]))
     first, through = index < len(faces), index >= (2 - share) * len(faces)
     count = torch.full((len(two[1]),), 3)
     support = torch.where(first, Support.POINTS, Support.CONTOUR)
-    config, everywhere = FineSurfaceConfig(), torch.ones_like(first)
 
     def kept(behind):
-        counts = ViewCounts(seen=count, lit=count, behind=behind.long())
-        return seen_surface(*two, support, counts, everywhere, 1.0, config)
+        counts = ViewCounts(seen=count, lit=count, behind=views * behind.long())
+        return seen_surface(*two, support, counts, torch.ones_like(first), 1.0, SMALL_HOLES)
 
-    assert bool((kept(through) == (first | stays)).all())  # of one view each
+    rest = ~through if views == 2 else torch.ones_like(first)
+    assert bool((kept(through) == (first | (rest & stays))).all())
     assert bool(kept(first).all())  # depth maps behind points are wrong
 
 

@@ -32,7 +32,7 @@ def test_a_scenes_model_is_found_once_and_its_seconds_are_those_of_the_first_run
     def structure_from_motion(views, config):
         runs.append(config)
         time.sleep(0.3)
-        return existing_ways(views, rendered / "truth" / "sparse")[0]
+        return existing_ways(views, rendered / "truth" / "sparse").plain[0]
 
     monkeypatch.setattr(reconstruct, "structure_from_motion", structure_from_motion)
     config = BenchConfig(scenes=(str(rendered),), samples=500)

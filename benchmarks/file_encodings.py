@@ -1,6 +1,6 @@
 """What is lost where files do not say how their samples encode radiance, or are not heard.
 
-Run as ``python benchmarks/encodings.py SCENE -o FOLDER``: a folder that ``pimper render`` wrote
+Run as ``python benchmarks/file_encodings.py SCENE -o FOLDER``: what ``pimper render`` wrote
 with ``--bits 16 --encoding linear``. Its photographs are written as PNG in other encodings, with
 the chunks that say so and without; each set is reconstructed with the true cameras and masks and
 measured. Prints rows of a table.
