@@ -15,9 +15,10 @@ from pimper_torch.silhouettes.rays import RayConfig, contour_rays
 from pimper_torch.silhouettes.tangency import contour_points
 from pimper_torch.stage import Stage
 
-# Fraction of the views whose silhouette may be wrong at a place: as large for those that are found
-# as in the vote that finds them. In one of 24 photographs of a skull, shadow took the jaw's end.
-_DISAGREEING = {"masks": 0.03, "found": 0.05}
+# Fraction of the views whose silhouette may be wrong at a place. Those that are found lack parts in
+# shadow: with 0.05, where 4 of 24 silhouettes of a cow lack a third of it, 23 % of its pixels are
+# not covered; with 0.15 none, and the right hull of a ball grows by 4 % in place of 2 %.
+_DISAGREEING = {"masks": 0.03, "found": 0.15}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

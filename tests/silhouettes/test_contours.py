@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -39,6 +41,20 @@ def test_one_wrong_silhouette_in_twenty_cuts_nothing_off_where_they_were_found(c
     for source, kept in (("found", True), ("masks", False)):
         contours = TraceContours()(silhouettes.replace(inside=wrong, source=source), cameras)
         assert bool(contours.hull.holds(lost)) == kept
+
+
+def test_three_wrong_silhouettes_in_twenty_cut_nothing_off_where_they_were_found(cameras):
+    silhouettes = silhouettes_of(ball, cameras)
+    wrong = silhouettes.inside.clone()
+    wrong[[3, 8, 15], :, 60:] = 0
+
+    def volume(inside):
+        hull = TraceContours()(silhouettes.replace(inside=inside, source="found"), cameras).hull
+        return float(hull.occupied.sum() * hull.spacing**3)
+
+    true = 4 / 3 * math.pi
+    assert true < volume(silhouettes.inside) < 1.1 * true
+    assert true < volume(wrong)
 
 
 def test_silhouettes_that_leave_nothing_out_constrain_nothing(cameras):
