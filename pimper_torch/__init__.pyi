@@ -1,4 +1,5 @@
 # Public names, which are imported when they are asked for (`__init__.py`).
+__all__: list[str]
 from .chains.chain import Chain as Chain
 from .chains.chain import Step as Step
 from .chains.coarse_to_fine import CoarseToFine as CoarseToFine
