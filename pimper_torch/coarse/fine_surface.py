@@ -275,10 +275,16 @@ def poisson(
     return vertices.to(points) + centre, faces.to(points.device)
 
 
-def mostly(
+def regions_seen_through(
     faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], through: Bool[Tensor, " face"]
 ) -> Bool[Tensor, " face"]:
-    """Find the connected regions of some faces that are seen through over enough of them."""
+    """Find the connected regions of some faces that views see through over enough of them.
+
+    Args:
+        faces: Of the surface.
+        some: True for faces that make up the regions.
+        through: True for faces that views see through.
+    """
     (index,) = torch.nonzero(some, as_tuple=True)
     region = face_components(faces[index])
     share = torch.bincount(region, through[index].double()) / torch.bincount(region)
@@ -373,7 +379,7 @@ def seen_surface(
     small = (config.hole_px * pixel) ** 2
     bare = inside & (support != Support.POINTS)
     through = bare & (counts.behind >= _MIN_BEHIND)
-    through |= mostly(faces, bare & (counts.seen > 0), through)
+    through |= regions_seen_through(faces, bare & (counts.seen > 0), through)
     possible = without_small_holes(vertices, faces, inside & ~through, small)
     leave_out("coarse.seen_through", inside & ~possible, at=(vertices, faces))
     kept = possible & ((counts.seen > 0) | known)
@@ -383,7 +389,7 @@ def seen_surface(
     kept = kept | (holes & ~connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
     rings = int(config.hole_px / (2 * CELL_PX))
-    floating = mostly(faces, kept, bare & (counts.behind > 0))
+    floating = regions_seen_through(faces, kept, bare & (counts.behind > 0))
     leave_out("coarse.floating", floating, at=(vertices, faces))
     kept &= ~floating
     strips = fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)

@@ -70,7 +70,7 @@ def view_counts(
     centre = vertices[faces].mean(dim=1)
     normals = unit_face_normals(vertices, faces)
     side = side_lengths(vertices[faces]).amax(dim=1)
-    caster = RayCaster(vertices, faces)
+    caster, cloud = RayCaster(vertices, faces), cKDTree(matched_world.detach().cpu().numpy())
 
     def of_view(view: int) -> Int[Tensor, "count face"]:
         seen, lit, behind = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
@@ -88,8 +88,8 @@ def view_counts(
             frame, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
             rays = rays_through(pixels[chosen][through], frame, intrinsics)
             shown = maps.inverse_depth[view, row, column][through, None]
-            met = point_distances(center + rays / shown, matched_world) <= reach
-            behind[chosen[through]] = met.long()
+            distance, _ = cloud.query((center + rays / shown).detach().cpu().numpy())
+            behind[chosen[through]] = torch.from_numpy(distance <= reach).to(behind)
         free = ~caster.occluded(centre[chosen], center, 0.5 * side[chosen])
         free &= level.usable[view, row, column]
         seen[chosen] = free.long()

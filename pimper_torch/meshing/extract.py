@@ -23,8 +23,8 @@ from pimper_torch.stage import Stage
 # a skull lost the edge of its teeth; with 0.6 its base ends smoothly and they stay.
 _TOOTH = 0.6
 # Expected error, in multiples of the surface's median, from which surface is not determined. Of the
-# skull's flaps 8 in 10 faces have more than 8, of its other faces the median has 1; with 5 the
-# flaps go as before, and of what was cut then a tenth stays.
+# skull's flaps 3 in 4 faces have more than 8, of its other faces the median has 1; with 5 the
+# flaps go, and 8 % of what is cut without this limit stays.
 _UNSURE = 5.0
 
 

@@ -150,16 +150,6 @@ def _again(
     return of_views(again, cues.num_views)
 
 
-def cut_from(
-    colours: UInt8[Tensor, "height width 3"],
-    labels: UInt8[Tensor, "height width"],
-    meeting: Bool[Tensor, "height width"],
-) -> Bool[Tensor, "height width"]:
-    """Cut a picture by its labels; drop what is small or does not meet the object."""
-    cut = grab_cut(colours, labels, _CUTS)
-    return without_specks(cut, meeting, round(_SPECK * cut.numel()))
-
-
 def _cut(
     how: Cutter,
     cues: Cues,
