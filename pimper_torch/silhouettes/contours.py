@@ -17,7 +17,7 @@ from pimper_torch.stage import Stage
 
 # Fraction of the views whose silhouette may be wrong at a place. Those that are found lack parts in
 # shadow: with 0.05, where 4 of 24 silhouettes of a cow lack a third of it, 23 % of its pixels are
-# not covered, with 0.1 0.3 %. With 0.15 one of 8 views is outvoted, and potatoes lose 60 %.
+# not covered, with 0.1 0.3 %. With 0.15 one of 8 views is outvoted: Chamfer 0.19 for 0.12.
 _DISAGREEING = {"masks": 0.03, "found": 0.1}
 
 
