@@ -13,23 +13,21 @@ from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.sfm.sound_views import with_views
 
 
-def by_series(
-    scene: SparseScene, find: Callable[[SparseScene, tuple[int, ...]], Silhouettes]
-) -> Silhouettes:
+def by_series(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) -> Silhouettes:
     """Find silhouettes in the views of each series, and put them side by side.
 
     Args:
         scene: With series or without.
-        find: Gives silhouettes of some views: their scene, and their numbers.
+        find: From the scene of one series to its silhouettes.
 
     Returns:
         Of all views. Where those of one series are everything, everything above every known plane.
     """
     if not len(scene.series):
-        return find(scene, tuple(range(scene.views.num_views)))
+        return find(scene)
     chosen = [scene.series == number for number in sorted(set(scene.series.tolist()))]
     views = [one.nonzero()[:, 0] for one in chosen]
-    found = [find(part(scene, one.tolist()), tuple(one.tolist())) for one in views]
+    found = [find(part(scene, one.tolist())) for one in views]
     doubtful = sum(one.source == "everything" for one in found)
     leave_out("silhouettes.by_series", doubtful, total=len(found))
     if doubtful:
@@ -43,7 +41,7 @@ def by_series(
 
 
 def part(scene: SparseScene, views: list[int]) -> SparseScene:
-    """Give the scene of some views, as if the object had stood there alone."""
+    """Return the scene of some views, as if the object had stood there alone."""
     kept = torch.zeros(scene.views.num_views, dtype=torch.bool)
     kept[views] = True
     some = with_views(scene, kept)

@@ -62,7 +62,7 @@ class FindSilhouettes(Stage):
                 "`silhouettes.object` is masks, but the photographs come without any. Give a "
                 "folder of masks, or let silhouettes be found: `silhouettes.object` auto."
             )
-        return by_series(scene, lambda part, _: self._found(part))
+        return by_series(scene, self._found)
 
     def _agreeing(self, silhouettes: Silhouettes, scene: SparseScene) -> Silhouettes:
         """Replace masks that clearly contradict the others by what the hull of these shows."""
