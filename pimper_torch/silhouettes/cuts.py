@@ -63,19 +63,20 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
     """Cut every view, vote, and cut again from what the vote says.
 
     Before every vote the plane's texture is learned anew where the cuts do not hide it: holes
-    that it is seen through stay open, and what stands before it stands out.
+    that it is seen through stay open, and what stands before it stands out. Where parallax alone
+    cut, views abstain from the first vote beyond the plane.
 
     Returns:
         ``None`` where the cuts have nothing in common.
     """
-    masks = _first(cues)
+    masks, unknown = _first(cues), _unknown(cues)
     for _ in range(details.iterations):
         cues = cues.relearned(masks)
         masks = _filled(cues, masks)
-        seen = _voted(cues, masks | _likely(cues), details)
+        seen = _voted(cues, masks | _likely(cues), details, unknown)
         if seen is None:
             return None
-        masks = _again(cues, masks, seen)
+        masks, unknown = _again(cues, masks, seen), torch.zeros_like(unknown)
     cues = cues.relearned(masks)
     masks = _filled(cues, masks)
     seen = _voted(cues, masks, details)
@@ -182,8 +183,18 @@ def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
     return of_views(lambda view: off_level(agreement[view]), cues.num_views)
 
 
+def _unknown(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Find what a first cut by parallax knows nothing of, as beyond the plane."""
+    if cues.agreement is None or cues.has_points:
+        return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
+    return cues.agreement.isnan()
+
+
 def _voted(
-    cues: Cues, masks: Bool[Tensor, "view height width"], details: SilhouetteDetails
+    cues: Cues,
+    masks: Bool[Tensor, "view height width"],
+    details: SilhouetteDetails,
+    unknown: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view height width"] | None:
     """Build the hull above the plane, and see it in every view."""
     cameras = cues.pictures.cameras
@@ -196,6 +207,7 @@ def _voted(
         cues.box_world,
         num_voxels=details.num_voxels,
         disagreeing=details.disagreeing,
+        unknown=unknown,
     )
     if hull is None:
         return None

@@ -168,11 +168,12 @@ def visual_hull(
     num_voxels: int = 2_000_000,
     disagreeing: float = 0.03,
     min_seen: float = 0.5,
+    unknown: Bool[Tensor, "view height width"] | None = None,
 ) -> Hull | None:
     """Build the hull by the vote of the reliable views.
 
-    A view votes about what is inside its photograph, and abstains elsewhere. Time and memory
-    grow with the voxels.
+    A view votes about what is inside its photograph and known, and abstains elsewhere. Time and
+    memory grow with the voxels.
 
     Args:
         silhouettes: Where the views show the object.
@@ -183,6 +184,7 @@ def visual_hull(
         disagreeing: Fraction of the views in sight of a voxel that may see it outside. What only
             a few views cut, such as the ends of an arc, needs a small one.
         min_seen: Fraction of the reliable views that a voxel must be in sight of.
+        unknown: Pixels that show the object or not; none by default.
 
     Returns:
         ``None`` where the silhouettes have nothing in common inside the box.
@@ -191,7 +193,8 @@ def visual_hull(
     masks = silhouettes.masks
 
     def framed(view: int) -> Float[Tensor, "high wide"]:
-        return _framed(masks[view], cameras.sizes_px[view].tolist())
+        other = torch.zeros_like(masks[view]) if unknown is None else unknown[view]
+        return _framed(masks[view], other, cameras.sizes_px[view].tolist())
 
     maps = list(side_by_side(framed, views, tracked=False))
     chosen = cameras.take(views)
@@ -264,11 +267,13 @@ def _deepest(
 
 
 def _framed(
-    mask: Bool[Tensor, "height width"], size_px: list[int]
+    mask: Bool[Tensor, "height width"], unknown: Bool[Tensor, "height width"], size_px: list[int]
 ) -> Float[Tensor, "high_and_2 wide_and_2"]:
-    """Measure distances to the silhouette inside the photograph, and mark what is beyond it."""
+    """Measure distances to the silhouette where it is known inside the photograph."""
     width, height = size_px
-    return pad(signed_distance(mask[:height, :width]), (1, 1, 1, 1), value=_UNSEEN)
+    known = signed_distance(mask[:height, :width])
+    known = known.masked_fill(unknown[:height, :width], _UNSEEN)
+    return pad(known, (1, 1, 1, 1), value=_UNSEEN)
 
 
 def _voted(

@@ -131,6 +131,11 @@ def closed(mask: Bool[Tensor, "height width"], radius_px: int) -> Bool[Tensor, "
     return _morphed(mask, cv2.MORPH_CLOSE, radius_px)
 
 
+def dilated(layer: Float[Tensor, "height width"], reach_px: int) -> Float[Tensor, "height width"]:
+    """Return the largest value of the square round each pixel that reaches so far."""
+    return torch.from_numpy(cv2.dilate(layer.numpy(), np.ones((2 * reach_px + 1,) * 2)))
+
+
 def convex_hull_of(
     pixels: Float[Tensor, "point 2"], size_px: tuple[int, int]
 ) -> Bool[Tensor, "height width"]:

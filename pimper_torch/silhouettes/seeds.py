@@ -12,6 +12,7 @@ from pimper_torch.silhouettes.opencv import (
     blind_holes,
     closed,
     convex_hull_of,
+    dilated,
     discs_at,
     opened,
     signed_distance,
@@ -23,6 +24,8 @@ _STRIP = 1 / 64  # along the border of a photograph, where nothing else is known
 _CLOSING = 1 / 90
 _BEYOND = 1 / 25  # what is further outside the hull's projection is background
 _DEEP = 1 / 50  # parallax this far inside the projection tells object
+_THIN = 1 / 200  # and this far in the middle of a part that is nowhere so deep
+_MIDDLE = 0.7  # of the depth of such a part: a body's legs and handle are seeded, no shadow is
 _GRAIN = 1 / 200  # what is smaller in parallax is noise
 _GAPS = 1 / 50  # in what does not show the plane, as beyond its far border
 _FOOT = 1 / 200  # parallax says nothing of an object's foot that is so high
@@ -83,7 +86,7 @@ def labels_from_hull(
     labels[region] = PERHAPS_OBJECT
     if agreement is not None:
         labels[_surely_on_plane(agreement)] = BACKGROUND
-        labels[_grainless(agreement < _OFF_PLANE) & is_deep(margin)] = OBJECT
+        labels[_grainless(agreement < _OFF_PLANE) & is_inmost(margin)] = OBJECT
     labels[margin < -_BEYOND * longer] = BACKGROUND
     discs = discs_at(object_px, _DISC * longer, (width, height))
     labels[discs & (margin > 0)] = OBJECT
@@ -99,6 +102,13 @@ def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height 
 def is_deep(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Mark what is so far inside that shadows beside the object do not reach it."""
     return margin > _DEEP * max(margin.shape)
+
+
+def is_inmost(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what is deep inside, and the middle of what is too thin to be deep."""
+    longer = max(margin.shape)
+    middle = margin > _MIDDLE * dilated(margin, max(1, round(_DEEP * longer)))
+    return is_deep(margin) | (middle & (margin > _THIN * longer))
 
 
 def not_seen_through(

@@ -30,17 +30,28 @@ def test_a_ball_on_a_table_is_found_in_every_view(staged):
     assert overlap(silhouettes.masks, staged.truth).min() > 0.95
 
 
-def test_an_object_without_a_point_is_found_by_parallax(staged):
-    scene = staged.scene
+def without_points_of_the_ball(scene):
     on_ball = scene.points_world[:, 2] > 0.01
     kept = ~on_ball[scene.observation_point]
-    bare = scene.replace(
+    return scene.replace(
         observation_point=scene.observation_point[kept],
         observation_view=scene.observation_view[kept],
         observation_pixels=scene.observation_pixels[kept],
     )
-    silhouettes = FindSilhouettes(*SMALL)(bare)
+
+
+def test_an_object_without_a_point_is_found_by_parallax(staged):
+    silhouettes = FindSilhouettes(*SMALL)(without_points_of_the_ball(staged.scene))
     assert silhouettes is not None
+    assert overlap(silhouettes.masks, staged.truth).median() > 0.9
+
+
+def test_what_stands_before_the_dark_beyond_a_table_is_found(staged):
+    """The table ends below the middle of the ball, and there is nothing behind it."""
+    images = staged.scene.views.images.clone()
+    images[:, :, :70] *= staged.truth[:, None, :70]
+    scene = staged.scene.replace(views=staged.scene.views.replace(images=images))
+    silhouettes = FindSilhouettes(*SMALL)(without_points_of_the_ball(scene))
     assert overlap(silhouettes.masks, staged.truth).median() > 0.9
 
 

@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from pimper_torch.silhouettes.opencv import BACKGROUND, OBJECT, PERHAPS_BACKGROUND, PERHAPS_OBJECT
+from pimper_torch.silhouettes.opencv import (
+    BACKGROUND,
+    OBJECT,
+    PERHAPS_BACKGROUND,
+    PERHAPS_OBJECT,
+    signed_distance,
+)
 from pimper_torch.silhouettes.seeds import (
     exposed_fraction,
     filled,
@@ -122,3 +128,12 @@ def test_a_cut_holds_the_points_in_it_and_a_few_points_tell_nothing():
     points = torch.stack([torch.arange(0.5, 30, 1.0), torch.full((30,), 7.5)], dim=1)
     assert float(held_fraction(cut, points)) == pytest.approx(1 / 3)
     assert float(held_fraction(cut, points[20:])) == 1  # ten
+
+
+def test_the_middle_of_a_thin_part_is_the_objects_and_a_shadows_edge_is_not(thing):
+    leg, streak = square(120, 180, 130, 220), square(160, 180, 163, 220)
+    shape = thing | leg | streak
+    labels = labels_from_hull(signed_distance(shape), thing, NOTHING, agreeing(shape))
+    assert (labels[190:210, 124:126] == OBJECT).all()
+    assert not (labels[185:, :122] == OBJECT).any()
+    assert not (labels[185:, 128:] == OBJECT).any()
