@@ -12,6 +12,10 @@ lower it. ``of floor`` is the time over what cannot be avoided, measured in the 
 - ``fuse``: one multigrid cycle on each round's finest system.
 - ``reconstruct``, with ``--colmap``: structure from motion with COLMAP's own settings.
 
+``import`` is what the process took before, ``aside`` what the chain did in no stage: hashes,
+records kept for a next run, and the rest. The share of the wall clock that no line has is printed
+below.
+
 ``-o FILE`` keeps the figures as JSON; ``--against FILE`` prints ratios to those of an earlier run.
 ``--scaling`` runs photographs at half, at 0.71 and at their full size, each in a process of its
 own, and prints the exponents of time and memory in the samples.
@@ -20,6 +24,7 @@ own, and prints the exponents of time and memory in the samples.
 import argparse
 import json
 import math
+import os
 import resource
 import statistics
 import subprocess
@@ -44,7 +49,10 @@ from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.write import render_scene
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import write_result
+from pimper_torch.outputs.folders import held_output
+from pimper_torch.outputs.marker import STAGES
 from pimper_torch.records import StageReport, Views
+from pimper_torch.reporting import ASIDE
 
 SCENES = ("mug", "jar", "balls", "potatoes", "pair")
 SIZES = (0.5, math.sqrt(0.5), 1.0)  # of photographs: 1, 2 and 4 times the samples
@@ -197,12 +205,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--colmap", action="store_true", help="COLMAP's own settings, too")
     parser.add_argument("--renderings", type=Path, default=Path("renderings"))
     options, others = parser.parse_known_args(arguments)
+    imports = replace(clocks("import"), seconds=since_start())
     target = photographs(options.target, options.renderings)
     if options.scaling:
         print_scaling(scaled_runs(target, others))
         return
     with tempfile.TemporaryDirectory() as folder:
-        found = measured(job_of(target, others, Path(folder) / "result"), options.colmap)
+        job = job_of(target, others, Path(folder) / "result")
+        found = measured(job, imports, options.colmap)
     print_table(found, options.scales)
     if options.against:
         print_ratios(found, json.loads(options.against.read_text(encoding="utf-8")))
@@ -227,24 +237,41 @@ def job_of(target: str, others: Sequence[str], out: Path) -> Job:
     return parse("reconstruct", [target, "-o", str(out), *others])
 
 
-def measured(job: Job, colmap: bool) -> dict[str, Any]:
+def since_start() -> float:
+    """Return the seconds since this process started; NaN where the system does not tell."""
+    try:
+        fields = Path("/proc/self/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    except OSError:
+        return math.nan
+    started = int(fields[19]) / os.sysconf("SC_CLK_TCK")
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - started
+
+
+def measured(job: Job, imports: Cost, colmap: bool) -> dict[str, Any]:
     """Run once and give all figures."""
-    meter = Meter()
+    meter, began = Meter(costs=[imports], figures=[{}]), clocks("all")
     watch_cycles(meter)
-    meter.started("read")
-    views = load_views(
-        job.photos,
-        masks=job.inputs.masks,
-        mask_object=job.inputs.mask_object,
-        encoding=job.config.photographs,
-        max_size_px=job.common.max_size_px,
-    ).to(job.common.device)
-    meter.ended("read")
-    result = make_chain(job.config, meter, job.common.cache)(views, job.inputs.sparse)
-    meter.started("write")
-    write_result(result, job.config, job.out, about={})
-    meter.ended("write")
-    written = sum(path.stat().st_size for path in job.out.rglob("*") if path.is_file())
+    with held_output(job.out, "result"):
+        meter.started("read")
+        views = load_views(
+            job.photos,
+            masks=job.inputs.masks,
+            mask_object=job.inputs.mask_object,
+            encoding=job.config.photographs,
+            max_size_px=job.common.max_size_px,
+        ).to(job.common.device)
+        meter.ended("read")
+        chain = make_chain(job.config, meter, job.common.cache or job.out / STAGES)
+        before, entered = len(meter.costs), clocks("aside")
+        result = chain(views, job.inputs.sparse)
+        meter.costs.append(clocks("aside") - entered - added("stages", meter.costs[before:]))
+        meter.figures.append({})
+        meter.started("write")
+        write_result(result, job.config, job.out, about={})
+        meter.ended("write")
+        clock_seconds = imports.seconds + (clocks("all") - began).seconds
+    files = (path for path in job.out.rglob("*") if path.is_file() and STAGES not in path.parts)
+    written = sum(path.stat().st_size for path in files)
     floors = {
         "copy_gb_per_s": copy_bytes_per_s() / 1e9,
         "batched_product_gflop_per_s": product_flops_per_s() / 1e9,
@@ -266,6 +293,8 @@ def measured(job: Job, colmap: bool) -> dict[str, Any]:
         "patches": [figures["patches"] for figures in meter.figures if "patches" in figures],
         "vertices": len(result.mesh.vertices_world),
         "written_mb": written / 1e6,
+        "clock_seconds": clock_seconds,
+        "aside": {one.name: one.seconds for one in result.report if one.name in ASIDE},
         "costs": [asdict(cost) for cost in with_floors(meter.costs, floors, entries)],
     }
 
@@ -397,7 +426,14 @@ def print_table(found: Mapping[str, Any], scales: bool) -> None:
         f"{found['machine']['cpu']}, {cores} cores; copies {floors['copy_gb_per_s']:.1f} GB/s, "
         f"batched products {floors['batched_product_gflop_per_s']:.1f} GFLOP/s.\n"
     )
-    table(("stage", *COLUMNS), [[row.stage, *row.cells(cores)] for row in rows_of(found, scales)])
+    rows = rows_of(found, scales)
+    table(("stage", *COLUMNS), [[row.stage, *row.cells(cores)] for row in rows])
+    left = found["clock_seconds"] - rows[-1].seconds
+    aside = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found["aside"].items())
+    say(
+        f"\nAside: {aside}. {left:.1f} s of {found['clock_seconds']:.1f} s are in no line: "
+        f"{left / found['clock_seconds']:.1%}."
+    )
 
 
 def print_ratios(found: Mapping[str, Any], earlier: Mapping[str, Any]) -> None:

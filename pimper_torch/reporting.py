@@ -2,10 +2,10 @@
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import singledispatch
 from typing import Protocol, runtime_checkable
 
@@ -56,23 +56,61 @@ class Silent:
         """Do nothing."""
 
 
+# Lines of a run's table for what no stage does: hashes of what stages are called with, records
+# written and read, and the rest.
+ASIDE = HASH, KEEP, BETWEEN = "hash", "keep", "between stages"
+
+
 @dataclass(frozen=True, slots=True)
 class _Recording:
-    """The reports of a call, and who hears of them."""
+    """The reports of a call, and who hears of them.
 
-    reports: list[StageReport]
+    Attributes:
+        observer: Hears of stages.
+        began: When the call did.
+        reports: Of the stages that ended.
+        open: When the stages began that are under way.
+        aside: Seconds by line of what no stage does.
+    """
+
     observer: Observer
+    began: float
+    reports: list[StageReport] = field(default_factory=list)
+    open: dict[str, float] = field(default_factory=dict)
+    aside: dict[str, float] = field(default_factory=dict)
 
     def finish(self, name: str, began: float, told: dict[str, int | float]) -> None:
         """Report that a stage ended."""
-        report = StageReport(
-            name=name,
-            seconds=time.perf_counter() - began,
-            peak_memory_mb=peak_memory_mb(),
-            figures=told,
-        )
+        report = reported(name, time.perf_counter() - began, told)
         self.reports.append(report)
         self.observer.finished(report)
+
+    def lines(self) -> list[StageReport]:
+        """Return the reports, and lines of what no stage did: they make up the call's seconds."""
+        lines = [*self.reports, *(reported(name, took) for name, took in self.aside.items())]
+        rest = time.perf_counter() - self.began - seconds_of(lines)
+        return [*lines, reported(BETWEEN, rest)]
+
+
+def reported(
+    name: str, seconds: float, figures: dict[str, int | float] | None = None
+) -> StageReport:
+    """Return the report of what has just ended."""
+    return StageReport(
+        name=name, seconds=seconds, peak_memory_mb=peak_memory_mb(), figures=figures or {}
+    )
+
+
+def seconds_of(reports: Iterable[StageReport]) -> float:
+    """Add up what stages took in this run; those of kept records took their time in another."""
+    return sum(report.seconds for report in reports if not report.kept)
+
+
+def gathered(reports: Sequence[StageReport]) -> tuple[StageReport, ...]:
+    """Put the lines of what no stage did at the end, each once."""
+    parts = {name: [one for one in reports if one.name == name] for name in ASIDE}
+    lines = [some[-1].replace(seconds=seconds_of(some)) for some in parts.values() if some]
+    return (*(one for one in reports if one.name not in ASIDE), *lines)
 
 
 # Of the call that this thread is in. Hooks belong to a module, which threads share.
@@ -83,34 +121,44 @@ _recording: ContextVar[_Recording | None] = ContextVar("recording", default=None
 def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]]:
     """Time the direct submodules of ``chain`` while the ``with`` block calls them.
 
-    Threads that share ``chain`` have reports of their own.
+    Threads that share ``chain`` have reports of their own. A block inside another one that is in no
+    stage is part of it.
 
     Yields:
-        The list that a report is appended to whenever a submodule has run.
+        The list that a report is appended to whenever a submodule has run, and at the end one of
+        each line of what no submodule did.
     """
-    recording = _Recording([], observer)
-    began: dict[str, float] = {}
+    recording, outer = _Recording(observer, time.perf_counter()), _recording.get()
     hooks = []
     for name, module in chain.named_children():
 
         def before(_: nn.Module, __: tuple[object, ...], name: str = name) -> None:
             if _recording.get() is recording:
-                began[name] = time.perf_counter()
+                recording.open[name] = time.perf_counter()
                 observer.started(name)
 
         def after(_: nn.Module, __: tuple[object, ...], output: object, name: str = name) -> None:
             if _recording.get() is recording:
-                recording.finish(name, began[name], figures(output))
+                recording.finish(name, recording.open.pop(name), figures(output))
 
         hooks += [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
     token = _recording.set(recording)
     try:
         with listening(observer.progressed):
             yield recording.reports
+        recording.reports[:] = recording.lines()
+        if outer is not None and not outer.open:
+            outer.reports.extend(recording.reports)
     finally:
         _recording.reset(token)
         for hook in hooks:
             hook.remove()
+
+
+def accounted() -> tuple[StageReport, ...]:
+    """Return all lines of the call so far, which make up its seconds."""
+    recording = _recording.get()
+    return () if recording is None else gathered(recording.lines())
 
 
 @contextmanager
@@ -133,6 +181,16 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
     finally:
         _recording.reset(token)
     recording.finish(name, began, told)
+
+
+@contextmanager
+def aside(line: str) -> Iterator[None]:
+    """Count what the ``with`` block takes to a line of its own, unless a stage is under way."""
+    recording, began = _recording.get(), time.perf_counter()
+    yield
+    if recording is not None and not recording.open:
+        took = time.perf_counter() - began
+        recording.aside[line] = recording.aside.get(line, 0.0) + took
 
 
 @contextmanager

@@ -7,9 +7,20 @@ import pytest
 import torch
 from torch import nn
 
+from pimper_torch import reporting
 from pimper_torch.progress import report
-from pimper_torch.records import Mesh
-from pimper_torch.reporting import Silent, figures, recorded
+from pimper_torch.records import Mesh, StageReport
+from pimper_torch.reporting import (
+    Silent,
+    accounted,
+    aside,
+    figures,
+    gathered,
+    recorded,
+    repeat,
+    seconds_of,
+    stage,
+)
 
 
 class Tetrahedron(nn.Module):
@@ -51,7 +62,7 @@ def test_stages_are_reported_in_the_order_they_run_with_their_figures():
     with recorded(chain, listener) as reports:
         chain.second()
         chain.first()
-    assert [entry.name for entry in reports] == ["second", "first"]
+    assert [entry.name for entry in reports] == ["second", "first", "between stages"]
     assert reports[0].figures == {"vertices": 4, "faces": 4, "openings": 0}
     assert all(entry.seconds >= 0 and entry.peak_memory_mb > 10 for entry in reports)
     assert listener.heard[:3] == ["started second", "1/1", "finished second"]
@@ -67,7 +78,7 @@ def test_threads_that_share_a_chain_have_reports_of_their_own():
             inside.wait()  # both have their hooks on the chain
             getattr(chain, stage)()
             inside.wait()
-        told[stage] = [entry.name for entry in reports]
+            told[stage] = [entry.name for entry in reports]
 
     threads = [threading.Thread(target=call, args=(stage,)) for stage in listeners]
     for thread in threads:
@@ -75,8 +86,8 @@ def test_threads_that_share_a_chain_have_reports_of_their_own():
     for thread in threads:
         thread.join()
     assert told == {"first": ["first"], "second": ["second"]}
-    for stage, listener in listeners.items():
-        assert listener.heard == [f"started {stage}", "1/1", f"finished {stage}"]
+    for name, listener in listeners.items():
+        assert listener.heard == [f"started {name}", "1/1", f"finished {name}"]
 
 
 def test_no_hook_stays_behind_even_after_a_failure():
@@ -85,6 +96,39 @@ def test_no_hook_stays_behind_even_after_a_failure():
         chain.broken()
     chain.first()
     assert listener.heard == ["started broken"]
+
+
+class Clock:
+    now = 100.0
+
+    def perf_counter(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+def test_every_second_of_a_call_belongs_to_one_line(monkeypatch):
+    chain, clock = Chain(), Clock()
+    monkeypatch.setattr(reporting, "time", clock)
+    kept = StageReport(name="kept", seconds=1e6, peak_memory_mb=0.0, figures={})
+    with recorded(nn.Module(), Silent()) as reports:
+        with stage("read"), aside("keep"):  # a stage's own, whatever it does
+            clock.sleep(1)
+        for _ in range(2):
+            with recorded(chain, Silent()):
+                with aside("keep"):
+                    clock.sleep(2)
+                chain.first()
+                repeat([kept])
+                clock.sleep(4)
+        so_far = accounted()
+        clock.sleep(8)
+    lines = [(line.name, 0 if line.kept else line.seconds) for line in gathered(reports)]
+    again = [("first", 0), ("kept", 0)] * 2
+    assert lines == [("read", 1), *again, ("keep", 4), ("between stages", 16)]
+    assert seconds_of(reports) == clock.now - 100
+    assert seconds_of(so_far) == clock.now - 108
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux what is resident")

@@ -1,6 +1,7 @@
 """What SECURITY.md says of the package's own code."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pimper_torch
@@ -8,26 +9,30 @@ import pimper_torch
 PACKAGE = Path(pimper_torch.__file__).parent
 UNPICKLE = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal"}
 NETWORK = {"socket", "urllib", "http", "ftplib", "requests", "httpx", "aiohttp", "ssl"}
-TREES = {
-    path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
-    for path in PACKAGE.rglob("*.py")
-}
+
+
+@cache
+def _found():
+    """List imports and calls of all files: once, and only where a test asks for them."""
+    imports, calls = [], []
+    for path in PACKAGE.rglob("*.py"):
+        name = path.relative_to(PACKAGE).as_posix()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imports += [(name, alias.name.partition(".")[0]) for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                imports.append((name, node.module.partition(".")[0]))
+            elif isinstance(node, ast.Call):
+                calls.append((name, ast.unparse(node.func), node))
+    return imports, calls
 
 
 def imports():
-    for path, tree in TREES.items():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Import):
-                yield from ((path, alias.name.partition(".")[0]) for alias in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                yield path, node.module.partition(".")[0]
+    return _found()[0]
 
 
 def calls():
-    for path, tree in TREES.items():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Call):
-                yield path, ast.unparse(node.func), node
+    return _found()[1]
 
 
 def test_nothing_is_unpickled():

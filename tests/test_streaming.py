@@ -118,11 +118,16 @@ def in_iterations(listener, **changes):
 
 def test_steps_show_the_records_of_every_pass_and_end_where_the_run_ends():
     chain, scene = in_iterations(Silent())
+    shown = []
+    chain.preview = lambda _, coarse: shown.append(coarse)
     steps = list(chain.steps(scene.views))
+    assert shown == [chain.coarse_surface.record]
     result = chain(scene.views)
     assert [(step.scale, step.last) for step in steps] == [(0.5, False), (1.0, True)]
     names = [report.name for step in steps for report in step.reports]
-    assert [report.name for report in result.report] == [*names, "extract"]
+    assert names.count("between stages") == len(steps)
+    stages = [name for name in names if name != "between stages"]
+    assert [report.name for report in result.report] == [*stages, "extract", "between stages"]
     assert torch.equal(chain.extract(steps[-1].surface).vertices_world, result.mesh.vertices_world)
     # The second pass stands on facets that were remeshed on the first one's surface.
     assert steps[0].coarse is chain.coarse_surface.record

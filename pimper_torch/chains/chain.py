@@ -35,7 +35,7 @@ from pimper_torch.records import (
     SweptPatches,
     Views,
 )
-from pimper_torch.reporting import Observer, Silent, recorded, stage
+from pimper_torch.reporting import Observer, Silent, gathered, recorded, stage
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.sound_views import sound
 from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
@@ -96,6 +96,9 @@ class Chain(Stage):
     Gradients run from photographs, cameras and coarse mesh through every stage after it. Structure
     from motion, how the coarse mesh is found, and what is chosen (views, samples, faces, splits)
     are constants to autograd.
+
+    A function that is assigned to ``preview`` is called with the scene and the coarse surface as
+    soon as they are there.
     """
 
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
@@ -114,6 +117,7 @@ class Chain(Stage):
         self.on_failure: OnFailure = on_failure
         self.kernels: Kernels = kernels
         self.observer = observer or Silent()
+        self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
         self.store = store
 
     @abstractmethod
@@ -171,6 +175,12 @@ class Chain(Stage):
         if mesh is not None or scene.cameras.num_views < 3 or not lacks_points(scene, FEW_OBSERVED):
             return scene
         return self.kept(depth_points, scene)
+
+    def show(self, scene: SparseScene, coarse: CoarseMesh) -> None:
+        """Call ``preview`` with cameras and coarse surface, if it is set."""
+        if self.preview is not None:
+            with stage("preview"):
+                self.preview(scene, coarse)
 
     def given_mesh(
         self,
@@ -277,7 +287,7 @@ class Chain(Stage):
             silhouettes=step.silhouettes,
             coarse=step.coarse,
             patches=step.heights,
-            report=(*reports, *last),
+            report=gathered([*reports, *last]),
             failures=(*step.failures, *distinct(entries)),
             left_out=(*step.left_out, *left_out_of(entries)),
         )

@@ -129,6 +129,7 @@ class CoarseToFine(Chain):
         cameras = scene.cameras
         contours = self.contours(silhouettes, cameras)
         coarse = self.kept(self.coarse_surface, scene, contours, mesh)
+        self.show(scene, coarse)
         sources = Prepared(self.warp, scene.views)
         heights: SweptPatches | None = None
         surface: Surface | None = None

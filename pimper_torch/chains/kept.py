@@ -12,7 +12,7 @@ from pimper_torch.errors import OutputError, caution, overheard
 from pimper_torch.failures import distinct, skipped
 from pimper_torch.ledger import kept_entries, noted_entries, repeat_entries
 from pimper_torch.records import Failure, Record, StageReport
-from pimper_torch.reporting import noted, repeat
+from pimper_torch.reporting import HASH, KEEP, aside, noted, repeat
 from pimper_torch.store import Store, digest, settled
 from pimper_torch.store.code import code_of
 
@@ -43,10 +43,14 @@ def kept_call(
         settings: What else the record depends on.
     """
     cls = _returns(call)
-    key = None if store is None or cls is None else _key(call, inputs, settings)
-    if store is None or key is None or cls is None:
+    if store is None or cls is None:
         return call(*inputs, **derived)
-    found = store.find(f"{name}-{key}", cls)
+    with aside(HASH):
+        key = _key(call, inputs, settings)
+    if key is None:
+        return call(*inputs, **derived)
+    with aside(KEEP):
+        found = store.find(f"{name}-{key}", cls)
     if found is not None:
         skipped(*(Failure(**failure) for failure in found.about["failures"]))
         repeat_entries(found.about["left_out"])
@@ -66,7 +70,8 @@ def kept_call(
         "left_out": kept_entries(entries),
     }
     try:
-        store.keep(f"{name}-{key}", result, about)
+        with aside(KEEP):
+            store.keep(f"{name}-{key}", result, about)
     except OutputError as error:
         caution(str(error))
     return typing.cast(R, result)

@@ -114,6 +114,7 @@ class Published(Chain):
         else:
             contours = Contours.none(silhouettes, scene.cameras)
             coarse = self.kept(self.coarse_surface, scene, contours, mesh)
+        self.show(scene, coarse)
         patches = self.decompose(coarse, scene.cameras, None, 1.0)
         photometric = self.kept(
             photometry, self.warp, self.factorize, scene.views, scene.cameras, patches

@@ -10,31 +10,32 @@ from rich.progress import (
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 
+from pimper_torch.doctor.cost import minutes
+from pimper_torch.doctor.forecast import Forecast
 from pimper_torch.records import StageReport
 
 
 class Bars:
-    """An observer with a bar and the time left for every stage.
+    """An observer with a bar for every stage, and beside it the time left for the run.
 
     Where the output is no terminal, it writes a line when a stage ends instead.
 
     Args:
         console: Where to.
+        forecast: Tells the time left.
         figures: How many of a stage's figures are shown at its end; ``None`` is all.
     """
 
-    def __init__(self, console: Console, figures: int | None = 3) -> None:
-        self.console = console
+    def __init__(self, console: Console, forecast: Forecast, figures: int | None = 3) -> None:
+        self.console, self._forecast = console, forecast
         self._most = figures
         self._progress = Progress(
             TextColumn("{task.description:<12}"),
             BarColumn(),
             TaskProgressColumn(),
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
             TextColumn("[dim]{task.fields[found]}"),
             console=console,
             disable=not console.is_terminal,
@@ -55,22 +56,31 @@ class Bars:
 
     def started(self, stage: str) -> None:
         """Begin a bar; it moves to and fro until the stage tells how far it has come."""
-        self._task = self._progress.add_task(stage, total=None, found="")
+        self._forecast.started(stage)
+        self._task = self._progress.add_task(stage, total=None, found=self._left())
 
     def progressed(self, done: int, total: int) -> None:
         """Fill the bar."""
         if self._task is not None:
-            self._progress.update(self._task, completed=done, total=total)
+            self._forecast.progressed(done, total)
+            self._progress.update(self._task, completed=done, total=total, found=self._left())
 
     def finished(self, report: StageReport) -> None:
         """Complete the bar, and say what was found."""
+        self._forecast.finished(report)
         found = ", ".join(_figures(report)[: self._most])
         if self._task is not None:
             self._progress.update(self._task, completed=1, total=1, found=found)
         if not self.console.is_terminal:
             took = "     kept" if report.kept else f"{report.seconds:7.1f} s"
-            self.console.print(f"{report.name:<12} {took}  {found}", highlight=False)
+            left = f"  [{self._left()}]" if self._left() else ""
+            line = f"{report.name:<12} {took}  {found}{left}"
+            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
         self._task = None
+
+    def _left(self) -> str:
+        seconds = self._forecast.seconds_left()
+        return "" if seconds is None else f"about {minutes(seconds)} left"
 
 
 def _figures(report: StageReport) -> list[str]:

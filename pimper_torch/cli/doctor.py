@@ -9,13 +9,14 @@ from typing import Annotated
 import tyro
 
 from pimper_torch.cli.arguments import read_arguments
-from pimper_torch.cli.output import Output, stage
+from pimper_torch.cli.output import Output
 from pimper_torch.doctor.examine import examine_folder
 from pimper_torch.doctor.findings import Finding
 from pimper_torch.doctor.machine import machine
 from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import list_images
 from pimper_torch.radiometry import FROM_FILES, Encoding
+from pimper_torch.reporting import stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +48,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     findings = list(machine())
     _tell(output, findings)
     if job.photos is not None:
-        with output.observer() as observer, stage(observer, "examine"):
+        with output.observer(), stage("examine"):
             found = examine_folder(job.photos, job.photographs, job.max_size_px)
         _tell(output, found)
         findings += found

@@ -9,11 +9,12 @@ import tyro
 from PIL import Image
 
 from pimper_torch.cli.arguments import Flag, read_arguments
-from pimper_torch.cli.output import Output, stage
+from pimper_torch.cli.output import Output
 from pimper_torch.config import require
 from pimper_torch.errors import caution, some
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.progress import report
+from pimper_torch.reporting import stage
 from pimper_torch.video.choose import blurred, chosen, scanned
 from pimper_torch.video.read import frame_pictures, luma_frames
 
@@ -45,13 +46,13 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         PimperError: No video, nothing moves in it, or a folder that holds something else.
     """
     job = checked(command, arguments)
-    with output.observer() as observer:
-        with stage(observer, "scan") as figure:
+    with output.observer():
+        with stage("scan") as told:
             scan = scanned(luma_frames(job.video))
-            figure("frames", len(scan.way))
+            told["frames"] = len(scan.way)
         frames = chosen(scan, job.count)
         with (
-            stage(observer, "write") as figure,
+            stage("write") as told,
             written_whole(job.out, "frames", overwrite=job.overwrite) as folder,
         ):
             for done, (number, picture) in enumerate(
@@ -59,7 +60,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             ):
                 Image.fromarray(picture).save(folder / f"{number:06d}.png")
                 report(done, len(frames))
-            figure("photographs", len(frames))
+            told["photographs"] = len(frames)
     if len(frames) < job.count:
         caution(
             f"{job.video}: has {len(frames)} frames that differ, of {job.count} that were asked "

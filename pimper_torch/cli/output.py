@@ -4,7 +4,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from pimper_torch.errors import ConfigError
 
 if TYPE_CHECKING:
+    from pimper_torch.doctor.forecast import Forecast
     from pimper_torch.reporting import Observer
 
 Level = Literal["error", "warning", "info", "debug"]
@@ -30,7 +31,9 @@ class Output:
     seconds, and what :meth:`event` is called with:
 
     - ``start``: ``command``, ``arguments``, ``versions``, ``format`` (1).
-    - ``stage-begin``: ``stage``. ``progress``: ``stage``, ``done``, ``total``.
+    - ``stage-begin``: ``stage``. ``progress``: ``stage``, ``done``, ``total``. Both and
+      ``stage-end``: ``seconds_left`` of a run, an estimate; ``null`` of other commands.
+    - ``preview``: ``path`` of a picture of the coarse surface, which is there until the run ends.
     - ``stage-end``: ``stage``, ``seconds``, ``peak_memory_mb``, ``figures``, and ``kept``,
       whether an earlier run found the record; time and memory are that run's then.
     - ``warning``: ``message``. ``finding``, of ``doctor``: ``check``, ``severity``, ``found``,
@@ -86,19 +89,33 @@ class Output:
         self.event("error", kind=kind, message=message, exit_code=exit_code)
         told("error", message)
 
-    def observer(self) -> AbstractContextManager["Observer"]:
-        """Give who hears of stages: a bar each, a line each, events, or nobody."""
+    @contextmanager
+    def observer(self, forecast: "Forecast | None" = None) -> Iterator["Observer"]:
+        """Let the stages of the ``with`` block be shown: a bar each, a line each, or events.
+
+        Args:
+            forecast: Tells the time left, if it can be told.
+
+        Yields:
+            Who hears of them.
+        """
         from rich.console import Console
+        from torch.nn import Module
 
         from pimper_torch.cli.bars import Bars
         from pimper_torch.cli.events import Events
-        from pimper_torch.reporting import Silent
+        from pimper_torch.doctor.forecast import Forecast
+        from pimper_torch.reporting import Silent, recorded
 
+        forecast = forecast or Forecast()
+        shown: AbstractContextManager[Observer] = nullcontext(Silent())
         if self.as_json:
-            return nullcontext(Events(self.event, _PROGRESS_SECONDS))
-        if not self.shows("info"):
-            return nullcontext(Silent())
-        return Bars(Console(stderr=True), figures=None if self.shows("debug") else 3)
+            shown = nullcontext(Events(self.event, _PROGRESS_SECONDS, forecast))
+        elif self.shows("info"):
+            figures = None if self.shows("debug") else 3
+            shown = Bars(Console(stderr=True), forecast, figures)
+        with shown as observer, recorded(Module(), observer):
+            yield observer
 
 
 def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:
@@ -149,29 +166,3 @@ def told(kind: str, message: str) -> None:
     color = "bold red" if kind == "error" else "bold yellow"
     text = Text.assemble((f"{kind}: ", color), " ".join(message.split()))
     Console(stderr=True, soft_wrap=True).print(text)
-
-
-@contextmanager
-def stage(observer: "Observer", name: str) -> Iterator[Callable[[str, float | int], None]]:
-    """Show a piece of work at the edge as if it were a stage of a chain.
-
-    Yields:
-        Called with the name and the value of each figure to be told.
-    """
-    from pimper_torch.progress import listening
-    from pimper_torch.records import StageReport
-    from pimper_torch.reporting import peak_memory_mb
-
-    figures: dict[str, int | float] = {}
-    began = time.perf_counter()
-    observer.started(name)
-    with listening(observer.progressed):
-        yield figures.__setitem__
-    observer.finished(
-        StageReport(
-            name=name,
-            seconds=time.perf_counter() - began,
-            peak_memory_mb=peak_memory_mb(),
-            figures=figures,
-        )
-    )

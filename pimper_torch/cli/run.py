@@ -1,17 +1,23 @@
 """One run, from photographs to a folder of results."""
 
 import json
+import time
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
 
 import torch
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, checked
-from pimper_torch.cli.output import Output, stage
+from pimper_torch.cli.output import Output
 from pimper_torch.cli.size import bars_in_files, sized, told_size
+from pimper_torch.doctor.cost import planned
 from pimper_torch.doctor.examine import examine_views
+from pimper_torch.doctor.forecast import Forecast
 from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
@@ -20,10 +26,13 @@ from pimper_torch.ledger import closing_line
 from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import held_output
 from pimper_torch.outputs.marker import STAGES
-from pimper_torch.records import Reconstruction, Views
+from pimper_torch.outputs.stages import PREVIEW
+from pimper_torch.records import CoarseMesh, Reconstruction, SparseScene, Views
+from pimper_torch.reporting import accounted, reported, stage
 from pimper_torch.size.scale import Scale
 from pimper_torch.store import Store
 from pimper_torch.viz.overview import headline
+from pimper_torch.viz.preview import draw_preview
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
@@ -35,25 +44,48 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     job = checked(command, arguments)
     common = job.common
     _check_device(common.device)
-    held = held_output(job.out, "result", overwrite=common.overwrite)
-    with held, output.observer() as observer:
-        with stage(observer, "read") as figure:
+    imports = reported("import", time.perf_counter() - output.began)
+    held, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
+    with held, output.observer(forecast) as observer:
+        with stage("read") as told:
             views = _read(job)
-            figure("photographs", views.num_views)
-        _examine(job, views)
-        bars = bars_in_files(job, views)
-        mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
-        result = make_chain(job.config, observer, _store(job))(
-            views.to(common.device), job.inputs.sparse, mesh
-        )
-        with stage(observer, "write") as figure:
+            told["photographs"] = views.num_views
+            _examine(job, views)
+            bars = bars_in_files(job, views)
+            mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
+        forecast.plan = _plan(job, views)
+        chain = make_chain(job.config, observer, _store(job))
+        chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW)
+        result = chain(views.to(common.device), job.inputs.sparse, mesh)
+        result = result.replace(report=(imports, *accounted()))
+        with stage("write") as told:
             result, scale = sized(job, bars, result)
             if scale is not None:
-                figure("scale", scale.factor)
+                told["scale"] = scale.factor
             _write(job, result, scale)
+        result = result.replace(report=(imports, *accounted()))
     if scale is not None:
         output.remark(told_size(scale))
     _conclude(output, job, result)
+
+
+def _plan(job: Job, views: Views) -> list[tuple[str, float]]:
+    """List the stages to come with their seconds; of the published chain they are not known."""
+    config, inputs = job.config, job.inputs
+    if not isinstance(config, CoarseToFineConfig):
+        return []
+    megapixels = float(views.sizes_px.prod(dim=1).sum()) / 1e6
+    masks = config.silhouettes.object == "everything" or inputs.masks is not None
+    cameras = inputs.sparse is not None
+    return planned(megapixels, views.num_views, config.scales, cameras=cameras, masks=masks)
+
+
+def _preview(output: Output, path: Path, scene: SparseScene, coarse: CoarseMesh) -> None:
+    """Draw the coarse surface and say where; a disk that refuses ends no run."""
+    with suppress(OSError):
+        draw_preview(scene, coarse, path)
+        output.event("preview", path=path)
+        output.remark(f"{path} shows the coarse surface, until the run ends.")
 
 
 def _store(job: Job) -> Store:

@@ -8,21 +8,58 @@ from pimper_torch.doctor.photograph import Photograph
 # Lines through the runs of benchmarks/README.md, "Speed", with `default` on 2 cores: the demo (24
 # photographs of 900x600, 13.0 megapixels in all) 112 s and 2.06 GB, the jar (30 of 1600x1200, 57.6
 # megapixels) 364 s and 6.7 GB. The jar at 800 pixels (14.4 megapixels) took 2.29 GB; the line says
-# 2.2.
-_SECONDS, _SECONDS_A_MEGAPIXEL = 40.0, 5.6
+# 2.2. Stages share them as in runs of the jar, the mug and the demo, from 0.3 to 57.6 megapixels.
 _GB, _GB_A_MEGAPIXEL = 0.7, 0.104
 
 
-def estimate(megapixels: float) -> tuple[float, float]:
+def estimate(megapixels: float, num_views: int) -> tuple[float, float]:
     """Estimate seconds on 2 cores and GB of memory that ``default`` takes.
 
-    >>> estimate(57.6)
-    (362.56, 6.6904)
+    >>> seconds, gigabytes = estimate(57.6, 30)
+    >>> round(seconds), round(gigabytes, 2)
+    (355, 6.69)
     """
-    return (
-        _SECONDS + _SECONDS_A_MEGAPIXEL * megapixels,
-        round(_GB + _GB_A_MEGAPIXEL * megapixels, 4),
-    )
+    seconds = sum(seconds for _, seconds in planned(megapixels, num_views))
+    return seconds, _GB + _GB_A_MEGAPIXEL * megapixels
+
+
+def planned(
+    megapixels: float,
+    num_views: int,
+    scales: Sequence[float] = (0.25, 0.5, 1.0),
+    *,
+    cameras: bool = False,
+    masks: bool = False,
+) -> list[tuple[str, float]]:
+    """List the stages of the chain from coarse to fine with their estimated seconds on 2 cores.
+
+    Compilation, next to nothing but for an installation's first run, is none of them. Stages that
+    look at photographs grow with all pixels, those on the surface with the pixels of one, in the
+    scale's square.
+
+    Args:
+        megapixels: Of all photographs.
+        num_views: Of photographs.
+        scales: Of the passes.
+        cameras: Whether they are given.
+        masks: Whether they are given.
+    """
+    pairs, one = num_views * (num_views - 1) / 2, megapixels / max(1, num_views)
+    found = 1.2 * megapixels + 0.05 * pairs
+    stages = [
+        ("reconstruct", 0.5 if cameras else found),
+        ("silhouettes", 0.1 if masks else 4.0 + 0.35 * megapixels),
+        ("contours", 0.3 + 0.1 * megapixels),
+        ("coarse_surface", 3.8 + 0.25 * megapixels),
+    ]
+    for scale in scales:
+        stages += [
+            ("decompose", 0.1 + 3.0 * one * scale**2),
+            ("photometry", 1.5 + 1.6 * megapixels**0.75 * scale**2),
+            ("fuse", 0.7 + 42.0 * one * scale**2),
+            ("repair", 1.5 * one * scale**2),
+        ]
+    return [*stages, ("extract", 0.5 + 18.0 * one * scales[-1] ** 2), ("write", 3.0 + 5.0 * one)]
 
 
 def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Iterator[Finding]:
@@ -30,8 +67,8 @@ def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Itera
     if not photographs:
         return
     megapixels = sum(one.width * one.height for one in photographs) / 1e6
-    seconds, needed = estimate(megapixels)
-    told = f"about {_minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
+    seconds, needed = estimate(megapixels, len(photographs))
+    told = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
     if available_gb is None or needed <= available_gb:
         yield Finding(check="cost", severity="ok", found=told)
         return
@@ -49,5 +86,6 @@ def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Itera
     )
 
 
-def _minutes(seconds: float) -> str:
+def minutes(seconds: float) -> str:
+    """Write a time that is estimated."""
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} minutes"

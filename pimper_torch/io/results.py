@@ -1,6 +1,7 @@
 """Results to a folder."""
 
 import json
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
+from pimper_torch.reporting import reported
 from pimper_torch.sfm.scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.overview import draw_overview
@@ -99,16 +101,19 @@ def write_result(
     Raises:
         OutputError: The folder holds something else, or cannot be written.
     """
-    folder = Path(folder)
+    folder, began = Path(folder), time.perf_counter()
     with written_whole(folder, "result", overwrite=overwrite) as staging:
         whole = result.to("cpu")
         with part(0, _PARTS):
             ready = finished(whole.mesh, files or MeshFiles())
-        summary = {**summary_report(whole, about or {}), **ready.summary}
-        whole = whole.replace(mesh=ready.mesh)
+        found, whole = whole, whole.replace(mesh=ready.mesh)
         with part(1, _PARTS):
             _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
-        _write_all(whole, config, staging, summary)
+        _write_all(whole, config, staging)
+        writing = reported("write", time.perf_counter() - began)
+        found = found.replace(report=(*found.report, writing))
+        summary = {**summary_report(found, about or {}), **ready.summary}
+        _write_json(summary, staging / "summary.json", indent=2)
 
 
 def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Path) -> None:
@@ -123,9 +128,7 @@ def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Pat
         write_obj(mesh, folder / "mesh.obj", offset, measured)
 
 
-def _write_all(
-    result: Reconstruction, config: object, folder: Path, summary: Mapping[str, object]
-) -> None:
+def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
         _write_masks(result.silhouettes, result.scene, folder / "masks")
@@ -133,7 +136,6 @@ def _write_all(
         _write_maps(result, folder)
     _write_json(lights_report(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    _write_json(summary, folder / "summary.json", indent=2)
     with part(3, _PARTS):
         draw_overview(result, folder / "overview.png")
 

@@ -17,9 +17,12 @@ from pimper_torch.errors import OutputError, caution
 from pimper_torch.outputs.marker import MARKER, STAGES, mark, read_marker, write_text
 
 LOCK = "lock"
+PREVIEW = "preview.png"
+"""In the folder of kept stages, while a run is under way: its coarse surface."""
+
 _HOLDER = "holder.json"
 # The lock is the last that is removed. Files end in .new while they are written.
-_OWN = (_HOLDER, f"{_HOLDER}.new", f"{MARKER}.new", MARKER, LOCK)
+_OWN = (_HOLDER, f"{_HOLDER}.new", PREVIEW, f"{PREVIEW}.new", f"{MARKER}.new", MARKER, LOCK)
 _TRIES = 5
 _MAX_HOLDER = 100_000  # characters: command lines are shorter as a rule
 _UNLOCKED = "{}: its disk knows no locks; see that no other run writes there."
@@ -125,10 +128,11 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
 
 
 def _tidy(target: Path) -> None:
-    """Remove the folder of kept stages where nothing is kept, and else who held it."""
+    """Remove the folder of kept stages where nothing is kept, and else what told of the run."""
     stages = target / STAGES
     with suppress(OSError):
-        (stages / _HOLDER).unlink(missing_ok=True)
+        for name in (_HOLDER, PREVIEW):
+            (stages / name).unlink(missing_ok=True)
         if not kept(target):
             for name in _OWN:
                 (stages / name).unlink(missing_ok=True)

@@ -12,6 +12,7 @@ import math
 import secrets
 import types
 import typing
+from bisect import bisect
 from collections.abc import Mapping
 from contextlib import suppress
 from enum import Enum
@@ -132,6 +133,7 @@ class _Writer:
     def __init__(self) -> None:
         self.tensors: dict[str, Tensor] = {}
         self._names: dict[object, str] = {}
+        self._taken: list[tuple[int, float]] = []  # memory: where each tensor begins and ends
 
     def plain(self, value: object, where: str) -> object:
         if isinstance(value, Record):
@@ -178,14 +180,18 @@ class _Writer:
         return name
 
     def _separate(self, tensor: Tensor) -> Tensor:
-        """Give contiguous memory that no tensor before has a part of, as safetensors needs."""
+        """Return contiguous memory that no tensor before has a part of, as safetensors needs.
+
+        What was taken before is disjoint and sorted, so that only its two neighbours can overlap.
+        """
         tensor = tensor.contiguous()
         first, end = tensor.data_ptr(), tensor.data_ptr() + tensor.nbytes
-        if any(
-            first < other.data_ptr() + other.nbytes and other.data_ptr() < end
-            for other in self.tensors.values()
-        ):
+        place = bisect(self._taken, (first, math.inf))
+        around = self._taken[max(0, place - 1) : place + 1]
+        if any(first < other_end and other < end for other, other_end in around):
             return tensor.clone()
+        if tensor.nbytes:
+            self._taken.insert(place, (first, end))
         return tensor
 
 

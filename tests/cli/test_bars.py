@@ -3,11 +3,12 @@ import io
 from rich.console import Console
 
 from pimper_torch.cli.bars import Bars
+from pimper_torch.doctor.forecast import Forecast
 from pimper_torch.records import StageReport
 from pimper_torch.reporting import Observer
 
 
-def show(terminal):
+def show(terminal, plan=()):
     text = io.StringIO()
     console = Console(file=text, force_terminal=terminal, width=120)
     report = StageReport(
@@ -16,7 +17,9 @@ def show(terminal):
         peak_memory_mb=9.0,
         figures={"samples": 12345, "missing_fraction": 0.25},
     )
-    with Bars(console) as bars:
+    forecast = Forecast()
+    forecast.plan = plan
+    with Bars(console, forecast) as bars:
         assert isinstance(bars, Observer)
         bars.started("warp")
         bars.progressed(1, 4)
@@ -34,3 +37,9 @@ def test_a_terminal_sees_a_bar_that_ends_full():
 def test_a_log_file_sees_one_line_a_stage():
     shown = show(terminal=False)
     assert " ".join(shown.split()) == "warp 2.5 s samples 12,345, missing fraction 0.25"
+
+
+def test_the_time_left_for_the_run_is_told_in_the_line_of_the_stage():
+    plan = [("warp", 2.5), ("write", 600.0)]
+    assert show(False, plan).splitlines()[0].endswith("fraction 0.25  [about 10 minutes left]")
+    assert "about 10 minutes left" in show(True, plan)

@@ -456,6 +456,47 @@ def test_a_machine_reads_events_one_a_line(photos, chain, tmp_path, capsys, monk
     assert moments == sorted(moments)
 
 
+def test_the_coarse_surface_is_shown_beside_a_former_result_until_the_run_ends(
+    photos, chain, reconstruction, tmp_path, capsys, monkeypatch
+):
+    out = tmp_path / "out"
+    assert run("reconstruct", photos, "-o", out) == 0
+    former = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    capsys.readouterr()
+
+    def show(self):
+        self.preview(reconstruction.scene, reconstruction.coarse)
+        with Image.open(out / ".stages" / "preview.png") as picture:
+            assert picture.height == 360
+
+    def show_and_fail(self):
+        show(self)
+        assert {path: path.stat().st_mtime_ns for path in former} == former
+        raise ReconstructionError("no surface.")
+
+    monkeypatch.setattr(chain, "work", show_and_fail)
+    assert run("reconstruct", photos, "--json", "--overwrite", "-o", out) == 2
+    (told,) = [one for one in events(capsys) if one["event"] == "preview"]
+    assert told["path"] == str(out / ".stages" / "preview.png")
+    assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == former
+    monkeypatch.setattr(chain, "work", show)
+    assert run("reconstruct", photos, "--overwrite", "-o", out) == 0
+    assert f"{told['path']} shows the coarse surface" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == {path.name for path in former}
+
+
+def test_time_left_and_every_line_of_the_clock_are_told(photos, chain, tmp_path, capsys):
+    assert run("reconstruct", photos, "--json", "-o", tmp_path / "out") == 0
+    told = events(capsys)
+    begun = [one for one in told if one["event"] == "stage-begin"]
+    assert begun[0]["seconds_left"] is None  # photographs are not read yet
+    assert begun[-1]["stage"] == "write"
+    assert 0 < begun[-1]["seconds_left"] < 10
+    assert told[-2]["seconds_left"] == 0
+    lines = [stage["name"] for stage in told[-1]["figures"]["stages"]]
+    assert (lines[0], lines[-2:]) == ("import", ["between stages", "write"])
+
+
 @pytest.mark.parametrize(
     ("work", "kind", "code"),
     [("fail", "ReconstructionError", 2), ("interrupt", "Interrupted", 130)],

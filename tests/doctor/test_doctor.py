@@ -161,14 +161,14 @@ def test_photographs_that_nothing_connects_are_named():
 
 
 def test_the_cost_is_that_of_measured_runs_and_advice_fits_the_memory():
-    for megapixels, seconds, gigabytes in ((13.0, 112, 2.06), (57.6, 364, 6.7)):
-        assert estimate(megapixels) == pytest.approx((seconds, gigabytes), rel=0.05)
+    for megapixels, views, seconds, gigabytes in ((13.0, 24, 112, 2.06), (57.6, 30, 364, 6.7)):
+        assert estimate(megapixels, views) == pytest.approx((seconds, gigabytes), rel=0.05)
     large = [photograph(width=4000, height=3000)] * 30
     assert severities(cost(large, 100.0)) == severities(cost(large, None)) == ["ok"]
     (found,) = cost(large, 8.0)
     size = int(found.advice.split("--max-size-px ")[1].split("`")[0])
     pixels = 30 * size * (0.75 * size) / 1e6
-    assert estimate(pixels)[1] == pytest.approx(0.9 * 8, rel=0.1)
+    assert estimate(pixels, 30)[1] == pytest.approx(0.9 * 8, rel=0.1)
 
 
 def test_the_machine_is_told():

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.cli.arguments import Flag, read_arguments
-from pimper_torch.cli.output import Output, stage
+from pimper_torch.cli.output import Output
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import (
     read_colmap,
@@ -37,6 +37,7 @@ from pimper_torch.outputs.folders import prepare_output, require_apart, written_
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
 from pimper_torch.records import Cameras, Capture, Truth, Views
+from pimper_torch.reporting import stage
 
 Source = Literal[
     "colmap",
@@ -128,9 +129,9 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """
     job = checked(command, arguments)
     with written_whole(job.out, "data set", overwrite=job.overwrite) as staging:
-        with output.observer() as observer, stage(observer, "read") as figure:
+        with output.observer(), stage("read") as told:
             capture = read(job)
-            figure("photographs", capture.views.num_views)
+            told["photographs"] = capture.views.num_views
         write(capture, job.target, staging)
     output.remark(describe(capture, job))
     output.result({"folder": job.out}, photographs=capture.views.num_views)

@@ -8,9 +8,10 @@ from typing import Annotated
 import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
-from pimper_torch.cli.output import Output, stage
+from pimper_torch.cli.output import Output
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.reporting import stage
 
 _DEFAULT = SceneConfig()
 # Left to --help-all.
@@ -51,11 +52,11 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         PimperError: Before anything is written.
     """
     job = checked(command, arguments)
-    with output.observer() as observer, stage(observer, "render") as figure:
+    with output.observer(), stage("render") as told:
         render_scene(
             job.scene, job.out, job.config, processes=job.processes, overwrite=job.overwrite
         )
-        figure("photographs", job.config.num_views)
+        told["photographs"] = job.config.num_views
     option = "" if job.config.encoding == "srgb" else " --photographs.response linear"
     output.remark(
         f"{job.out}/photos are the photographs, {job.out}/truth is what they show. Next:\n"

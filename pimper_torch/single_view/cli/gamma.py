@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 import tyro
 
 from pimper_torch.cli.arguments import read_arguments
-from pimper_torch.cli.output import Output, stage
+from pimper_torch.cli.output import Output
 from pimper_torch.errors import InputError, caution, held
 from pimper_torch.io.file_cautions import CONTRADICTED
 from pimper_torch.io.photographs import list_images, load_views, read_mask
 from pimper_torch.radiometry import LINEAR
+from pimper_torch.reporting import stage
 from pimper_torch.single_view.factorization.gamma import GammaEstimate, gamma_of_photographs
 
 # A standard response whose residual is below this multiple of the best is recommended: a choice.
@@ -26,7 +27,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         PimperError: Photographs that cannot be read, or too few under too few lights.
     """
     job = checked(command, arguments)
-    with output.observer() as observer, stage(observer, "read"), held() as messages:
+    with output.observer(), stage("read"), held() as messages:
         views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
     for message in messages:
         if CONTRADICTED not in message:  # values are looked at as they are, whatever files say

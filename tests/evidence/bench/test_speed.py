@@ -119,18 +119,21 @@ def test_a_run_is_measured_kept_and_compared(speed, reconstruction, monkeypatch,
     speed.main(["demo", *options, "-o", str(figures)])
     kept = json.loads(figures.read_text(encoding="utf-8"))
     assert [cost["stage"] for cost in kept["costs"]] == [
-        *("read", "reconstruct", "decompose", "warp", "fuse", "write"),
+        *("import", "read", "reconstruct", "decompose", "warp", "fuse", "aside", "write"),
     ]
     assert kept["preset"] == "fast"
     assert kept["entries"] == [100 * reconstruction.scene.views.num_views]
-    assert kept["costs"][3]["floor_seconds"] == 13e-9 * kept["entries"][0]
+    assert kept["costs"][4]["floor_seconds"] == 13e-9 * kept["entries"][0]
     assert kept["written_mb"] > 0
     after = speed.rows_of(kept)[-2]
     assert after.seconds < speed.rows_of(kept)[-1].seconds
     assert after.seconds > kept["costs"][-1]["seconds"]
+    whole = speed.rows_of(kept)[-1].seconds
+    assert whole == pytest.approx(kept["clock_seconds"], abs=0.1 + 0.02 * whole)  # nothing hides
     printed = capsys.readouterr().out
     measured, compared = printed.split("Over the earlier run's")
     assert measured.count("| fuse |") == compared.count("| fuse |") == 1
+    assert "s are in no line: " in measured
     assert "| fuse | - |" not in compared
     assert "| write | - | - | - | - |" in compared  # the earlier run had none
 

@@ -1,0 +1,98 @@
+"""The time left for a run, on a clock that tests set."""
+
+import pytest
+
+from pimper_torch.doctor import forecast as module
+from pimper_torch.doctor.cost import planned
+from pimper_torch.doctor.forecast import Forecast
+from pimper_torch.records import StageReport
+
+PLAN = [("find", 10.0), ("pass", 2.0), ("end", 1.0), ("pass", 8.0), ("end", 4.0)]
+
+
+class Clock:
+    now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+@pytest.fixture
+def forecast():
+    forecast = Forecast()
+    forecast.plan = PLAN
+    return forecast
+
+
+def ran(forecast, clock, name, seconds, kept=False):
+    forecast.started(name)
+    clock.now += 0.0 if kept else seconds
+    report = StageReport(name=name, seconds=seconds, peak_memory_mb=0.0, figures={}, kept=kept)
+    forecast.finished(report)
+
+
+def test_a_machine_that_is_slower_by_a_factor_takes_the_plan_times_it(forecast, clock):
+    assert forecast.seconds_left() == 25.0
+    ran(forecast, clock, "find", 30.0)
+    # The plan weighs 1.25 s beside the 10 that ended.
+    assert forecast.seconds_left() == pytest.approx(15 * 31.25 / 11.25)
+    ran(forecast, clock, "pass", 6.0)
+    ran(forecast, clock, "end", 3.0)
+    assert forecast.seconds_left() == pytest.approx(12 * 3.0)
+
+
+def test_a_later_pass_is_scaled_by_the_one_before(forecast, clock):
+    for name, seconds in (("find", 10.0), ("pass", 10.0), ("end", 1.0)):
+        ran(forecast, clock, name, seconds)
+    assert forecast.seconds_left() == pytest.approx(5 * 8 + 4)
+
+
+def test_the_stage_under_way_counts_down(forecast, clock):
+    forecast.started("find")
+    clock.now = 4.0
+    assert forecast.seconds_left() == 21.0
+    forecast.progressed(1, 4)
+    assert forecast.seconds_left() == 0.75 * 10 + 15
+    forecast.progressed(4, 4)
+    assert forecast.seconds_left() == 15.0
+
+
+def test_a_stage_that_takes_longer_than_planned_scales_those_to_come(forecast, clock):
+    forecast.started("find")
+    forecast.progressed(1, 4)
+    clock.now = 40.0
+    assert forecast.seconds_left() == pytest.approx(0.75 * 40 + 15 * 41.25 / 11.25)
+
+
+def test_records_that_are_kept_and_stages_left_out_take_no_time(forecast, clock):
+    ran(forecast, clock, "find", 1000.0, kept=True)
+    assert forecast.seconds_left() == 15.0
+    ran(forecast, clock, "unknown", 3.0)
+    assert forecast.seconds_left() == 15.0
+    ran(forecast, clock, "end", 1.0)  # without the pass before it
+    assert forecast.seconds_left() == 12.0
+    ran(forecast, clock, "pass", 8.0)
+    ran(forecast, clock, "end", 4.0)
+    assert forecast.seconds_left() == 0.0
+
+
+def test_nothing_is_told_without_a_plan(clock):
+    forecast = Forecast()
+    ran(forecast, clock, "warp", 3.0)
+    assert forecast.seconds_left() is None
+
+
+def test_what_is_given_is_not_planned_for():
+    def seconds(**given):
+        return sum(seconds for _, seconds in planned(10.0, 20, **given))
+
+    assert seconds(cameras=True, masks=True) < min(seconds(cameras=True), seconds(masks=True))
+    assert max(seconds(cameras=True), seconds(masks=True)) < seconds()
+    assert seconds(scales=(0.4,)) < seconds()
