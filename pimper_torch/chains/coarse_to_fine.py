@@ -21,6 +21,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import caution, held
 from pimper_torch.failures import OnFailure
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.kernels.compile import COARSE, PHOTOMETRY, SWEEP
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.memory import bytes_of, release_memory, require_memory
 from pimper_torch.meshing.extract import Extract, ExtractConfig
@@ -128,7 +129,9 @@ class CoarseToFine(Chain):
         scene = masked(placed, silhouettes)
         cameras = scene.cameras
         contours = self.contours(silhouettes, cameras)
+        self.need(COARSE)
         coarse = self.kept(self.coarse_surface, scene, contours, mesh)
+        self.need((*PHOTOMETRY, *SWEEP))
         sources = Prepared(self.warp, scene.views)
         heights: SweptPatches | None = None
         surface: Surface | None = None
