@@ -69,7 +69,7 @@ SOLE_IMPORTERS = {
     "tifffile": {"io/tiff.py"},
     "cv2": {"silhouettes/opencv.py", "size/aruco.py", "video/quality.py"},
     "av": {"video/read.py"},
-    "numba": {"kernels/switch.py"},
+    "numba": {"kernels/compile.py"},
     "yaml": {"config.py"},
     "tyro": {"cli/", "evidence/cli/", "single_view/cli/"},
     "matplotlib": {"viz/"},

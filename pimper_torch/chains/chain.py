@@ -1,7 +1,7 @@
 """What both chains have in common: a run is a sequence of steps, and the last one's mesh."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -15,7 +15,8 @@ from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
-from pimper_torch.kernels.switch import Kernels, compile_all, using
+from pimper_torch.kernels.compile import compile_ahead, load
+from pimper_torch.kernels.switch import Kernels, using
 from pimper_torch.ledger import Entry, left_out_of
 from pimper_torch.records import (
     Cameras,
@@ -145,6 +146,12 @@ class Chain(Stage):
         name = names[0] if names else getattr(call, "__name__", type(call).__name__)
         return kept_call(self.store, name, call, inputs, derived, self.kernels)
 
+    def need(self, kernels: Sequence[str]) -> None:
+        """Wait for kernels, which takes time in an installation's first run alone."""
+        if self.kernels == "numba":
+            with stage("compile"):
+                load(kernels)
+
     def placed(
         self,
         views: Views | SparseScene,
@@ -226,7 +233,8 @@ class Chain(Stage):
         for named in self.references():
             view_named(named, names)  # not first after structure from motion
         passes = self.passes(views, sparse_model, mesh)
-        compiled = self.kernels == "torch"
+        if self.kernels == "numba":
+            compile_ahead()
         entries: list[Entry] = []
         while True:
             with (
@@ -234,10 +242,6 @@ class Chain(Stage):
                 collecting(self.on_failure, entries),
                 recorded(self, self.observer) as reports,
             ):
-                if not compiled:
-                    with stage("compile"):  # next to nothing but for an installation's first run
-                        compile_all()
-                    compiled = True
                 step = next(passes, None)
             if step is None:
                 return

@@ -21,6 +21,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import caution, held
 from pimper_torch.failures import OnFailure
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.kernels.compile import COARSE, PHOTOMETRY, SURFACE, SWEEP
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.memory import bytes_of, release_memory, require_memory
 from pimper_torch.meshing.extract import Extract, ExtractConfig
@@ -123,6 +124,7 @@ class CoarseToFine(Chain):
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
         placed = self.placed(views, sparse_model, mesh)
+        self.need(COARSE)
         silhouettes = self.kept(self.silhouettes, placed)
         mesh = self.given_mesh(mesh, views, placed, silhouettes)
         scene = masked(placed, silhouettes)
@@ -130,6 +132,7 @@ class CoarseToFine(Chain):
         contours = self.contours(silhouettes, cameras)
         coarse = self.kept(self.coarse_surface, scene, contours, mesh)
         self.show(scene, coarse)
+        self.need((*PHOTOMETRY, *SWEEP))
         sources = Prepared(self.warp, scene.views)
         heights: SweptPatches | None = None
         surface: Surface | None = None
@@ -155,6 +158,8 @@ class CoarseToFine(Chain):
                 if number == last:
                     sources.release()  # as much memory as the photographs themselves
                 release_memory()
+                if number == 1:
+                    self.need(SURFACE)
                 surface = self.repair(self.kept(self.fuse, heights, contours, number == last))
             if number == last:  # what earlier passes would warn of as well
                 for message in cautions:

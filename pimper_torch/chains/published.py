@@ -11,6 +11,7 @@ from pimper_torch.chains.chain import Chain, Step
 from pimper_torch.chains.streaming import Factorizing, Warping
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.failures import OnFailure
+from pimper_torch.kernels.compile import PHOTOMETRY
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.paper.alignment.align import Align, AlignConfig
@@ -116,6 +117,7 @@ class Published(Chain):
             coarse = self.kept(self.coarse_surface, scene, contours, mesh)
         self.show(scene, coarse)
         patches = self.decompose(coarse, scene.cameras, None, 1.0)
+        self.need(PHOTOMETRY)
         photometric = self.kept(
             photometry, self.warp, self.factorize, scene.views, scene.cameras, patches
         )

@@ -11,10 +11,12 @@ process was killed.
 import ctypes
 import difflib
 import errno
+import gc
 import io
 import os
 import sys
 import traceback
+import types
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -181,12 +183,22 @@ def _run(command: str, arguments: list[str], output: Output, supervised: bool) -
             output.event(
                 "start", command=command, arguments=arguments, versions=versions(), format=1
             )
-        run = light(home, "run") if command in _LIGHT else import_module(home).run
+        run = light(home, "run") if command in _LIGHT else _loaded(home).run
         with stoppable(repeat=not supervised):
             run(command, arguments, output)
     except (Exception, KeyboardInterrupt) as error:
         return _failed(output, error)
     return 0
+
+
+def _loaded(home: str) -> types.ModuleType:
+    """Import a module, and leave what it brings out of all searches for unused memory."""
+    gc.disable()
+    try:
+        return import_module(home)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def _failed(output: Output, error: BaseException) -> int:

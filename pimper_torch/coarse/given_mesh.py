@@ -2,7 +2,6 @@
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -101,6 +100,8 @@ def oriented_outward(
     like = cameras.cam_from_world
     found, _ = cleaned(mesh.to(like.device, like.dtype))
     vertices, faces = found.vertices_world, found.faces
+    import trimesh
+
     plain = trimesh.Trimesh(
         vertices.cpu().double().numpy(), faces.cpu().numpy(), process=False, validate=False
     )

@@ -6,7 +6,7 @@ Functions with ``first`` and ``last`` work on the rows from ``first`` up to ``la
 
 import numpy as np
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 Array = np.ndarray
 
@@ -346,7 +346,8 @@ def coarser(
         if filled + count > capacity:
             capacity = 2 * capacity + count
             wider, wider_values = np.empty(capacity, np.int32), np.empty(capacity)
-            wider[:filled], wider_values[:filled] = aggregates[:filled], values[:filled]
+            for index in range(filled):
+                wider[index], wider_values[index] = aggregates[index], values[index]
             aggregates, values = wider, wider_values
         for index in range(count):
             aggregate = touched[index]

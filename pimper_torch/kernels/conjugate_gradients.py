@@ -6,7 +6,7 @@ float32.
 
 import numpy as np
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 Array = np.ndarray
 

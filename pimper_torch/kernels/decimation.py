@@ -7,7 +7,7 @@ the nearest points of the surface.
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int32]

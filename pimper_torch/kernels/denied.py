@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 
 @compiled(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 Array = np.ndarray
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pimper_torch.kernels.cholesky import solve_damped
+from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.cone import TILE, update_shading, whitening
 from pimper_torch.kernels.robust_scale import robust_variance
-from pimper_torch.kernels.switch import compiled
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -137,7 +137,9 @@ def _packed(
             radiance_rows[f, k], weight[f, k] = source[samples[k]], weights_row[samples[k]]
             size += abs(radiance_rows[f, k])
             count += weight[f, k]
-        own_anchor[f], own_regularization[f] = anchor[views[f]], regularization[views[f]]
+        for i in range(4):
+            own_anchor[f, i] = anchor[views[f], i]
+        own_regularization[f] = regularization[views[f]]
         slack -= 4 * own_regularization[f]
     prior_rows = np.zeros((10, padded), np.float32)
     for i in range(10):
@@ -188,13 +190,16 @@ def _solve(
         for f in range(len(lights)):
             for i in range(4):
                 step[4 * f + i] = slope[f, i]
-        mean = (np.trace(curvature) + patch.slack) / (4 * patch.num_views)
+        trace = 0.0
+        for i in range(size):
+            trace += curvature[i, i]
+        mean = (trace + patch.slack) / (4 * patch.num_views)
         after = np.inf
         if solve_damped(curvature, damping * max(mean, 1e-300), step, factor):
             for f in range(len(lights)):
                 for i in range(4):
                     new_lights[f, i] = lights[f, i] + step[4 * f + i]
-            new_shading[:] = shading
+            _overwrite(new_shading, shading)
             _keep_scale(patch, lights, new_lights, new_shading)
             _equations(patch, new_lights)
             update_shading(patch.equations, new_shading, _SHADING_STEPS)
@@ -207,8 +212,9 @@ def _solve(
         stalled = damping > 1 / _EPS and not exact
         damping = max(damping, _EPS)
         if better:
-            lights[:], shading[:], slope[:] = new_lights, new_shading, new_slope
-            cost = after
+            _overwrite(lights, new_lights)
+            _overwrite(shading, new_shading)
+            slope, new_slope, cost = new_slope, slope, after
             if patch.scale > 0:
                 scale_start = _robust_weights(patch, lights, shading, scale_start)
                 cost = _evaluate(patch, lights, shading, slope)
@@ -220,6 +226,14 @@ def _solve(
             _equations(patch, lights)
             _curvature(patch, lights, shading, curvature_samples, curvature)
     return max_iterations, _LIMIT
+
+
+@compiled()
+def _overwrite(target: Floats, source: Floats) -> None:
+    """Copy a matrix; assigned slices would compile a message on shapes, a second each."""
+    for i in range(len(target)):
+        for k in range(target.shape[1]):
+            target[i, k] = source[i, k]
 
 
 @compiled(fast=True)
@@ -274,7 +288,8 @@ def _equations(patch: Patch, lights: Floats) -> None:
     for i in range(10):
         total, prior_rows = patch.equations[i], patch.prior[i]
         row, column = _ROWS[i], _COLUMNS[i]
-        total[:] = prior_rows
+        for k in range(len(total)):
+            total[k] = prior_rows[k]
         for f in range(len(lights)):
             weight, factor = patch.weight[f], lights[f, row] * lights[f, column]
             for k in range(len(total)):
@@ -495,7 +510,8 @@ def solve_on_cone(
         light = np.empty((len(views), 4), np.float32)
         shade = np.zeros((4, patch.radiance.shape[1]), np.float32)
         for f in range(len(views)):
-            light[f] = lights[p, views[f]]
+            for i in range(4):
+                light[f, i] = lights[p, views[f], i]
         for k in range(len(samples)):
             for i in range(4):
                 shade[i, k] = shading[p, i, samples[k]]
@@ -504,7 +520,8 @@ def solve_on_cone(
         if not has_data:
             cause[p] = _EMPTY
         for f in range(len(views)):
-            lights[p, views[f]] = light[f]
+            for i in range(4):
+                lights[p, views[f], i] = light[f, i]
             for k in range(len(samples)):
                 weight[p, views[f], samples[k]] = patch.weight[f, k]
         for i in range(4):

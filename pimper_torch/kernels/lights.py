@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pimper_torch.kernels.cholesky import solve_damped
+from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.robust_scale import robust_variance
-from pimper_torch.kernels.switch import compiled
 
 Doubles = NDArray[np.float64]
 
@@ -382,8 +382,13 @@ def fit(
             _shade(geometry, new_lights, trial_shading)
             after = _settle(radiance, seen, trial_shading, scale, weight, new_residual, new_albedo)
         if after < cost:
-            lights[:], albedo[:] = new_lights, new_albedo
-            shading[:], residual[:] = trial_shading, new_residual
+            for v in range(len(lights)):
+                for p in range(lights.shape[1]):
+                    lights[v, p] = new_lights[v, p]
+            for i in range(len(albedo)):
+                albedo[i] = new_albedo[i]
+            shading, trial_shading = trial_shading, shading
+            residual, new_residual = new_residual, residual
             damping = max(damping * _LESS, _MIN_DAMPING)
             if widen == 1 and after > cost * (1 - min_gain):
                 break

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 Array = NDArray[Any]
 

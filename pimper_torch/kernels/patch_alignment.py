@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ over columns took 1.1 to 1.3 and 1.9 times as long (five-point Laplacian, 130,00
 
 import numpy as np
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 Array = np.ndarray
 

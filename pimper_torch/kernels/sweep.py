@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrinkage
-from pimper_torch.kernels.switch import compiled
 
 Array = NDArray[Any]
 
-# Reweighted least squares for the albedo, after the median.
-ALBEDO_ITERATIONS = 2
+# As in ``sweep.consistency``: reweighted least squares for the albedo, after the median.
+_ALBEDO_ITERATIONS = 2
 
 # Factors multiplied before a logarithm is taken: no overflow up to residuals of 1e19 scales.
 _FACTORS = 8
@@ -90,7 +90,7 @@ def _inconsistency(
         ratios[view] = radiance[step, view] * per_shading[view]
     albedo = np.float32(_lower_median(ratios, order, count))
     one = np.float32(1)
-    for _ in range(ALBEDO_ITERATIONS):
+    for _ in range(_ALBEDO_ITERATIONS):
         square, product = np.float32(0), np.float32(0)
         for view in range(count):
             residual = (radiance[step, view] - albedo * shading[view]) * per_scale

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.switch import compiled
+from pimper_torch.kernels.compile import compiled
 
 # Bytes of window weights that are read again for every hypothesis: those of a core's cache.
 _CACHED = 3 << 18
@@ -144,6 +144,12 @@ def _add(total: NDArray[np.float32], one: NDArray[np.float32], other: NDArray[np
         total[x] += one[x] * other[x]
 
 
+@compiled(f"void({_ROW}, {_ROW})")
+def _increase(total: NDArray[np.float32], more: NDArray[np.float32]) -> None:
+    for x in range(len(total)):
+        total[x] += more[x]
+
+
 @compiled(f"void({_ROW}, {_ROW}, {_ROW}, {_ROW}, {_ROW}, boolean[::1], float32)")
 def _correlate(
     found: NDArray[np.float32],
@@ -264,8 +270,7 @@ def window_scores(
                 for rank in range(best):
                     for s in range(num_sources - 1, rank, -1):
                         _swap(found[s - 1, low:high], found[s, low:high])
-                    scores[index, y, low:high] += found[rank, low:high]
-                scores[index, y, low:high] /= np.float32(best)
+                    _increase(scores[index, y, low:high], found[rank, low:high])
                 for x in range(low, high):
-                    if not valid[y, x]:
-                        scores[index, y, x] = 0
+                    mean_of_best = scores[index, y, x] / np.float32(best)
+                    scores[index, y, x] = mean_of_best if valid[y, x] else np.float32(0)

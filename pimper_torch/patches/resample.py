@@ -6,7 +6,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pimper_torch.geometry.frames import invert_rigid, transform
-from pimper_torch.kernels import resample
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.patches.sources import Sources
 from pimper_torch.records import Cameras, Observations, Templates
@@ -30,6 +29,8 @@ def resampled(
         min_facing: Cosine of the steepest angle between a normal and the way to the camera.
         dark_level: Radiance at or below which a sample is missing.
     """
+    from pimper_torch.kernels import resample
+
     patch_from_world = templates.patch_from_world.double()
     exact = cameras.to(torch.float64)
     image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]
@@ -69,6 +70,8 @@ def hide(
     One ray for every ``stride`` samples either way, from the camera to just before the surface;
     all of a bucket at once.
     """
+    from pimper_torch.kernels import resample
+
     assert sources.caster is not None
     sparse = templates.points_patch[:, stride // 2 :: stride, stride // 2 :: stride].double()
     if sparse.numel() == 0:

@@ -17,6 +17,7 @@ from pimper_torch.errors import InputError
 AnyRecord = TypeVar("AnyRecord", bound="Record")
 Index = Sequence[int] | slice | Tensor
 _ARRAYS: dict[object, dict[str, Any]] = {}
+_HINTS: dict[object, dict[str, Any]] = {}
 _NODES: dict[object, set[str]] = {}
 
 
@@ -165,10 +166,16 @@ class Record:
         return f"{type(self).__name__}({fields})"
 
 
+def _hints(cls: type[Record]) -> dict[str, Any]:
+    if cls not in _HINTS:
+        _HINTS[cls] = typing.get_type_hints(cls)
+    return _HINTS[cls]
+
+
 def _arrays(cls: type[Record]) -> dict[str, Any]:
     """Give the fields that are tensors of a stated shape, or may be."""
     if cls not in _ARRAYS:
-        hints = typing.get_type_hints(cls)
+        hints = _hints(cls)
         fields = {field.name: hints[field.name] for field in dataclasses.fields(cls)}
         _ARRAYS[cls] = {
             name: hint
@@ -199,7 +206,7 @@ def _axis(hint: Any) -> str:  # noqa: ANN401
 def _along(record: Record) -> tuple[list[str], int]:
     """Name the fields that have the first axis of the first tensor, and give its length."""
     cls = type(record)
-    hints, arrays = typing.get_type_hints(cls), _arrays(cls)
+    hints, arrays = _hints(cls), _arrays(cls)
     if not arrays:
         raise InputError(f"{cls.__name__} has no tensors to take a part of.")
     first = next(iter(arrays))
@@ -221,7 +228,7 @@ def _nodes(record: Record) -> tuple[list[tuple[str, Any]], tuple[object, ...]]:
     children: list[tuple[str, Any]] = []
     rest: list[tuple[str, Any]] = []
     if cls not in _NODES:
-        hints = typing.get_type_hints(cls)
+        hints = _hints(cls)
         names = (field.name for field in dataclasses.fields(cls))
         _NODES[cls] = {name for name in names if _holds_tensors(hints[name])}
     for field in dataclasses.fields(cls):

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -41,6 +40,8 @@ def write_faces(
 
 def read_faces(path: Path) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """Read a triangle mesh that COLMAP wrote; float32, vertices as they are in the file."""
+    import trimesh
+
     mesh = trimesh.load_mesh(path, process=False)
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float32).reshape(-1, 3))
     return vertices, torch.from_numpy(np.array(mesh.faces, dtype=np.int64).reshape(-1, 3))

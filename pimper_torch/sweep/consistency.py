@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.kernels.sweep import ALBEDO_ITERATIONS
+# Reweighted least squares for the albedo, after the median.
+ALBEDO_ITERATIONS = 2
 
 
 def inconsistency(

@@ -5,7 +5,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.geometry.frames import invert_rigid, transform
-from pimper_torch.kernels import sweep
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.patches.sources import Sources
 from pimper_torch.records import Cameras, Observations, Photometry, Templates
@@ -40,6 +39,8 @@ def compiled_costs(
         min_views: Least number of them for a sample that is swept.
         min_facing: Cosine of the angle from which on footprints shrink no more.
     """
+    from pimper_torch.kernels import sweep
+
     patch_from_world = templates.patch_from_world.double()
     exact = cameras.to(torch.float64)
     image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]

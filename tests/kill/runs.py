@@ -119,7 +119,7 @@ def load() -> None:
 
     import pimper_torch.cli.run
     import pimper_torch.evidence.cli.render  # noqa: F401
-    from pimper_torch.kernels.switch import compile_all
+    from pimper_torch.kernels.compile import compile_all
 
     compile_all()
 

@@ -1,0 +1,138 @@
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from filelock import FileLock
+
+import pimper_torch.kernels
+from pimper_torch.kernels.compile import (
+    COARSE,
+    PHOTOMETRY,
+    SFM,
+    SURFACE,
+    SWEEP,
+    compile_all,
+    compiled,
+    forget_stale,
+    load,
+)
+
+AHEAD = "from pimper_torch.kernels.compile import *; child = compile_ahead(); "
+
+
+@pytest.fixture
+def fresh(tmp_path, monkeypatch):
+    """No kernel is compiled in the processes that a test starts."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+
+
+def started(code: str) -> "subprocess.Popen[str]":
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, text=True)
+
+
+def test_compiled_functions_answer_as_python_does():
+    @compiled("float64(float64)")
+    def halved(value: float) -> float:
+        return value / 2
+
+    assert halved(3.0) == 1.5
+
+
+def test_compiling_leaves_torchs_threads_alone():
+    compile_all()
+    code = (
+        "import torch; torch.set_num_threads(2)\n"
+        "from pimper_torch.kernels.compile import compile_all\n"
+        "compile_all(); assert torch.get_num_threads() == 2"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_kernel_of_a_run_is_compiled():
+    listed = {*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE}
+    sources = Path(pimper_torch.kernels.__path__[0]).glob("*.py")
+    with_types = {
+        path.stem for path in sources if re.search(r'@compiled\(\s*(f?"|\*)', path.read_text())
+    }
+    assert with_types == {*listed, "lookup"}  # which other kernels import
+
+
+def test_no_kernel_is_compiled_twice_at_once(fresh):
+    """What another process compiles comes last, and is waited for."""
+    code = (
+        "from pimper_torch.kernels.compile import cache_folder, load\n"
+        "from pimper_torch.progress import listening\n"
+        "print(cache_folder(), flush=True); input()\n"
+        "with listening(lambda done, total: print(done, flush=True)): load(('denied', 'lookup'))"
+    )
+    with started(code) as other:
+        assert other.stdout is not None
+        assert other.stdin is not None
+        folder = other.stdout.readline().strip()
+        with FileLock(f"{folder}/denied.lock"):
+            print(file=other.stdin, flush=True)
+            assert [other.stdout.readline() for _ in range(2)] == ["0\n", "1\n"]
+            time.sleep(1.0)
+            assert other.poll() is None
+        assert other.stdout.read() == "2\n"
+        assert other.wait() == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="ends processes as POSIX does")
+@pytest.mark.parametrize("end", ["sys.exit()", "os._exit(1)", "os.kill(os.getpid(), 9)"])
+def test_the_compiling_process_ends_with_its_parent(fresh, end):
+    with started(f"import os, sys; {AHEAD} print(child.pid, flush=True); input(); {end}") as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        os.kill(child, 0)
+        parent.communicate("\n")
+    for _ in range(100):
+        try:
+            os.kill(child, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    pytest.fail("it compiles on")
+
+
+def test_kernels_are_compiled_where_the_compiling_process_died(fresh):
+    code = (
+        f"{AHEAD} child.kill(); child.wait(); load(('denied',))\n"
+        "from pimper_torch.kernels.denied import count_denied as kernel\n"
+        "print(dict(kernel.stats.cache_misses))"
+    )
+    with started(code) as parent:
+        output, _ = parent.communicate()
+    assert output.strip().endswith(": 1}")
+
+
+def test_no_process_is_started_once_all_is_compiled():
+    compile_all()
+    with started(f"{AHEAD} assert child is None") as parent:
+        assert parent.wait() == 0
+
+
+def test_an_unknown_kernel_is_an_error():
+    with pytest.raises(ModuleNotFoundError):
+        load(("no_such_kernel",))
+
+
+def test_kernels_are_compiled_anew_when_any_of_their_sources_changed(tmp_path, monkeypatch):
+    monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path)])
+    kept = tmp_path / "__pycache__" / "one.py311.nbi"
+    kept.parent.mkdir()
+    for source in ("one.py", "two.py"):
+        (tmp_path / source).touch()
+        os.utime(tmp_path / source, (100, 100))
+    kept.touch()
+    os.utime(kept, (200, 200))
+    forget_stale(kept.parent)
+    assert kept.exists()
+    os.utime(tmp_path / "two.py", (300, 300))
+    forget_stale(kept.parent)
+    assert not kept.exists()
