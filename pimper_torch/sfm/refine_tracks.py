@@ -30,9 +30,8 @@ _FEWEST_TRACK_OBSERVATIONS = 3
 # tails, from light that is no slope: one spread puts points a quarter nearer to the truth.
 _FIRST_SCALE_PX, _SCALES_PX = 0.5, (0.05, 1.0)
 
-# Relative fall of the cost that ends the adjustment which tells the spread. With the 1e-6 of the
-# adjustment after it, all of them take 71 in place of 56 CPU s on 66 photographs of 1600x1067.
-_FIRST_TOLERANCE = 1e-4
+# Relative falls of the cost that end the adjustment that tells the spread, and the one after it.
+_FIRST_TOLERANCE, _TOLERANCE = 1e-4, 1e-5
 
 # Median length of a two-dimensional Gaussian's draws, in standard deviations.
 _MEDIAN_LENGTH = 1.1774
@@ -88,14 +87,13 @@ def refine_tracks(
         renewed, aligned = _renewed(some, found, pinholes, settings.fewest_points)
         if not bool(aligned.any()):
             return model
-        tied, scale = _adjusted(renewed, aligned, settings, cameras=cameras)
-        model = (
-            model if left else renewed
-        )  # all points of the last round, with its track observations
-        model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
-        model = bundle(model, _FIRST_SCALE_PX, cameras=False, tolerance=_FIRST_TOLERANCE)
+        tied, leading, scale = _adjusted(renewed, aligned, settings, cameras=cameras)
+        if left:
+            model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
+            model = bundle(model, _FIRST_SCALE_PX, cameras=False, tolerance=_FIRST_TOLERANCE)
+        else:
+            model = _with_others(renewed, tied, leading, scale)
     if rounds:
-        model = bundle(model, scale, cameras=False)
         limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
         before = len(model.points_world)
         model = model.without(observation_errors(model) > limit)
@@ -167,26 +165,42 @@ def _adjusted(
     settings: TrackSettings,
     *,
     cameras: bool,
-) -> tuple[SparseModel, float]:
-    """Adjust cameras, unless held fixed, to what was aligned; tell the residuals' scale."""
-    tied, leading = _leading(model, aligned, settings.fewest_points)
+) -> tuple[SparseModel, Bool[Tensor, " point"], float]:
+    """Adjust points and cameras, unless held fixed, to aligned observations.
+
+    Returns:
+        The model of the leading points, which points these are, and the scale of the residuals.
+    """
+    points = _leading(model, aligned, settings.fewest_points)
+    leading = points[model.observation_point]
+    tied = model.without(~leading)
     tied = bundle(tied, _FIRST_SCALE_PX, cameras=cameras, tolerance=_FIRST_TOLERANCE)
-    spread = float(observation_errors(tied)[leading].median()) / _MEDIAN_LENGTH
+    spread = float(observation_errors(tied)[aligned[leading]].median()) / _MEDIAN_LENGTH
     scale = min(max(spread, _SCALES_PX[0]), _SCALES_PX[1])
-    return (bundle(tied, scale) if cameras else tied), scale
+    return bundle(tied, scale, cameras=cameras, tolerance=_TOLERANCE), points, scale
+
+
+def _with_others(
+    model: SparseModel, tied: SparseModel, leading: Bool[Tensor, " point"], scale_px: float
+) -> SparseModel:
+    """Return all points with the adjusted cameras: leading ones as they are, others adjusted."""
+    model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
+    points = model.points_world.clone()
+    points[leading] = tied.points_world
+    if not bool(leading.all()):
+        others = model.without(leading[model.observation_point])
+        for scale, tolerance in ((_FIRST_SCALE_PX, _FIRST_TOLERANCE), (scale_px, _TOLERANCE)):
+            others = bundle(others, scale, cameras=False, tolerance=tolerance)
+        points[~leading] = others.points_world
+    return model.replace(points_world=points)
 
 
 def _leading(
     model: SparseModel, aligned: Bool[Tensor, " observation"], fewest_points: int
-) -> tuple[SparseModel, Bool[Tensor, " leading"]]:
-    """Keep the points that tell cameras: those aligned, and all in views that show few of them.
-
-    Returns:
-        The model of these points, and which of its observations are aligned.
-    """
+) -> Bool[Tensor, " point"]:
+    """Mark the points that tell cameras: those aligned, and all in views that show few of them."""
     counts = torch.bincount(model.observation_view[aligned], minlength=model.num_views)
     leading = aligned | (counts < fewest_points)[model.observation_view]
     wanted = torch.zeros(len(model.points_world), dtype=torch.bool)
     wanted[model.observation_point[leading]] = True
-    kept = wanted[model.observation_point]
-    return model.without(~kept), aligned[kept]
+    return wanted
