@@ -17,7 +17,7 @@ from pimper_torch.failures import solved_or
 from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.contacts import Contacts, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.continuation import about_mean
-from pimper_torch.fusion.estimate import Fused, fuse_terms
+from pimper_torch.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.fusion.expected_error import expected_error
 from pimper_torch.fusion.normal_bias import NormalBias, common_variance, normal_bias
 from pimper_torch.fusion.problem import FINEST, Problem, pose
@@ -50,8 +50,8 @@ class FuseConfig:
             variance of the error that its swept heights have in common, are estimated; 0 takes
             all errors for independent.
         noise_iterations: Solves in which the noise of each kind of terms is estimated and
-            outliers lose weight: for each estimate of the tilt and twice after them on a coarser
-            subdivided mesh, and twice at full size.
+            outliers lose weight: for each estimate of the tilt and once after them on a coarser
+            subdivided mesh, and once at full size.
         error_draws: Of noise, for the expected error of every vertex; its relative standard error
             is one over the square root of twice as many, a quarter for 8. 0 gives none.
     """
@@ -81,14 +81,12 @@ class _Shared(Record):
 
     Attributes:
         tilt: Of the normals of each facet; ``None`` if no position tells it.
-        tilt_variance: Of what remains of it in the normals that it was added to.
         height_variance: Of the common error of a facet's swept heights; ``None`` where unknown.
         independent: The solve in which normals have independent errors: it has the detail.
         correlated: The solve in which they share a tilt: it has the coarse shape.
     """
 
     tilt: NormalBias | None
-    tilt_variance: Float[Tensor, ""]
     height_variance: Float[Tensor, ""] | None
     independent: Fused
     correlated: Fused
@@ -141,7 +139,7 @@ class Fuse(Stage):
         contacts = self._contacts(coarse, swept, contours)
         shared = self._shared(coarse, contacts)
         fine = pose(swept, config.samples_per_vertex, config.slopes)
-        solved, solves = self._solve(fine, contacts, shared)
+        solved = self._solve(fine, contacts, shared, coarse)
         leave_out("fuse.support", ~fine.blend.supported, at=fine.points)
         leave_out("fuse.normals", ~fine.known, at=fine.points)
         leave_out("fuse.albedo", ~fine.blend.observed, at=fine.points)
@@ -171,7 +169,7 @@ class Fuse(Stage):
             height_information=blend.offset_information,
             expected_error=error,
             convergence=Convergence(
-                iterations=torch.full((1,), solves, device=moved.device),
+                iterations=torch.full((1,), config.noise_iterations, device=moved.device),
                 residual=average(moved.square()).sqrt()[None],
                 cause=torch.full((1,), int(StopCause.CONVERGED), device=moved.device),
             ),
@@ -217,7 +215,6 @@ class Fuse(Stage):
             only = solve(normals, [*points, *heights])
             return _Shared(
                 tilt=None,
-                tilt_variance=only.damping.new_zeros(()),
                 height_variance=None,
                 independent=only,
                 correlated=only,
@@ -238,58 +235,57 @@ class Fuse(Stage):
         tilt = normal_bias(subdivision, facets, normals, shape, known)
         normals = normalize(normals + tilt.at(subdivision, facets), dim=-1)
         variance = normal_bias(subdivision, facets, normals, shape, known).variance()
+        independent = solve(normals, positions)
+        terms = [*unlit, *positions, problem.slopes(normals, variance)]
         return _Shared(
             tilt=tilt,
-            tilt_variance=variance,
             height_variance=height_variance,
-            independent=solve(normals, positions),
-            correlated=solve(normals, positions, variance),
+            independent=independent,
+            correlated=fuse_like(independent, terms, problem.blend.heights),
         )
 
     def _solve(
-        self, problem: Problem, contacts: list[Contacts], shared: _Shared
-    ) -> tuple[Float[Tensor, " vertex"], int]:
-        """Solve at full size, given the errors that facets have in common; and count the solves.
+        self, problem: Problem, contacts: list[Contacts], shared: _Shared, coarse: Problem
+    ) -> Float[Tensor, " vertex"]:
+        """Solve at full size for the detail, and give it the coarse shape of the coarser mesh.
 
         Noise is estimated anew: what the coarser mesh finds noisier than claimed may be its own
         coarseness.
         """
+        normals = problem.blend.normals_world
+        if shared.tilt is not None:
+            tilt = shared.tilt.at(problem.subdivision, problem.facets)
+            normals = normalize(normals + tilt, dim=-1)
         terms = [
             *problem.unlit(),
             *passing(contacts, problem.surface),
             *self._heights(problem, shared.height_variance),
+            problem.slopes(normals),
         ]
-        normals, iterations = problem.blend.normals_world, self.config.noise_iterations
+        detail = self._fused(problem, terms).heights
         if shared.tilt is None:
-            fused = self._fused(problem, [*terms, problem.slopes(normals)])
-            return fused.heights, iterations
-        tilt = shared.tilt.at(problem.subdivision, problem.facets)
-        normals = normalize(normals + tilt, dim=-1)
-        detail = self._fused(problem, [*terms, problem.slopes(normals)]).heights
-        correlated = [*terms, problem.slopes(normals, shared.tilt_variance)]
-        coarse = self._fused(problem, correlated, near=detail).heights
+            return detail
 
         def with_coarse_shape() -> Float[Tensor, " vertex"]:
-            part = CoarsePart(problem.subdivision, problem.facets)
-            return detail + part(coarse - detail)
+            part = CoarsePart(coarse.subdivision, coarse.facets)
+            here = transferred(detail, problem.subdivision, coarse.subdivision)
+            at = part.corners(shared.correlated.heights - here)
+            return detail + problem.subdivision.interpolate(at, problem.facets)[:, 0]
 
-        found = solved_or(
+        return solved_or(
             with_coarse_shape,
             lambda: detail,
             stage="fuse",
             name="the fusion's coarse shape",
             done="The surface has the coarse shape of independent errors",
         )
-        return found, 2 * iterations
 
     def _heights(self, problem: Problem, shared: Float[Tensor, ""] | None) -> list[Terms]:
         return problem.heights(shared) if self.config.heights else []
 
-    def _fused(
-        self, problem: Problem, terms: list[Terms], near: Float[Tensor, " vertex"] | None = None
-    ) -> Fused:
+    def _fused(self, problem: Problem, terms: list[Terms]) -> Fused:
         start, iterations = problem.blend.heights, self.config.noise_iterations
-        return fuse_terms(terms, start, problem.damping, iterations, near)
+        return fuse_terms(terms, start, problem.damping, iterations)
 
     def _expected_error(
         self, coarse: Problem, shared: _Shared, fine: Problem, normals: Float[Tensor, "vertex 3"]
