@@ -22,10 +22,11 @@ from pimper_torch.fusion.expected_error import expected_error
 from pimper_torch.fusion.normal_bias import NormalBias, common_variance, normal_bias
 from pimper_torch.fusion.problem import FINEST, Problem, pose
 from pimper_torch.fusion.terms import Terms
-from pimper_torch.geometry.subdivision import transferred
+from pimper_torch.geometry.subdivision import Subdivision, transferred
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import average
+from pimper_torch.memory import release_memory
 from pimper_torch.records import Convergence, Record, StopCause, Surface, SweptPatches
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
@@ -77,19 +78,19 @@ class FuseConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Shared(Record):
-    """Errors that the terms of a facet have in common, and the solves that they came from.
+    """Errors that the terms of a facet have in common, and the solution that allows for them.
 
     Attributes:
         tilt: Of the normals of each facet; ``None`` if no position tells it.
         height_variance: Of the common error of a facet's swept heights; ``None`` where unknown.
-        independent: The solve in which normals have independent errors: it has the detail.
-        correlated: The solve in which they share a tilt: it has the coarse shape.
+        shape: Heights where normals share a tilt: they have the coarse shape.
+        expected: Expected errors of the heights; ``None`` if they are not asked for.
     """
 
     tilt: NormalBias | None
     height_variance: Float[Tensor, ""] | None
-    independent: Fused
-    correlated: Fused
+    shape: Float[Tensor, " vertex"]
+    expected: Float[Tensor, " vertex"] | None
 
 
 class Fuse(Stage):
@@ -137,9 +138,14 @@ class Fuse(Stage):
         config = self.config
         coarse = pose(swept, _COARSER * config.samples_per_vertex, config.slopes)
         contacts = self._contacts(coarse, swept, contours)
-        shared = self._shared(coarse, contacts)
+        shared = self._shared(coarse, contacts, expected)
+        subdivided = coarse.subdivision
+        del coarse
+        release_memory()
         fine = pose(swept, config.samples_per_vertex, config.slopes)
-        solved = self._solve(fine, contacts, shared, coarse)
+        release_memory()
+        solved = self._solve(fine, contacts, shared, subdivided)
+        release_memory()
         leave_out("fuse.support", ~fine.blend.supported, at=fine.points)
         leave_out("fuse.normals", ~fine.known, at=fine.points)
         leave_out("fuse.albedo", ~fine.blend.observed, at=fine.points)
@@ -148,15 +154,10 @@ class Fuse(Stage):
         vertices = subdivision.points + heights[:, None] * directions
         normals = vertex_normals(vertices, subdivision.faces)
         error: Float[Tensor, " vertex"] | None = None
-        if expected and config.error_draws > 0:
-            error = solved_or(
-                lambda: self._expected_error(coarse, shared, fine, normals),
-                lambda: None,
-                stage="fuse",
-                name="the expected error",
-                done="The surface has no expected errors",
-                memory=True,
-            )
+        if shared.expected is not None:
+            along = transferred(shared.expected, subdivided, subdivision).to(normals)
+            facing = (normals.detach() * directions.detach()).sum(dim=-1).abs()
+            error = torch.hypot(along * facing, FINEST * fine.spacing.detach())
         moved = (heights - blend.heights).detach()
         return Surface(
             vertices_world=vertices,
@@ -188,7 +189,7 @@ class Fuse(Stage):
             found.append(contour_tangents(tangent, surface))
         return found
 
-    def _shared(self, problem: Problem, contacts: list[Contacts]) -> _Shared:
+    def _shared(self, problem: Problem, contacts: list[Contacts], expected: bool) -> _Shared:
         """Estimate the noise of each kind of terms, and the errors that a facet has in common.
 
         Normals and positions are estimated from each other, in turns.
@@ -206,6 +207,19 @@ class Fuse(Stage):
             terms = [*unlit, *positions, problem.slopes(normals, tilt_variance)]
             return self._fused(problem, terms)
 
+        def expecting(independent: Fused, correlated: Fused) -> Float[Tensor, " vertex"] | None:
+            if not expected or self.config.error_draws == 0:
+                return None
+            draws = self.config.error_draws
+            return solved_or(
+                lambda: expected_error(independent, correlated, subdivision, facets, draws),
+                lambda: None,
+                stage="fuse",
+                name="the expected error",
+                done="The surface has no expected errors",
+                memory=True,
+            )
+
         normals, shape, height_variance = problem.blend.normals_world, problem.normals, None
         if (
             self.config.bias_iterations == 0
@@ -216,8 +230,8 @@ class Fuse(Stage):
             return _Shared(
                 tilt=None,
                 height_variance=None,
-                independent=only,
-                correlated=only,
+                shape=only.heights,
+                expected=expecting(only, only),
             )
         # Heights are evaluated by the others first, which they would draw along.
         positions = points or heights
@@ -237,15 +251,16 @@ class Fuse(Stage):
         variance = normal_bias(subdivision, facets, normals, shape, known).variance()
         independent = solve(normals, positions)
         terms = [*unlit, *positions, problem.slopes(normals, variance)]
+        correlated = fuse_like(independent, terms, problem.blend.heights)
         return _Shared(
             tilt=tilt,
             height_variance=height_variance,
-            independent=independent,
-            correlated=fuse_like(independent, terms, problem.blend.heights),
+            shape=correlated.heights,
+            expected=expecting(independent, correlated),
         )
 
     def _solve(
-        self, problem: Problem, contacts: list[Contacts], shared: _Shared, coarse: Problem
+        self, problem: Problem, contacts: list[Contacts], shared: _Shared, coarse: Subdivision
     ) -> Float[Tensor, " vertex"]:
         """Solve at full size for the detail, and give it the coarse shape of the coarser mesh.
 
@@ -256,20 +271,22 @@ class Fuse(Stage):
         if shared.tilt is not None:
             tilt = shared.tilt.at(problem.subdivision, problem.facets)
             normals = normalize(normals + tilt, dim=-1)
-        terms = [
-            *problem.unlit(),
+        terms = problem.unlit()
+        release_memory()
+        terms += [
             *passing(contacts, problem.surface),
             *self._heights(problem, shared.height_variance),
             problem.slopes(normals),
         ]
+        release_memory()
         detail = self._fused(problem, terms).heights
         if shared.tilt is None:
             return detail
 
         def with_coarse_shape() -> Float[Tensor, " vertex"]:
-            part = CoarsePart(coarse.subdivision, coarse.facets)
-            here = transferred(detail, problem.subdivision, coarse.subdivision)
-            at = part.corners(shared.correlated.heights - here)
+            part = CoarsePart(coarse, problem.facets)
+            here = transferred(detail, problem.subdivision, coarse)
+            at = part.corners(shared.shape - here)
             return detail + problem.subdivision.interpolate(at, problem.facets)[:, 0]
 
         return solved_or(
@@ -286,13 +303,3 @@ class Fuse(Stage):
     def _fused(self, problem: Problem, terms: list[Terms]) -> Fused:
         start, iterations = problem.blend.heights, self.config.noise_iterations
         return fuse_terms(terms, start, problem.damping, iterations)
-
-    def _expected_error(
-        self, coarse: Problem, shared: _Shared, fine: Problem, normals: Float[Tensor, "vertex 3"]
-    ) -> Float[Tensor, " vertex"]:
-        """Give the expected error across the surface; heights count along directions."""
-        solves, draws = (shared.independent, shared.correlated), self.config.error_draws
-        along = expected_error(*solves, coarse.subdivision, coarse.facets, draws)
-        along = transferred(along, coarse.subdivision, fine.subdivision).to(normals)
-        facing = (normals.detach() * fine.directions.detach()).sum(dim=-1).abs()
-        return torch.hypot(along * facing, FINEST * fine.spacing.detach())

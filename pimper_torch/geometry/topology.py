@@ -25,25 +25,29 @@ def face_edges(
     faces: Int[Tensor, "face 3"],
 ) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "face 3"]]:
     """List every edge once, its lower vertex first, and which one is opposite to each corner."""
-    ends = half_edges(faces).sort(dim=1).values
-    if len(ends) == 0:
-        return ends, faces
-    # One key an edge: rows take far longer to compare.
-    size = ends.max() + 1
-    key, index = torch.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)
-    return torch.stack([key // size, key % size], dim=1), index.reshape(-1, 3)
+    if len(faces) == 0:
+        return faces[:, :2], faces
+    key, index = torch.unique(_edge_keys(faces), return_inverse=True)
+    return _ends(key, faces), index
 
 
 def open_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
     """List the edges that do not have exactly two faces, once each, their lower vertex first."""
     if len(faces) == 0:
         return faces[:, :2]
-    size = faces.max() + 1
-    sides = ((faces[:, one], faces[:, other]) for one, other in ((1, 2), (2, 0), (0, 1)))
-    keys = torch.cat([torch.minimum(a, b) * size + torch.maximum(a, b) for a, b in sides])
-    keys = keys.sort().values
+    keys = _edge_keys(faces).flatten().sort().values
     key, counts = torch.unique_consecutive(keys, return_counts=True)
-    key = key[counts != 2]
+    return _ends(key[counts != 2], faces)
+
+
+def _edge_keys(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "face 3"]:
+    """Number the edge opposite to each corner: rows of two would take far longer to compare."""
+    ahead, behind = faces.roll(-1, dims=1), faces.roll(1, dims=1)
+    return torch.minimum(ahead, behind) * (faces.max() + 1) + torch.maximum(ahead, behind)
+
+
+def _ends(key: Int[Tensor, " edge"], faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
+    size = faces.max() + 1
     return torch.stack([key // size, key % size], dim=1)
 
 
