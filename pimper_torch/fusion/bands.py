@@ -51,8 +51,8 @@ class CoarsePart:
             "the fusion's coarse shape",
         )
 
-    def corners(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "corner column"]:
-        """Give its values at the facets' corners, in one column or several. Differentiable."""
+    def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
+        """Give it at the subdivided mesh's vertices, in one column or several. Differentiable."""
         columns = values.double().reshape(len(values), -1)
         side = columns.new_zeros(self._size, columns.shape[1])
         for corner in range(3):
@@ -60,9 +60,5 @@ class CoarsePart:
             side = side.index_add(
                 0, self._facets[self._subdivision.facet, corner], fraction * columns
             )
-        return self._normal.solve(side)
-
-    def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
-        """Give it at the subdivided mesh's vertices."""
-        found = self._subdivision.interpolate(self.corners(values), self._facets)
-        return found.to(values).reshape(values.shape)
+        at = self._normal.solve(side)
+        return self._subdivision.interpolate(at, self._facets).to(values).reshape(values.shape)

@@ -1,7 +1,7 @@
 """The stage that makes one surface of slopes, swept heights and the cloud's points.
 
 It reads in the order of its ``forward``: the errors that facets have in common are estimated on a
-coarser subdivided mesh, then the surface is solved for at full size, and its expected error drawn.
+coarser subdivided mesh, and its expected error drawn there; then it is solved for at full size.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from pimper_torch.fusion.expected_error import expected_error
 from pimper_torch.fusion.normal_bias import NormalBias, common_variance, normal_bias
 from pimper_torch.fusion.problem import FINEST, Problem, pose
 from pimper_torch.fusion.terms import Terms
-from pimper_torch.geometry.subdivision import Subdivision, transferred
+from pimper_torch.geometry.subdivision import transferred
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import average
@@ -51,8 +51,8 @@ class FuseConfig:
             variance of the error that its swept heights have in common, are estimated; 0 takes
             all errors for independent.
         noise_iterations: Solves in which the noise of each kind of terms is estimated and
-            outliers lose weight: for each estimate of the tilt and once after them on a coarser
-            subdivided mesh, and once at full size.
+            outliers lose weight: for each estimate of the tilt, and for the expected error, on a
+            coarser subdivided mesh, and once at full size. The coarse shape takes one more.
         error_draws: Of noise, for the expected error of every vertex; its relative standard error
             is one over the square root of twice as many, a quarter for 8. 0 gives none.
     """
@@ -82,14 +82,14 @@ class _Shared(Record):
 
     Attributes:
         tilt: Of the normals of each facet; ``None`` if no position tells it.
+        tilt_variance: Of what remains of it in the normals that it was added to.
         height_variance: Of the common error of a facet's swept heights; ``None`` where unknown.
-        shape: Heights where normals share a tilt: they have the coarse shape.
         expected: Expected errors of the heights; ``None`` if they are not asked for.
     """
 
     tilt: NormalBias | None
+    tilt_variance: Float[Tensor, ""]
     height_variance: Float[Tensor, ""] | None
-    shape: Float[Tensor, " vertex"]
     expected: Float[Tensor, " vertex"] | None
 
 
@@ -129,7 +129,7 @@ class Fuse(Stage):
             expected: Whether the expected error of every vertex is found.
 
         The convergence's residual is the root mean square distance that the surface moved, in
-        scene units; its iterations are the solves at full size.
+        scene units; its iterations are the solves at full size for the detail.
 
         Raises:
             InputError: A normal that is not unit, an inverse variance below 0 or a height that
@@ -144,7 +144,7 @@ class Fuse(Stage):
         release_memory()
         fine = pose(swept, config.samples_per_vertex, config.slopes)
         release_memory()
-        solved = self._solve(fine, contacts, shared, subdivided)
+        solved = self._solve(fine, contacts, shared)
         release_memory()
         leave_out("fuse.support", ~fine.blend.supported, at=fine.points)
         leave_out("fuse.normals", ~fine.known, at=fine.points)
@@ -190,7 +190,7 @@ class Fuse(Stage):
         return found
 
     def _shared(self, problem: Problem, contacts: list[Contacts], expected: bool) -> _Shared:
-        """Estimate the noise of each kind of terms, and the errors that a facet has in common.
+        """Estimate the errors that a facet has in common, and the expected error of the heights.
 
         Normals and positions are estimated from each other, in turns.
         """
@@ -207,31 +207,18 @@ class Fuse(Stage):
             terms = [*unlit, *positions, problem.slopes(normals, tilt_variance)]
             return self._fused(problem, terms)
 
-        def expecting(independent: Fused, correlated: Fused) -> Float[Tensor, " vertex"] | None:
-            if not expected or self.config.error_draws == 0:
-                return None
-            draws = self.config.error_draws
-            return solved_or(
-                lambda: expected_error(independent, correlated, subdivision, facets, draws),
-                lambda: None,
-                stage="fuse",
-                name="the expected error",
-                done="The surface has no expected errors",
-                memory=True,
-            )
-
         normals, shape, height_variance = problem.blend.normals_world, problem.normals, None
         if (
             self.config.bias_iterations == 0
             or not bool(problem.lit.any())
             or not (heights or points)
         ):
-            only = solve(normals, [*points, *heights])
+            terms = [*unlit, *points, *heights]
             return _Shared(
                 tilt=None,
+                tilt_variance=normals.new_zeros(()),
                 height_variance=None,
-                shape=only.heights,
-                expected=expecting(only, only),
+                expected=None if not expected else self._expected(problem, terms, normals, None),
             )
         # Heights are evaluated by the others first, which they would draw along.
         positions = points or heights
@@ -249,20 +236,42 @@ class Fuse(Stage):
         tilt = normal_bias(subdivision, facets, normals, shape, known)
         normals = normalize(normals + tilt.at(subdivision, facets), dim=-1)
         variance = normal_bias(subdivision, facets, normals, shape, known).variance()
-        independent = solve(normals, positions)
-        terms = [*unlit, *positions, problem.slopes(normals, variance)]
-        correlated = fuse_like(independent, terms, problem.blend.heights)
+        terms = [*unlit, *positions]
         return _Shared(
             tilt=tilt,
+            tilt_variance=variance,
             height_variance=height_variance,
-            shape=correlated.heights,
-            expected=expecting(independent, correlated),
+            expected=self._expected(problem, terms, normals, variance) if expected else None,
+        )
+
+    def _expected(
+        self,
+        problem: Problem,
+        terms: list[Terms],
+        normals: Float[Tensor, "vertex 3"],
+        tilt_variance: Float[Tensor, ""] | None,
+    ) -> Float[Tensor, " vertex"] | None:
+        """Solve as at full size, and give the expected error of the heights."""
+        if self.config.error_draws == 0:
+            return None
+        independent = correlated = self._fused(problem, [*terms, problem.slopes(normals)])
+        if tilt_variance is not None:
+            common = [*terms, problem.slopes(normals, tilt_variance)]
+            correlated = fuse_like(independent, common, problem.blend.heights)
+        subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
+        return solved_or(
+            lambda: expected_error(independent, correlated, subdivision, facets, draws),
+            lambda: None,
+            stage="fuse",
+            name="the expected error",
+            done="The surface has no expected errors",
+            memory=True,
         )
 
     def _solve(
-        self, problem: Problem, contacts: list[Contacts], shared: _Shared, coarse: Subdivision
+        self, problem: Problem, contacts: list[Contacts], shared: _Shared
     ) -> Float[Tensor, " vertex"]:
-        """Solve at full size for the detail, and give it the coarse shape of the coarser mesh.
+        """Solve at full size, for the detail and once more for the coarse shape.
 
         Noise is estimated anew: what the coarser mesh finds noisier than claimed may be its own
         coarseness.
@@ -279,15 +288,15 @@ class Fuse(Stage):
             problem.slopes(normals),
         ]
         release_memory()
-        detail = self._fused(problem, terms).heights
+        fused = self._fused(problem, terms)
+        detail = fused.heights
         if shared.tilt is None:
             return detail
+        terms[-1] = problem.slopes(normals, shared.tilt_variance)
 
         def with_coarse_shape() -> Float[Tensor, " vertex"]:
-            part = CoarsePart(coarse, problem.facets)
-            here = transferred(detail, problem.subdivision, coarse)
-            at = part.corners(shared.shape - here)
-            return detail + problem.subdivision.interpolate(at, problem.facets)[:, 0]
+            shape = fuse_like(fused, terms, problem.blend.heights).heights
+            return detail + CoarsePart(problem.subdivision, problem.facets)(shape - detail)
 
         return solved_or(
             with_coarse_shape,
