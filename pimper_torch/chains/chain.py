@@ -15,7 +15,7 @@ from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
-from pimper_torch.kernels.compile import compile_ahead, load
+from pimper_torch.kernels.compile import all_compiled, compile_ahead, load
 from pimper_torch.kernels.switch import Kernels, using
 from pimper_torch.ledger import Entry, left_out_of
 from pimper_torch.records import (
@@ -147,8 +147,8 @@ class Chain(Stage):
         return kept_call(self.store, name, call, inputs, derived, self.kernels)
 
     def need(self, kernels: Sequence[str]) -> None:
-        """Wait for kernels, which takes time in an installation's first run alone."""
-        if self.kernels == "numba":
+        """Wait for kernels, in an installation's first run."""
+        if self.kernels == "numba" and not all_compiled():
             with stage("compile"):
                 load(kernels)
 

@@ -186,6 +186,10 @@ def _run(command: str, arguments: list[str], output: Output, supervised: bool) -
         run = light(home, "run") if command in _LIGHT else _loaded(home).run
         with stoppable(repeat=not supervised):
             run(command, arguments, output)
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # rich's answer to it
+            raise error.__context__ from None
+        raise
     except (Exception, KeyboardInterrupt) as error:
         return _failed(output, error)
     return 0

@@ -58,7 +58,7 @@ class Fused(Record):
     """
 
     heights: Float[Tensor, " vertex"]
-    factors: tuple[float, ...]
+    factors: tuple[Float[Tensor, ""], ...]
     kinds: tuple[Terms, ...]
     weights: tuple[Float[Tensor, " _"], ...]
     damping: Float[Tensor, " vertex"]
@@ -67,10 +67,8 @@ class Fused(Record):
         self,
     ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
         """Give rows, columns and values of the matrix that was solved last."""
-        factors = [self.damping.new_tensor(factor).double() for factor in self.factors]
-        return _system(
-            self.kinds, self.weights, factors, torch.zeros_like(self.damping), self.damping
-        )[0]
+        start = torch.zeros_like(self.damping)
+        return _system(self.kinds, self.weights, self.factors, start, self.damping)[0]
 
 
 def fuse_terms(
@@ -78,7 +76,6 @@ def fuse_terms(
     start: Float[Tensor, " vertex"],
     damping: Float[Tensor, " vertex"],
     iterations: int,
-    near: Float[Tensor, " vertex"] | None = None,
 ) -> Fused:
     """Solve, estimate the noise, and solve again.
 
@@ -87,7 +84,6 @@ def fuse_terms(
         start: Heights that vertices keep without other terms.
         damping: Information of these.
         iterations: Of solves.
-        near: Heights that iterations may begin at; they do not change the answer.
 
     Differentiable in targets, coefficients, information, damping and start, through the weights and
     the factors too: every solve answers by the implicit function. That takes as many more solves
@@ -101,7 +97,7 @@ def fuse_terms(
     generator = torch.Generator().manual_seed(0)  # of signs: any will do
     probe = 2.0 * torch.randint(0, 2, (len(start),), generator=generator) - 1
     probe = probe.double().to(start.device)
-    heights = near
+    heights: Tensor | None = None
     for _ in range(iterations - 1):
         try:
             heights, answer = _solved(
@@ -127,11 +123,46 @@ def fuse_terms(
             _kept(error)
     return Fused(
         heights=start.double() if heights is None else heights,
-        factors=tuple(float(factor.detach()) for factor in found),
+        factors=tuple(found),
         kinds=tuple(kinds),
-        weights=tuple(weight.detach() for weight in weights),
-        damping=damping.detach(),
+        weights=tuple(weights),
+        damping=damping,
     )
+
+
+def fuse_like(fused: Fused, kinds: Sequence[Terms], start: Float[Tensor, " vertex"]) -> Fused:
+    """Solve once more, for terms with common errors, with the weights that a solve has found.
+
+    Residuals from vertex to vertex do not show what normals err by together: slopes seem to have
+    less noise than they claim, and the points that contradict them more. So slopes have a factor of
+    1 at least here, and all others of 1 at most.
+
+    Args:
+        fused: The solve without common errors.
+        kinds: The same terms, in order; only information and correlation may differ.
+        start: Heights that vertices keep without other terms.
+
+    Differentiable as :func:`fuse_terms`, through the weights and factors too. Where the equations
+    have no solution, the heights are those of the solve before.
+    """
+    factors = tuple(
+        factor.clamp_max(1) if kind.unknowns.shape[1] == 1 else factor.clamp_min(1)
+        for kind, factor in zip(kinds, fused.factors, strict=True)
+    )
+    heights = fused.heights
+    try:
+        (heights,) = _solved(
+            kinds,
+            fused.weights,
+            factors,
+            start,
+            fused.damping,
+            guess=heights,
+            tolerance=_ACCURATE,
+        )
+    except SingularSystemError as error:
+        _kept(error)
+    return fused.replace(heights=heights, factors=factors, kinds=tuple(kinds))
 
 
 def _kept(error: SingularSystemError) -> None:

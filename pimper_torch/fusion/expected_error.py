@@ -51,7 +51,7 @@ def expected_error(
     Args:
         fine: The solve that detail is from.
         coarse: The solve that the coarse shape is from, with what neighbours err by together;
-            the same record where there was only one solve.
+            the same record where there was only one solve. Noise has the factors of ``fine``.
         subdivision: The facets, subdivided.
         facets: The coarse mesh's faces.
         draws: Of noise. The result is off by one over the square root of twice as many.
@@ -70,7 +70,7 @@ def expected_error(
             [
                 _noise(kind, weight, factor, subdivision, region, generator)
                 for kind, weight, factor in zip(
-                    coarse.kinds, coarse.weights, coarse.factors, strict=True
+                    coarse.kinds, coarse.weights, fine.factors, strict=True
                 )
             ]
         )
@@ -112,7 +112,7 @@ def regions(subdivision: Subdivision) -> Int[Tensor, " facet"]:
 def _noise(
     kind: Terms,
     weight: Float[Tensor, " equation"],
-    factor: float,
+    factor: Float[Tensor, ""],
     subdivision: Subdivision,
     region: Int[Tensor, " facet"],
     generator: torch.Generator,
@@ -124,7 +124,7 @@ def _noise(
     depends on where they point.
     """
     claimed = 1 / (weight * kind.information.double() * kind.correlated.double())
-    each = claimed * (max(factor, 1.0) if kind.evaluated else _UNMEASURED**2)
+    each = claimed * (factor.clamp_min(1) if kind.evaluated else _UNMEASURED**2)
     facet = subdivision.facet[kind.unknowns[:, 0]]
     count = torch.bincount(facet, minlength=1)[facet].to(each)
     together = torch.ones_like(each)

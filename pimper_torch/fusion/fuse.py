@@ -1,7 +1,7 @@
 """The stage that makes one surface of slopes, swept heights and the cloud's points.
 
 It reads in the order of its ``forward``: the errors that facets have in common are estimated on a
-coarser subdivided mesh, then the surface is solved for at full size, and its expected error drawn.
+coarser subdivided mesh, and its expected error drawn there; then it is solved for at full size.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from pimper_torch.failures import solved_or
 from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.contacts import Contacts, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.continuation import about_mean
-from pimper_torch.fusion.estimate import Fused, fuse_terms
+from pimper_torch.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.fusion.expected_error import expected_error
 from pimper_torch.fusion.normal_bias import NormalBias, common_variance, normal_bias
 from pimper_torch.fusion.problem import FINEST, Problem, pose
@@ -26,6 +26,7 @@ from pimper_torch.geometry.subdivision import transferred
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import average
+from pimper_torch.memory import release_memory
 from pimper_torch.records import Convergence, Record, StopCause, Surface, SweptPatches
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
@@ -50,8 +51,8 @@ class FuseConfig:
             variance of the error that its swept heights have in common, are estimated; 0 takes
             all errors for independent.
         noise_iterations: Solves in which the noise of each kind of terms is estimated and
-            outliers lose weight: for each estimate of the tilt and twice after them on a coarser
-            subdivided mesh, and twice at full size.
+            outliers lose weight: for each estimate of the tilt, and for the expected error, on a
+            coarser subdivided mesh, and once at full size. The coarse shape takes one more.
         error_draws: Of noise, for the expected error of every vertex; its relative standard error
             is one over the square root of twice as many, a quarter for 8. 0 gives none.
     """
@@ -77,21 +78,19 @@ class FuseConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Shared(Record):
-    """Errors that the terms of a facet have in common, and the solves that they came from.
+    """Errors that the terms of a facet have in common, and the solution that allows for them.
 
     Attributes:
         tilt: Of the normals of each facet; ``None`` if no position tells it.
         tilt_variance: Of what remains of it in the normals that it was added to.
         height_variance: Of the common error of a facet's swept heights; ``None`` where unknown.
-        independent: The solve in which normals have independent errors: it has the detail.
-        correlated: The solve in which they share a tilt: it has the coarse shape.
+        expected: Expected errors of the heights; ``None`` if they are not asked for.
     """
 
     tilt: NormalBias | None
     tilt_variance: Float[Tensor, ""]
     height_variance: Float[Tensor, ""] | None
-    independent: Fused
-    correlated: Fused
+    expected: Float[Tensor, " vertex"] | None
 
 
 class Fuse(Stage):
@@ -130,7 +129,7 @@ class Fuse(Stage):
             expected: Whether the expected error of every vertex is found.
 
         The convergence's residual is the root mean square distance that the surface moved, in
-        scene units; its iterations are the solves at full size.
+        scene units; its iterations are the solves at full size for the detail.
 
         Raises:
             InputError: A normal that is not unit, an inverse variance below 0 or a height that
@@ -139,9 +138,14 @@ class Fuse(Stage):
         config = self.config
         coarse = pose(swept, _COARSER * config.samples_per_vertex, config.slopes)
         contacts = self._contacts(coarse, swept, contours)
-        shared = self._shared(coarse, contacts)
+        shared = self._shared(coarse, contacts, expected)
+        subdivided = coarse.subdivision
+        del coarse
+        release_memory()
         fine = pose(swept, config.samples_per_vertex, config.slopes)
-        solved, solves = self._solve(fine, contacts, shared)
+        release_memory()
+        solved = self._solve(fine, contacts, shared)
+        release_memory()
         leave_out("fuse.support", ~fine.blend.supported, at=fine.points)
         leave_out("fuse.normals", ~fine.known, at=fine.points)
         leave_out("fuse.albedo", ~fine.blend.observed, at=fine.points)
@@ -150,15 +154,10 @@ class Fuse(Stage):
         vertices = subdivision.points + heights[:, None] * directions
         normals = vertex_normals(vertices, subdivision.faces)
         error: Float[Tensor, " vertex"] | None = None
-        if expected and config.error_draws > 0:
-            error = solved_or(
-                lambda: self._expected_error(coarse, shared, fine, normals),
-                lambda: None,
-                stage="fuse",
-                name="the expected error",
-                done="The surface has no expected errors",
-                memory=True,
-            )
+        if shared.expected is not None:
+            along = transferred(shared.expected, subdivided, subdivision).to(normals)
+            facing = (normals.detach() * directions.detach()).sum(dim=-1).abs()
+            error = torch.hypot(along * facing, FINEST * fine.spacing.detach())
         moved = (heights - blend.heights).detach()
         return Surface(
             vertices_world=vertices,
@@ -171,7 +170,7 @@ class Fuse(Stage):
             height_information=blend.offset_information,
             expected_error=error,
             convergence=Convergence(
-                iterations=torch.full((1,), solves, device=moved.device),
+                iterations=torch.full((1,), config.noise_iterations, device=moved.device),
                 residual=average(moved.square()).sqrt()[None],
                 cause=torch.full((1,), int(StopCause.CONVERGED), device=moved.device),
             ),
@@ -190,8 +189,8 @@ class Fuse(Stage):
             found.append(contour_tangents(tangent, surface))
         return found
 
-    def _shared(self, problem: Problem, contacts: list[Contacts]) -> _Shared:
-        """Estimate the noise of each kind of terms, and the errors that a facet has in common.
+    def _shared(self, problem: Problem, contacts: list[Contacts], expected: bool) -> _Shared:
+        """Estimate the errors that a facet has in common, and the expected error of the heights.
 
         Normals and positions are estimated from each other, in turns.
         """
@@ -214,13 +213,12 @@ class Fuse(Stage):
             or not bool(problem.lit.any())
             or not (heights or points)
         ):
-            only = solve(normals, [*points, *heights])
+            terms = [*unlit, *points, *heights]
             return _Shared(
                 tilt=None,
-                tilt_variance=only.damping.new_zeros(()),
+                tilt_variance=normals.new_zeros(()),
                 height_variance=None,
-                independent=only,
-                correlated=only,
+                expected=None if not expected else self._expected(problem, terms, normals, None),
             )
         # Heights are evaluated by the others first, which they would draw along.
         positions = points or heights
@@ -238,65 +236,79 @@ class Fuse(Stage):
         tilt = normal_bias(subdivision, facets, normals, shape, known)
         normals = normalize(normals + tilt.at(subdivision, facets), dim=-1)
         variance = normal_bias(subdivision, facets, normals, shape, known).variance()
+        terms = [*unlit, *positions]
         return _Shared(
             tilt=tilt,
             tilt_variance=variance,
             height_variance=height_variance,
-            independent=solve(normals, positions),
-            correlated=solve(normals, positions, variance),
+            expected=self._expected(problem, terms, normals, variance) if expected else None,
+        )
+
+    def _expected(
+        self,
+        problem: Problem,
+        terms: list[Terms],
+        normals: Float[Tensor, "vertex 3"],
+        tilt_variance: Float[Tensor, ""] | None,
+    ) -> Float[Tensor, " vertex"] | None:
+        """Solve as at full size, and give the expected error of the heights."""
+        if self.config.error_draws == 0:
+            return None
+        independent = correlated = self._fused(problem, [*terms, problem.slopes(normals)])
+        if tilt_variance is not None:
+            common = [*terms, problem.slopes(normals, tilt_variance)]
+            correlated = fuse_like(independent, common, problem.blend.heights)
+        subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
+        return solved_or(
+            lambda: expected_error(independent, correlated, subdivision, facets, draws),
+            lambda: None,
+            stage="fuse",
+            name="the expected error",
+            done="The surface has no expected errors",
+            memory=True,
         )
 
     def _solve(
         self, problem: Problem, contacts: list[Contacts], shared: _Shared
-    ) -> tuple[Float[Tensor, " vertex"], int]:
-        """Solve at full size, given the errors that facets have in common; and count the solves.
+    ) -> Float[Tensor, " vertex"]:
+        """Solve at full size, for the detail and once more for the coarse shape.
 
         Noise is estimated anew: what the coarser mesh finds noisier than claimed may be its own
         coarseness.
         """
-        terms = [
-            *problem.unlit(),
+        normals = problem.blend.normals_world
+        if shared.tilt is not None:
+            tilt = shared.tilt.at(problem.subdivision, problem.facets)
+            normals = normalize(normals + tilt, dim=-1)
+        terms = problem.unlit()
+        release_memory()
+        terms += [
             *passing(contacts, problem.surface),
             *self._heights(problem, shared.height_variance),
+            problem.slopes(normals),
         ]
-        normals, iterations = problem.blend.normals_world, self.config.noise_iterations
+        release_memory()
+        fused = self._fused(problem, terms)
+        detail = fused.heights
         if shared.tilt is None:
-            fused = self._fused(problem, [*terms, problem.slopes(normals)])
-            return fused.heights, iterations
-        tilt = shared.tilt.at(problem.subdivision, problem.facets)
-        normals = normalize(normals + tilt, dim=-1)
-        detail = self._fused(problem, [*terms, problem.slopes(normals)]).heights
-        correlated = [*terms, problem.slopes(normals, shared.tilt_variance)]
-        coarse = self._fused(problem, correlated, near=detail).heights
+            return detail
+        terms[-1] = problem.slopes(normals, shared.tilt_variance)
 
         def with_coarse_shape() -> Float[Tensor, " vertex"]:
-            part = CoarsePart(problem.subdivision, problem.facets)
-            return detail + part(coarse - detail)
+            shape = fuse_like(fused, terms, problem.blend.heights).heights
+            return detail + CoarsePart(problem.subdivision, problem.facets)(shape - detail)
 
-        found = solved_or(
+        return solved_or(
             with_coarse_shape,
             lambda: detail,
             stage="fuse",
             name="the fusion's coarse shape",
             done="The surface has the coarse shape of independent errors",
         )
-        return found, 2 * iterations
 
     def _heights(self, problem: Problem, shared: Float[Tensor, ""] | None) -> list[Terms]:
         return problem.heights(shared) if self.config.heights else []
 
-    def _fused(
-        self, problem: Problem, terms: list[Terms], near: Float[Tensor, " vertex"] | None = None
-    ) -> Fused:
+    def _fused(self, problem: Problem, terms: list[Terms]) -> Fused:
         start, iterations = problem.blend.heights, self.config.noise_iterations
-        return fuse_terms(terms, start, problem.damping, iterations, near)
-
-    def _expected_error(
-        self, coarse: Problem, shared: _Shared, fine: Problem, normals: Float[Tensor, "vertex 3"]
-    ) -> Float[Tensor, " vertex"]:
-        """Give the expected error across the surface; heights count along directions."""
-        solves, draws = (shared.independent, shared.correlated), self.config.error_draws
-        along = expected_error(*solves, coarse.subdivision, coarse.facets, draws)
-        along = transferred(along, coarse.subdivision, fine.subdivision).to(normals)
-        facing = (normals.detach() * fine.directions.detach()).sum(dim=-1).abs()
-        return torch.hypot(along * facing, FINEST * fine.spacing.detach())
+        return fuse_terms(terms, start, problem.damping, iterations)

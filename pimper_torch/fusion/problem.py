@@ -26,6 +26,7 @@ from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.linalg.sums import total
+from pimper_torch.memory import release_memory
 from pimper_torch.records import DepthPatches, Depths, Record, SweptPatches
 
 # Information of every vertex about its present height, in units of one over its spacing squared:
@@ -214,6 +215,7 @@ def pose(swept: SweptPatches, samples_per_vertex: float, slopes: bool) -> Proble
     # A vertex stands for so many samples, each of which has its own information.
     density = samples_per_vertex**2
     blend = blend.replace(offset_information=density * blend.offset_information)
+    release_memory()
     points = subdivision.points + blend.heights[:, None] * directions
     edges = face_edges(subdivision.faces)[0]
     known = blend.seen & slopes

@@ -25,13 +25,30 @@ def face_edges(
     faces: Int[Tensor, "face 3"],
 ) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "face 3"]]:
     """List every edge once, its lower vertex first, and which one is opposite to each corner."""
-    ends = half_edges(faces).sort(dim=1).values
-    if len(ends) == 0:
-        return ends, faces
-    # One key an edge: rows take far longer to compare.
-    size = ends.max() + 1
-    key, index = torch.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)
-    return torch.stack([key // size, key % size], dim=1), index.reshape(-1, 3)
+    if len(faces) == 0:
+        return faces[:, :2], faces
+    key, index = torch.unique(_edge_keys(faces), return_inverse=True)
+    return _ends(key, faces), index
+
+
+def open_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
+    """List the edges that do not have exactly two faces, once each, their lower vertex first."""
+    if len(faces) == 0:
+        return faces[:, :2]
+    keys = _edge_keys(faces).flatten().sort().values
+    key, counts = torch.unique_consecutive(keys, return_counts=True)
+    return _ends(key[counts != 2], faces)
+
+
+def _edge_keys(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "face 3"]:
+    """Number the edge opposite to each corner: rows of two would take far longer to compare."""
+    ahead, behind = faces.roll(-1, dims=1), faces.roll(1, dims=1)
+    return torch.minimum(ahead, behind) * (faces.max() + 1) + torch.maximum(ahead, behind)
+
+
+def _ends(key: Int[Tensor, " edge"], faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
+    size = faces.max() + 1
+    return torch.stack([key // size, key % size], dim=1)
 
 
 def face_pairs(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "pair 2"], Int[Tensor, "pair 2"]]:
@@ -68,8 +85,7 @@ def boundary_vertices(
     faces: Int[Tensor, "face 3"], num_vertices: int
 ) -> Bool[Tensor, " {num_vertices}"]:
     """Mark vertices on an edge that has one face, or more than two."""
-    edges, index = face_edges(faces)
-    return _marked(edges[face_counts(index) != 2], num_vertices)
+    return _marked(open_edges(faces), num_vertices)
 
 
 def corners_of(
@@ -137,7 +153,7 @@ def vertex_fans(
     """
     pairs, ends = face_pairs(faces)
     corners = [
-        3 * pairs + (faces[pairs] == end[:, None, None]).long().argmax(dim=2)
+        torch.stack([_corner(faces, face, end) for face in pairs.unbind(dim=1)], dim=1)
         for end in ends.unbind(dim=1)
     ]
     label = graph_components(torch.cat(corners), 3 * len(faces))
@@ -145,6 +161,14 @@ def vertex_fans(
     order = old.argsort(stable=True)
     rank = torch.empty_like(order).scatter(0, order, torch.arange(len(order)).to(order))
     return old[order], rank[label].reshape(-1, 3)
+
+
+def _corner(
+    faces: Int[Tensor, "face 3"], face: Int[Tensor, " pair"], vertex: Int[Tensor, " pair"]
+) -> Int[Tensor, " pair"]:
+    """Number the corners of faces that are vertices of theirs."""
+    second, third = (faces[face, corner] == vertex for corner in (1, 2))
+    return 3 * face + second.long() + 2 * third.long()
 
 
 def boundary_loops(
@@ -164,11 +188,10 @@ def boundary_loops(
             [1, 3],
             [2, 3]]), tensor([0, 0, 0]))
     """
-    edges, index = face_edges(faces)
-    open_edges = edges[face_counts(index) != 2]
-    if len(open_edges) == 0:
-        return open_edges, open_edges[:, 0]
-    on_border = _marked(open_edges, int(faces.max()) + 1)
+    border = open_edges(faces)
+    if len(border) == 0:
+        return border, border[:, 0]
+    on_border = _marked(border, int(faces.max()) + 1)
     source, separate = vertex_fans(faces[on_border[faces].any(dim=1)])
     edges, index = face_edges(separate)
     alone = face_counts(index) == 1

@@ -140,14 +140,19 @@ def _stamp() -> Path:
     return cache_folder() / f"compiled-{version}-{processor}"
 
 
+def all_compiled() -> bool:
+    """Return whether no kernel of a run is left to compile."""
+    stamp = _stamp()
+    return stamp.exists() and stamp.stat().st_mtime >= _newest_source()
+
+
 @cache
 def compile_ahead() -> "subprocess.Popen[bytes] | None":
     """Start a process, once, that compiles what is not cached; ``None`` where all is.
 
     It ends with this one, however that ends: its standard input is closed then.
     """
-    stamp = _stamp()
-    if stamp.exists() and stamp.stat().st_mtime >= _newest_source():
+    if all_compiled():
         return None
     path = [str(Path(pimper_torch.__path__[0]).parent), os.environ.get("PYTHONPATH", "")]
     child = subprocess.Popen(

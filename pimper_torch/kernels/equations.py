@@ -7,7 +7,6 @@ from pimper_torch.kernels.compile import compiled
 Array = np.ndarray
 
 _REALS = ("float32", "float64")
-_FOUND = "Tuple((int32[::1], int32[::1], float64[::1]))"
 
 
 @compiled("void(int64[:,::1], int32[::1])")
@@ -98,11 +97,9 @@ def judge(
     return used
 
 
-@compiled(f"{_FOUND}(int32[::1], int32[::1], int32[::1], float64[::1])")
-def merged(
-    starts: Array, ends: Array, columns: Array, entries: Array
-) -> tuple[Array, Array, Array]:
-    """Sort every row by column, and add up duplicates."""
+@compiled("int32[::1](int32[::1], int32[::1], int32[::1], float64[::1])")
+def merge(starts: Array, ends: Array, columns: Array, entries: Array) -> Array:
+    """Sort every row by column, add up duplicates, and close the gaps; return the rows' starts."""
     size = len(ends)
     first = np.zeros(size + 1, np.int32)
     filled = 0
@@ -121,4 +118,4 @@ def merged(
             columns[slot], entries[slot] = column, entry
             filled += 1
         first[row + 1] = filled
-    return first, columns[:filled].copy(), entries[:filled].copy()
+    return first

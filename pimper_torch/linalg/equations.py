@@ -83,7 +83,9 @@ def compressed_equations(
     ends, columns, entries = starts.copy(), np.empty(total, np.int32), np.empty(total)
     for unknowns, coefficients, _, weights in sets:
         kernels.fill(unknowns, coefficients, weights, ends, columns, entries)
-    first, columns, entries = kernels.merged(starts, ends, columns, entries)
+    first = kernels.merge(starts, ends, columns, entries)
+    for array in (columns, entries):  # what duplicates took is given back, without a copy
+        array.resize(first[-1], refcheck=False)
     matrix = csr_array((entries, columns, first), shape=(size, size))
     return matrix, torch.from_numpy(side)
 

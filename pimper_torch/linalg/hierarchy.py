@@ -119,13 +119,9 @@ class CompiledLevel(Level):
             return None if matrix is None else lambda vectors: with_product(matrix, vectors)
 
         real = inverse_diagonal.numpy().dtype
-        self._matrix = matrix.astype(real, copy=False)
-        self._prolong_matrix = (
-            None if prolong_matrix is None else prolong_matrix.astype(real, copy=False)
-        )
-        self._restrict_matrix = (
-            None if restrict_matrix is None else restrict_matrix.astype(real, copy=False)
-        )
+        self._matrix = _rounded(matrix, real)
+        self._prolong_matrix = None if prolong_matrix is None else _rounded(prolong_matrix, real)
+        self._restrict_matrix = None if restrict_matrix is None else _rounded(restrict_matrix, real)
         own = product(self._matrix)
         assert own is not None
         super().__init__(
@@ -314,6 +310,12 @@ def torch_product(matrix: csr_array, device: torch.device) -> Product:
             check_invariants=False,
         ).to(device)
     return lambda vector: moved @ vector
+
+
+def _rounded(matrix: csr_array, real: np.dtype[np.floating]) -> csr_array:
+    """Give a matrix with entries of another type; the arrays of indices are shared."""
+    entries = matrix.data.astype(real, copy=False)
+    return csr_array((entries, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 def _columns(vectors: Float[Tensor, "unknown ..."]) -> np.ndarray:

@@ -14,7 +14,7 @@ from pimper_torch.geometry.surfaces import component_areas
 from pimper_torch.geometry.topology import face_components, vertex_fans
 from pimper_torch.ledger import leave_out
 from pimper_torch.meshing.borders import protruding
-from pimper_torch.meshing.faults import faults, overturned, stretched
+from pimper_torch.meshing.faults import faults
 from pimper_torch.meshing.groups import diagonal, small_groups
 from pimper_torch.records import Mesh, Surface
 from pimper_torch.stage import Stage
@@ -101,13 +101,10 @@ class Extract(Stage):
             leave_out("extract.expected_error", keep & ~near, at=(vertices, surface.faces))
             keep &= near
         with_support = int(keep.sum())
-        spikes, long = (
-            self._spikes(surface),
-            stretched(vertices, surface.faces, self.config.max_stretch),
-        )
-        leave_out("extract.spikes", keep & spikes & long, at=(vertices, surface.faces))
-        leave_out("extract.overturned", keep & spikes & ~long, at=(vertices, surface.faces))
-        faces = surface.faces[keep & ~spikes]
+        long, over = self._long_and_overturned(surface)
+        leave_out("extract.spikes", keep & long, at=(vertices, surface.faces))
+        leave_out("extract.overturned", keep & over & ~long, at=(vertices, surface.faces))
+        faces = surface.faces[keep & ~long & ~over]
         if len(faces) == 0:
             raise ReconstructionError(
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
@@ -135,13 +132,16 @@ class Extract(Stage):
             expected_error=None if error is None else error[source],
         )
 
-    def _spikes(self, surface: Surface) -> Bool[Tensor, " face"]:
-        config = self.config
-        vertices, faces, facet = surface.vertices_world.detach(), surface.faces, surface.facet
-        if config.overturned == "folded":
-            return faults(vertices, faces, facet, config.max_stretch).worst(vertices)
-        spikes = stretched(vertices, faces, config.max_stretch)
-        return spikes | overturned(vertices, faces, facet) if config.overturned == "all" else spikes
+    def _long_and_overturned(
+        self, surface: Surface
+    ) -> tuple[Bool[Tensor, " face"], Bool[Tensor, " face"]]:
+        vertices = surface.vertices_world.detach()
+        found = faults(vertices, surface.faces, surface.facet, self.config.max_stretch)
+        long = found.stretched(vertices)
+        if self.config.overturned == "none":
+            return long, torch.zeros_like(long)
+        folded = self.config.overturned == "folded"
+        return long, found.folded_over(vertices) if folded else found.overturned(vertices)
 
 
 def facet_side(surface: Surface) -> float:

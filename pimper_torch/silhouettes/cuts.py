@@ -76,7 +76,7 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
         seen = _voted(cues, masks | _likely(cues), details, unknown)
         if seen is None:
             return None
-        masks, unknown = _again(cues, masks, seen), torch.zeros_like(unknown)
+        masks, unknown = _again(cues, masks, seen, unknown), torch.zeros_like(unknown)
     cues = cues.relearned(masks)
     masks = _filled(cues, masks)
     seen = _voted(cues, masks, details)
@@ -138,13 +138,14 @@ def _again(
     cues: Cues,
     masks: Bool[Tensor, "view height width"],
     seen: Float[Tensor, "view height width"],
+    unknown: Bool[Tensor, "view height width"],
 ) -> Bool[Tensor, "view height width"]:
     """Cut from the last cut and the hull; drop what does not meet the hull."""
 
     def again(view: int) -> Bool[Tensor, "height width"]:
         object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
-        labels = labels_from_hull(seen[view], masks[view], object_px, agreement)
+        labels = labels_from_hull(seen[view], masks[view], object_px, agreement, unknown[view])
         cut = _cut(grab_cut, cues, view, labels, seen[view])
         return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
 

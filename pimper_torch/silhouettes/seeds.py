@@ -75,8 +75,12 @@ def labels_from_hull(
     cut: Bool[Tensor, "height width"],
     object_px: Float[Tensor, "point 2"],
     agreement: Float[Tensor, "height width"] | None,
+    unknown: Bool[Tensor, "height width"] | None = None,
 ) -> UInt8[Tensor, "height width"]:
-    """Seed with a view's last cut, the projection of the hull, points in it, and parallax."""
+    """Seed with a view's last cut, the projection of the hull, points in it, and parallax.
+
+    Nothing is certain where the vote on the hull was ``unknown``, none by default.
+    """
     height, width = margin.shape
     longer = max(height, width)
     labels = torch.full(margin.shape, PERHAPS_BACKGROUND, dtype=torch.uint8)
@@ -87,7 +91,8 @@ def labels_from_hull(
     if agreement is not None:
         labels[_surely_on_plane(agreement)] = BACKGROUND
         labels[_grainless(agreement < _OFF_PLANE) & is_inmost(margin)] = OBJECT
-    labels[margin < -_BEYOND * longer] = BACKGROUND
+    beyond = margin < -_BEYOND * longer
+    labels[beyond if unknown is None else beyond & ~unknown] = BACKGROUND
     discs = discs_at(object_px, _DISC * longer, (width, height))
     labels[discs & (margin > 0)] = OBJECT
     return labels

@@ -44,6 +44,7 @@ class Ran:
         hears, tells = os.pipe()
         self.process = subprocess.Popen(
             [sys.executable, "-c", PROGRAM, *(arguments or ("config",))],
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -175,6 +176,18 @@ def test_what_goes_well_goes_well(tmp_path):
     assert "unexpected ZeroDivisionError" in err
     (report,) = (word for word in err.split() if word.endswith(".txt"))
     Path(report).unlink()
+
+
+def test_a_reader_who_has_read_enough_of_a_table_is_no_crash(tmp_path):
+    table = "from rich.console import Console\nConsole(file=sys.stdout).print('row\\n' * 9999)"
+    ran = Ran(tmp_path, at_run(f"{READY}\nsys.stdin.read()\n{table}"))
+    assert ran.process.stdout is not None
+    assert ran.process.stdin is not None
+    ran.process.stdout.close()
+    ran.process.stdin.close()
+    assert ran.process.wait(timeout=30) == 0
+    assert ran.process.stderr is not None
+    assert ran.process.stderr.read() == ""
 
 
 def test_a_character_that_cannot_be_printed_is_written_otherwise(tmp_path, monkeypatch):

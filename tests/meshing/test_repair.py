@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -8,15 +10,17 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import unit_face_normals, vertex_normals
 from pimper_torch.geometry.topology import (
     boundary_loops,
     boundary_vertices,
     face_edges,
+    face_pairs,
+    graph_components,
     vertex_components,
 )
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.meshing.faults import faults, overturned
+from pimper_torch.meshing.faults import faults
 from pimper_torch.meshing.plates import least_bent
 from pimper_torch.meshing.repair import Repair, RepairConfig, repair, surroundings
 from pimper_torch.records import Convergence, Mesh, Surface
@@ -63,6 +67,10 @@ def folded_sphere(subdivisions=4):
     return vertices, surface_of(dragged, faces, surface_of(vertices, faces).facet)
 
 
+def overturned(mesh, facet):
+    return faults(mesh.vertices_world, mesh.faces, facet, torch.inf).overturned(mesh.vertices_world)
+
+
 def sides(vertices, faces):
     edges, _ = face_edges(faces)
     return (vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1)
@@ -82,7 +90,7 @@ def test_a_folded_sphere_was_slit_and_comes_out_closed():
     assert found.folds == 0
     assert found.euler == 2
     assert torch.equal(mesh.faces, surface.faces)
-    assert not overturned(mesh.vertices_world, mesh.faces, surface.facet).any()
+    assert not overturned(mesh, surface.facet).any()
     true = volume(surface.replace(vertices_world=sphere))
     assert abs(volume(mesh) / true - 1) < 3e-5  # what the plates cut off
     assert abs(volume(surface) / true - 1) > 3e-4
@@ -106,7 +114,7 @@ def test_only_repaired_vertices_change_and_their_confidence_is_zero():
 
 def test_without_repair_exactly_the_overturned_faces_go():
     _, surface = folded_sphere()
-    gone = overturned(surface.vertices_world, surface.faces, surface.facet)
+    gone = overturned(surface, surface.facet)
     mesh = Extract(OLD)(surface)
     assert gone.sum() > 6
     assert_close(
@@ -128,6 +136,21 @@ def test_looking_only_round_the_folds_changes_nothing():
     near = surroundings(surface.faces, found.broken(vertices), len(vertices))
     assert near.sum() < 0.7 * len(near)
     assert_close(Repair()(surface).vertices_world, whole)
+
+
+def test_folds_looked_for_among_few_faces_are_those_of_all(generator):
+    _, surface = folded_sphere()
+    vertices, faces = surface.vertices_world, surface.faces
+    vertices = vertices + 0.03 * torch.randn(vertices.shape, generator=generator).double()
+    found = faults(vertices, faces, surface.facet, torch.inf)
+    normals, pairs = unit_face_normals(vertices, faces), face_pairs(faces)[0]
+    fold = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(dim=1) < math.cos(math.radians(110))
+    over = found.overturned(vertices)
+    label = graph_components(pairs[over[pairs].all(dim=1)], len(faces))
+    folded = torch.zeros_like(over).index_fill(0, pairs[fold].flatten(), True)
+    folded |= over & torch.isin(label, label[folded & over])
+    assert 20 < folded.sum() < len(faces) / 2
+    assert (found.broken(vertices) == folded).all()
 
 
 def test_a_genuine_opening_stays_as_it_is():
@@ -160,7 +183,7 @@ def test_a_fold_at_the_border_goes_as_before():
         through[((group == label) & dragged).nonzero()[0]] = True
     cut = surface.replace(faces=surface.faces[~through[surface.faces].any(dim=1)])
     folds = faults(cut.vertices_world, cut.faces, cut.facet, torch.inf)
-    gone = folds.worst(cut.vertices_world)
+    gone = folds.folded_over(cut.vertices_world)
     assert gone.sum() > 6
     mesh = Extract()(Repair()(cut))
     assert (mesh.confidence == 1).all()
@@ -198,7 +221,7 @@ def test_a_facet_that_bends_far_has_no_fold():
     bulge[:, 2] = torch.where(bulge[:, 2] > 0, 4 * bulge[:, 2], bulge[:, 2])
     surface = surface_of(bulge, faces, torch.zeros(len(bulge), dtype=torch.long))
     surface = surface.replace(faces=faces[(bulge[faces][..., 2] > -0.8).all(dim=1)])
-    assert overturned(surface.vertices_world, surface.faces, surface.facet).any()
+    assert overturned(surface, surface.facet).any()
     mesh = Extract()(Repair()(surface))
     assert len(mesh.faces) == len(surface.faces)
     assert (mesh.confidence == 1).all()

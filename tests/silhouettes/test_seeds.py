@@ -137,3 +137,13 @@ def test_the_middle_of_a_thin_part_is_the_objects_and_a_shadows_edge_is_not(thin
     assert (labels[190:210, 124:126] == OBJECT).all()
     assert not (labels[185:, :122] == OBJECT).any()
     assert not (labels[185:, 128:] == OBJECT).any()
+
+
+def test_where_the_vote_was_unknown_nothing_is_certain_outside_the_hull(thing):
+    unknown, margin = square(0, 0, WIDTH, 40), signed_distance(thing)
+    agreement = agreeing(thing).masked_fill(unknown, torch.nan)
+    labels = labels_from_hull(margin, thing, NOTHING, agreement, unknown)
+    assert (labels[:40][margin[:40] < -20] == PERHAPS_BACKGROUND).all()
+    without = labels_from_hull(margin, thing, NOTHING, agreement)
+    assert (without[:40] == BACKGROUND).all()
+    assert torch.equal(labels[40:], without[40:])
