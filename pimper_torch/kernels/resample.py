@@ -144,46 +144,22 @@ def register(
                                 )
                                 if here == 0:
                                     unusable += weight * bilinear(
-                                        unusable_finest,
-                                        view,
-                                        at,
-                                        aside,
-                                        under,
-                                        across,
-                                        down,
+                                        unusable_finest, view, at, aside, under, across, down
                                     )
                                     for channel in range(channels):
                                         blended[channel] = weight * bilinear(
-                                            finest,
-                                            view,
-                                            at,
-                                            aside,
-                                            under,
-                                            across,
-                                            down,
+                                            finest, view, at, aside, under, across, down
                                         )
                                         at += fine_plane
                                     continue
                                 start = levels[here, 2]
                                 unusable += weight * bilinear(
-                                    unusable_coarser,
-                                    view,
-                                    start + at,
-                                    aside,
-                                    under,
-                                    across,
-                                    down,
+                                    unusable_coarser, view, start + at, aside, under, across, down
                                 )
                                 at += channels * start
                                 for channel in range(channels):
                                     value = weight * bilinear(
-                                        coarser,
-                                        view,
-                                        at,
-                                        aside,
-                                        under,
-                                        across,
-                                        down,
+                                        coarser, view, at, aside, under, across, down
                                     )
                                     blended[channel] = (
                                         value if step == 0 else blended[channel] + value
