@@ -55,7 +55,8 @@ class CoarseToFineConfig:
 
     Attributes:
         chain: Which chain these are the settings of.
-        kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or none.
+        kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
+            what is constant to autograd: structure from motion, the coarse surface (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         max_memory: Such as 4GB: a run whose last pass would take more is refused in its first.
         scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.

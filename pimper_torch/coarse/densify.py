@@ -1,6 +1,6 @@
 """Depth maps of all views from windows that match, coarse to fine."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -106,9 +106,10 @@ def depth_maps(
     """
     maps: list[DepthMaps] = []
     for factor in config.factors(max(scene.views.images.shape[-2:])):
-        level, before = level_of(scene, factor), maps[-1] if maps else None
-        search = partial(_searched, scene, points, level, config, before)
-        found = list(side_by_side(search, range(scene.cameras.num_views)))
+        level = level_of(scene, factor)
+        search = partial(_search, scene, points, level, config, maps[-1] if maps else None)
+        solve = partial(_search_or_nothing, search, scene.views.names, level)
+        found = list(side_by_side(solve, range(scene.cameras.num_views)))
         maps.append(_checked(factor, level, found))
     return tuple(maps)
 
@@ -121,25 +122,16 @@ class _Found(Record):
     sources: Int[Tensor, " source"]
 
 
-def _searched(
-    scene: SparseScene,
-    points: Int[Tensor, " chosen"],
-    level: Level,
-    config: DensifyConfig,
-    before: DepthMaps | None,
-    view: int,
+def _search_or_nothing(
+    search: Callable[[int], _Found], names: Sequence[str], level: Level, view: int
 ) -> _Found:
-    """Search a view's depths; none are found where that fails."""
-
-    def nothing() -> _Found:
-        blank, none = torch.zeros_like(level.tone[view]), points.new_zeros(0)
-        return _Found(inverse_depth=blank, score=blank, step=0.0, sources=none)
-
+    blank = torch.zeros_like(level.tone[view])
+    none = torch.zeros(0, dtype=torch.long, device=blank.device)
     return solved_or(
-        lambda: _search(scene, points, level, config, before, view),
-        nothing,
+        lambda: search(view),
+        lambda: _Found(inverse_depth=blank, score=blank, step=0.0, sources=none),
         stage="coarse_surface",
-        name=f"depths of {scene.views.names[view]}",
+        name=f"depths of {names[view]}",
         done="The coarse surface is found without these",
     )
 

@@ -198,7 +198,7 @@ def _in_source(
     pairing = pair(maps.level, view, one)
     field, there = maps.inverse_depth[view], maps.agreed > 0
     agrees = agreeing(maps.level, maps.inverse_depth, there, view, one, _AGREEING_PX)[chosen] > 0
-    alike = Matcher(maps.level, pairing, Windows()).score(field)[chosen] >= _ALIKE
+    alike = Matcher(maps.level, pairing, Windows()).scores(field, [0.0])[0, chosen] >= _ALIKE
     rays = pairing.replace(ray=pairing.ray[:, :, chosen])
     height, width = chosen.shape
     grid = grid_from_pixels(rays.look(field[chosen])[0].movedim(1, -1), width, height)

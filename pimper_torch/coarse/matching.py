@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, pad
+from torch.nn.functional import avg_pool2d, pad
 
-from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers, scale_intrinsics
-from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
+from pimper_torch.kernels.arrays import as_array
 from pimper_torch.records import Cameras, Record, SparseScene
 
 # Added to radiance over its bright level before the root, so that the noise of black pixels is not
@@ -140,98 +141,51 @@ class Matcher:
     """
 
     def __init__(self, level: Level, pairing: Pairing, windows: Windows) -> None:
-        self._pairing, self._windows = pairing, windows
-        self._sources = level.tone[pairing.sources, None]
-        self._usable = level.usable[pairing.sources, None].to(self._sources)
-        self._here = level.usable[pairing.view]
-        tone = level.tone[pairing.view]
-        self._compiled = tone.dtype == torch.float32 and compiled_for(tone)
-        if self._compiled:
-            self._weigh(tone)
-            return
-        around = torch.stack(shifted(tone, windows.radius, "replicate"))
-        weight = _spatial(windows.radius).to(tone)[:, None, None] * torch.exp(
+        radius, tone = windows.radius, level.tone[pairing.view].detach().float()
+        here = level.usable[pairing.view]
+        around = torch.stack(shifted(tone, radius, "replicate"))
+        weight = _spatial(radius).to(tone)[:, None, None] * torch.exp(
             -((around - tone) / windows.likeness).square() / 2
         )
-        weight = weight * torch.stack(shifted(self._here.to(tone), windows.radius, "replicate"))
-        self._weight = weight / weight.sum(dim=0).clamp_min(1e-12)
-        self._mean = (self._weight * around).sum(dim=0)
+        weight *= torch.stack(shifted(here.to(tone), radius, "replicate"))
+        weight /= weight.sum(dim=0).clamp_min(1e-12)
         # Around the mean, so that no difference of large numbers is left for single precision.
-        self._deviation = self._weight * (around - self._mean)
-        self._power = (self._deviation * (around - self._mean)).sum(dim=0)
-
-    def _weigh(self, tone: Float[Tensor, "height width"]) -> None:
-        from pimper_torch.kernels.windows import window_weights
-
-        radius = self._windows.radius
-        self._power = torch.empty_like(tone)
-        self._weight = tone.new_empty((2 * radius + 1) ** 2, *tone.shape)
-        self._deviation = torch.empty_like(self._weight)
-        window_weights(
-            tone.contiguous().numpy(),
-            self._here.contiguous().numpy(),
-            _spatial(radius).double().numpy(),
-            self._windows.likeness,
-            self._weight.numpy(),
-            self._deviation.numpy(),
-            self._power.numpy(),
-        )
+        around -= (weight * around).sum(dim=0)
+        deviation = weight * around
+        power = (deviation * around).sum(dim=0)
+        of_sources = pairing.ray, pairing.shift, level.tone[pairing.sources]
+        self._ray, self._shift, self._tone = (as_array(one, torch.float32) for one in of_sources)
+        self._usable, self._here = as_array(level.usable[pairing.sources]), as_array(here)
+        self._weight, self._deviation, self._power = map(as_array, (weight, deviation, power))
+        self._windows = windows
 
     def scores(
         self, field: Float[Tensor, "height width"], offsets: Sequence[float]
     ) -> Float[Tensor, "offset height width"]:
-        """Score a field of inverse depths moved by each of some offsets."""
-        if not self._compiled:
-            smallest = torch.finfo(field.dtype).tiny
-            return torch.stack([self.score((field + one).clamp_min(smallest)) for one in offsets])
+        """Score a field of inverse depths moved by each of some offsets.
+
+        The score is the mean correlation of the best sources, 0 where none sees the pixel:
+        computed on the CPU in single precision, a constant to autograd.
+        """
         from pimper_torch.kernels.windows import window_scores
 
-        found = field.new_empty(len(offsets), *field.shape)
+        found = torch.empty(len(offsets), *field.shape)
         window_scores(
-            field.contiguous().numpy(),
-            field.new_tensor(offsets).numpy(),
-            self._pairing.ray.numpy(),
-            self._pairing.shift.numpy(),
-            self._sources[:, 0].numpy(),
-            (self._usable[:, 0] > 0).numpy(),
-            self._weight.numpy(),
-            self._deviation.numpy(),
-            self._power.numpy(),
-            self._here.numpy(),
+            as_array(field, torch.float32),
+            np.array(offsets, dtype=np.float32),
+            self._ray,
+            self._shift,
+            self._tone,
+            self._usable,
+            self._weight,
+            self._deviation,
+            self._power,
+            self._here,
             self._windows.contrast**2,
             self._windows.best,
             found.numpy(),
         )
-        return found
-
-    def score(self, inverse_depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-        """Give the mean correlation of the best sources, 0 where none sees the pixel."""
-        height, width = inverse_depth.shape
-        pixels, ratio = self._pairing.look(inverse_depth)
-        grid = grid_from_pixels(pixels.movedim(1, -1), width, height)
-        seen = grid_sample(self._sources, grid, padding_mode="border", align_corners=False)[:, 0]
-        there = (grid_sample(self._usable, grid, mode="nearest", align_corners=False)[:, 0] > 0) & (
-            ratio > 0
-        )
-        correlation = torch.stack([self._correlation(one) for one in seen])
-        correlation = torch.where(there & self._here, correlation, 0)
-        best = min(self._windows.best, len(correlation))
-        return correlation.topk(best, dim=0).values.mean(dim=0)
-
-    def _correlation(self, seen: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-        radius, floor = self._windows.radius, self._windows.contrast**2
-        mean, square, both = (torch.zeros_like(seen) for _ in range(3))
-        maps = zip(
-            shifted(seen, radius, "replicate"),
-            shifted(seen.square(), radius, "replicate"),
-            strict=True,
-        )
-        for index, (value, power) in enumerate(maps):
-            mean.addcmul_(self._weight[index], value)
-            square.addcmul_(self._weight[index], power)
-            both.addcmul_(self._deviation[index], value)
-        spread = (square - mean.square()).clamp_min(0)
-        return both / ((spread + floor) * (self._power + floor)).sqrt()
+        return found.to(field)
 
 
 def shifted(

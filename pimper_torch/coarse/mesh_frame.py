@@ -43,20 +43,12 @@ class Rays(Record):
     Attributes:
         origins: Of the cameras.
         directions: To a point, with its distance for length; through a pixel.
-        inside: Of a pixel: whether the mask has it. Empty for rays to points.
+        inside: Of a pixel: whether the mask has it; true for points.
     """
 
     origins: Float[Tensor, "ray 3"]
     directions: Float[Tensor, "ray 3"]
-    inside: Bool[Tensor, " pixel"]
-
-    def every(self, step: int) -> "Rays":
-        """Take every so-many-th ray."""
-        return Rays(
-            origins=self.origins[::step],
-            directions=self.directions[::step],
-            inside=self.inside[::step],
-        )
+    inside: Bool[Tensor, " ray"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +103,7 @@ def compare_with_scene(
     here = torch.eye(3, dtype=torch.float64)
 
     def fit(world_from_mesh: Float[Tensor, "3 3"], every: int = 1) -> Fit:
-        some = [rays.every(every) for rays in seen]
+        some = [rays.take(slice(None, None, every)) for rays in seen]
         return _fit(caster, diagonal, some[0], some[1], world_from_mesh, scene.offset_world)
 
     found = fit(here)
@@ -276,11 +268,7 @@ def _to_points(scene: SparseScene, masks: Bool[Tensor, "view height width"] | No
         inside &= depth[:, 0] > 0
         kept = inside & masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
         kept = kept.cpu()
-    return Rays(
-        origins=origins[kept],
-        directions=(points - origins)[kept],
-        inside=torch.zeros(0, dtype=torch.bool),
-    )
+    return Rays(origins=origins, directions=points - origins, inside=kept).take(kept)
 
 
 def _to_pixels(

@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.linalg import cross
 from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.matching import shifted
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import project, rays_through
-from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record, SparseScene
@@ -158,11 +158,7 @@ def fitted_planes(
         The planes' inverse depths and slopes a pixel, the standard deviation of that inverse
         depth, and True where enough neighbours lie on the plane.
     """
-    if inverse_depth.dtype == torch.float32 and compiled_for(inverse_depth):
-        fits = _compiled_fits(inverse_depth, valid, max(step, 1e-30))
-    else:
-        fits = _fits(inverse_depth, valid, max(step, 1e-30))
-    offset, across, down, variance, fraction = fits
+    offset, across, down, variance, fraction = _fits(inverse_depth, valid, max(step, 1e-30))
     fitted = valid & (fraction >= _MIN_FRACTION) & (offset.abs() < 1)
     # Neighbouring windows overlap, so that their errors are correlated: averaging gains nothing.
     spread = step * variance.sqrt().clamp_min(0.05)
@@ -172,75 +168,52 @@ def fitted_planes(
 def _fits(
     inverse_depth: Float[Tensor, "height width"], valid: Bool[Tensor, "height width"], step: float
 ) -> Float[Tensor, "5 height width"]:
-    """Give offset, slopes, variance and mean weight of planes, in steps; 0 where not valid."""
-    steps = torch.arange(-_RADIUS, _RADIUS + 1).to(inverse_depth)
-    v, u = (one.reshape(-1) for one in torch.meshgrid(steps, steps, indexing="ij"))
-    basis = torch.stack([torch.ones_like(u), u, v], dim=-1)
-    around = (
-        torch.stack(shifted(inverse_depth, _RADIUS, "constant"), dim=-1) - inverse_depth[..., None]
-    )
-    counted = torch.stack(shifted(valid.to(inverse_depth), _RADIUS, "constant"), dim=-1)
-    around, counted = around[valid] / step, counted[valid]
-    weight = counted * torch.exp(-(around / _REACH_STEPS).square() / 2)
-    fit = torch.zeros_like(around[:, :3])
+    """Return offset, slopes, variance and mean weight of planes, in steps; 0 where not valid."""
+    side = torch.arange(-_RADIUS, _RADIUS + 1).to(inverse_depth)
+    v, u = (one.reshape(-1) for one in torch.meshgrid(side, side, indexing="ij"))
+    basis = torch.stack([torch.ones_like(u), u, v])
+    squares = (basis[:, None] * basis).flatten(0, 1)
+    ridge = _RIDGE * torch.eye(3).to(basis)[..., None]
+
+    def around(values: Float[Tensor, "height width"]) -> Float[Tensor, "entry pixel"]:
+        return torch.stack([one[valid] for one in shifted(values, _RADIUS, "constant")])
+
+    differences = (around(inverse_depth) - inverse_depth[valid]) * (1 / step)
+    counted = around(valid.to(inverse_depth))
+    weight = counted * torch.exp(-(differences / _REACH_STEPS).square() / 2)
     for _ in range(_ITERATIONS):
-        normal = torch.einsum("pk,ki,kj->pij", weight, basis, basis)
-        normal = normal + _RIDGE * torch.eye(3).to(normal)
-        fit = torch.linalg.solve(normal, torch.einsum("pk,ki,pk->pi", weight, basis, around))
-        residual = around - fit @ basis.T
-        weight = counted * torch.exp(-residual.square() / 2)
-    fraction = weight.sum(dim=-1) / len(basis)
-    variance = (weight * residual.square()).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1e-6)
+        a, b, c = (squares @ weight).double().reshape(3, 3, -1) + ridge
+        right = (basis @ (weight * differences))[:, None]
+        # Cramer's rule: the whole fit takes 0.8 times as long as with LAPACK.
+        adjugate = torch.stack([cross(b, c, dim=0), cross(c, a, dim=0), cross(a, b, dim=0)])
+        fit = ((adjugate * right).sum(dim=0) / (a * adjugate[0]).sum(dim=0)).to(weight)
+        square = (differences - basis.mT @ fit).square_()
+        weight = counted * torch.exp(-square / 2)
+    total = weight.sum(dim=0)
+    variance = (weight * square).sum(dim=0) / total.clamp_min(1e-6)
     results = inverse_depth.new_zeros(5, *inverse_depth.shape)
-    results[:, valid] = torch.stack([*fit.unbind(dim=1), variance, fraction])
-    return results
-
-
-def _compiled_fits(
-    inverse_depth: Float[Tensor, "height width"], valid: Bool[Tensor, "height width"], step: float
-) -> Float[Tensor, "5 height width"]:
-    from pimper_torch.kernels.planes import plane_fits
-
-    results = inverse_depth.new_zeros(5, *inverse_depth.shape)
-    plane_fits(
-        inverse_depth.contiguous().numpy(),
-        valid.contiguous().numpy(),
-        step,
-        _RADIUS,
-        _REACH_STEPS,
-        _RIDGE,
-        _ITERATIONS,
-        results.numpy(),
-    )
+    results[:, valid] = torch.cat([fit, variance[None], total[None] / len(counted)])
     return results
 
 
 def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
     """Count the views whose depth maps lie behind the points, and so contradict them."""
     cameras, count = maps.level.cameras, torch.zeros_like(points[:, 0], dtype=torch.long)
-    if points.dtype == maps.inverse_depth.dtype == torch.float32 and compiled_for(points):
-        from pimper_torch.kernels.denied import count_denied
-
-        count_denied(
-            points.contiguous().numpy(),
-            view,
-            (cameras.intrinsics @ cameras.cam_from_world[:, :3]).contiguous().numpy(),
-            maps.inverse_depth.numpy(),
-            maps.valid.numpy(),
-            (_DENIED_STEPS * maps.step).numpy(),
-            count.numpy(),
-        )
-        return count
+    pixels_from_world = cameras.intrinsics @ cameras.cam_from_world[:, :3]
     height, width = maps.valid.shape[-2:]
     for other in range(cameras.num_views):
         if other == view:
             continue
-        pixels, depth = project(points, cameras.cam_from_world[other], cameras.intrinsics[other])
-        column, row = pixels.nan_to_num(-1).floor().long().unbind(dim=-1)
-        inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-        behind = maps.inverse_depth[other, row, column] + _DENIED_STEPS * maps.step[other]
-        count += inside & maps.valid[other, row, column] & (1 / depth > behind)
+        to = pixels_from_world[other]
+        x, y, depth = to[:, :3] @ points.mT + to[:, 3:]
+        column, row = (x / depth).floor(), (y / depth).floor()
+        inside = (column == column.clamp(0, width - 1)) & (row == row.clamp(0, height - 1))
+        inside &= depth > 0
+        pixel = torch.where(inside, row, 0).int() * width + torch.where(inside, column, 0).int()
+        # Half the time of indexing by rows and columns.
+        behind = maps.inverse_depth[other].flatten().index_select(0, pixel)
+        known = maps.valid[other].flatten().index_select(0, pixel)
+        count += inside & known & (1 / depth > behind + _DENIED_STEPS * maps.step[other])
     return count
 
 

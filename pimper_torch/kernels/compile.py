@@ -26,7 +26,7 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 # The kernels of each part of a run, in the order of need.
 SFM = ("line_matches", "patch_alignment")
-COARSE = ("windows", "planes", "denied")
+COARSE = ("windows",)
 PHOTOMETRY = ("resample", "lights", "factorization")
 SWEEP = ("sweep",)
 SURFACE = ("equations", "sparse", "conjugate_gradients", "aggregation", "decimation")

@@ -1,4 +1,4 @@
-"""The best matches near each feature's epipolar line: twin of ``sfm.guided.likeness``."""
+"""The best matches near each feature's epipolar line."""
 
 import numpy as np
 import numpy.typing as npt

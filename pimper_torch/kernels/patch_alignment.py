@@ -1,4 +1,4 @@
-"""Patches of a view aligned with templates: twin of ``sfm.track_observations._iterated``."""
+"""Patches of a view aligned with templates."""
 
 import numpy as np
 import numpy.typing as npt

@@ -144,46 +144,22 @@ def register(
                                 )
                                 if here == 0:
                                     unusable += weight * bilinear(
-                                        unusable_finest,
-                                        view,
-                                        at,
-                                        aside,
-                                        under,
-                                        across,
-                                        down,
+                                        unusable_finest, view, at, aside, under, across, down
                                     )
                                     for channel in range(channels):
                                         blended[channel] = weight * bilinear(
-                                            finest,
-                                            view,
-                                            at,
-                                            aside,
-                                            under,
-                                            across,
-                                            down,
+                                            finest, view, at, aside, under, across, down
                                         )
                                         at += fine_plane
                                     continue
                                 start = levels[here, 2]
                                 unusable += weight * bilinear(
-                                    unusable_coarser,
-                                    view,
-                                    start + at,
-                                    aside,
-                                    under,
-                                    across,
-                                    down,
+                                    unusable_coarser, view, start + at, aside, under, across, down
                                 )
                                 at += channels * start
                                 for channel in range(channels):
                                     value = weight * bilinear(
-                                        coarser,
-                                        view,
-                                        at,
-                                        aside,
-                                        under,
-                                        across,
-                                        down,
+                                        coarser, view, at, aside, under, across, down
                                     )
                                     blended[channel] = (
                                         value if step == 0 else blended[channel] + value
@@ -200,112 +176,3 @@ def register(
                         radiance[patch, view, channel, row, column] = (
                             blended[channel] if usable else np.float32(0)
                         )
-
-
-@compiled(
-    "int64(boolean[:,:,:,::1], int64[::1], int64[::1], boolean[:,:,:,::1])",
-)
-def sites(valid: Array, rows: Array, columns: Array, tested: Array) -> int:
-    """Mark the sites of occlusion tests that have a valid sample, and count them.
-
-    Args:
-        valid: Of every patch, view and sample.
-        rows: The row of sites of each row of samples.
-        columns: Likewise.
-        tested: Result, false before.
-    """
-    count = 0
-    patches, views, height, width = valid.shape
-    for patch in range(patches):
-        for view in range(views):
-            for row in range(height):
-                for column in range(width):
-                    if valid[patch, view, row, column]:
-                        site = tested[patch, view, rows[row]]
-                        if not site[columns[column]]:
-                            site[columns[column]] = True
-                            count += 1
-    return count
-
-
-@compiled(
-    "void(boolean[:,:,:,::1], float64[:,:,:,::1], float64[:,::1], float64[::1],"
-    "float32[:,::1], float32[:,::1], float32[::1])"
-)
-def sight_lines(
-    tested: Array,
-    points: Array,
-    centers: Array,
-    tolerance: Array,
-    starts: Array,
-    directions: Array,
-    reach: Array,
-) -> None:
-    """List the rays from cameras to the tested sites.
-
-    Args:
-        tested: Of every patch, view and site.
-        points: Of every patch and site, world.
-        centers: Of the cameras, world.
-        tolerance: Of every patch: a ray ends so far before the point of its site.
-        starts: Result.
-        directions: Result; unit.
-        reach: Result: lengths.
-    """
-    ray = 0
-    patches, views, height, width = tested.shape
-    for patch in range(patches):
-        for view in range(views):
-            for row in range(height):
-                for column in range(width):
-                    if tested[patch, view, row, column]:
-                        square = 0.0
-                        for axis in range(3):
-                            step = points[patch, row, column, axis] - centers[view, axis]
-                            square += step * step
-                            starts[ray, axis] = centers[view, axis]
-                        length = math.sqrt(square)
-                        for axis in range(3):
-                            step = points[patch, row, column, axis] - centers[view, axis]
-                            directions[ray, axis] = step / length
-                        reach[ray] = max(0.0, length - tolerance[patch])
-                        ray += 1
-
-
-@compiled(
-    "void(boolean[:,:,:,::1], boolean[::1], int64[::1], int64[::1],"
-    "float32[:,:,:,:,::1], boolean[:,:,:,::1])"
-)
-def hide(
-    tested: Array, blocked: Array, rows: Array, columns: Array, radiance: Array, valid: Array
-) -> None:
-    """Mark the samples of occluded sites as missing.
-
-    Args:
-        tested: From :func:`sites`; overwritten.
-        blocked: Of every ray, in the order of :func:`sight_lines`.
-        rows: See :func:`sites`.
-        columns: Likewise.
-        radiance: Becomes zero where occluded.
-        valid: Becomes false where occluded.
-    """
-    ray = 0
-    patches, views, channels, height, width = radiance.shape
-    for patch in range(patches):
-        for view in range(views):
-            any_sample = False
-            hidden = tested[patch, view]
-            for row in range(hidden.shape[0]):
-                for column in range(hidden.shape[1]):
-                    if hidden[row, column]:
-                        hidden[row, column] = blocked[ray]
-                        any_sample = any_sample or blocked[ray]
-                        ray += 1
-            if not any_sample:
-                continue
-            for row in range(height):
-                for column in range(width):
-                    if hidden[rows[row], columns[column]]:
-                        valid[patch, view, row, column] = False
-                        for channel in range(channels):
-                            radiance[patch, view, channel, row, column] = 0

@@ -15,7 +15,7 @@ _chosen: ContextVar[Kernels] = ContextVar("kernels", default="numba")
 
 @contextmanager
 def using(kernels: Kernels) -> Iterator[None]:
-    """Choose inside the ``with`` block: ``"numba"``, compiled kernels; ``"torch"``, none."""
+    """Choose inside the ``with`` block whether kernels stand in for torch."""
     token = _chosen.set(kernels)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Window correlations of all hypotheses of inverse depth: twin of ``coarse.matching.Matcher``."""
+"""Window correlations of all hypotheses of inverse depth."""
 
 import math
 
@@ -11,62 +11,6 @@ from pimper_torch.kernels.compile import compiled
 _CACHED = 3 << 18
 
 _ROW = "float32[::1]"
-
-
-@compiled(
-    "void(float32[:,::1], boolean[:,::1], float64[::1], float64, float32[:,:,::1], "
-    "float32[:,:,::1], float32[:,::1])"
-)
-def window_weights(
-    tone: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-    spatial: NDArray[np.float64],
-    likeness: float,
-    weight: NDArray[np.float32],
-    deviation: NDArray[np.float32],
-    power: NDArray[np.float32],
-) -> None:
-    """Compute what :func:`window_scores` needs of every window of the reference view.
-
-    Args:
-        tone: Of the view, ``height width``.
-        valid: Of its pixels; elsewhere the result is 0.
-        spatial: Weight of every entry of a window, row by row.
-        likeness: Difference of tone to the centre at which a weight falls to 0.6.
-        weight: Result, ``entry height width``; adds up to 1 over a window.
-        deviation: Result: weight times the difference of the tone to the window's mean.
-        power: Result: variance of the tone in the window.
-    """
-    height, width = tone.shape
-    num_entries = len(spatial)
-    side = int(math.sqrt(num_entries) + 0.5)
-    window_tones, raw = np.empty(num_entries), np.empty(num_entries)
-    rows, columns = np.empty(num_entries, dtype=np.int64), np.empty(num_entries, dtype=np.int64)
-    for entry in range(num_entries):
-        rows[entry], columns[entry] = entry // side - side // 2, entry % side - side // 2
-    weight[:] = 0
-    deviation[:] = 0
-    power[:] = 0
-    for y in range(height):
-        for x in range(width):
-            if not valid[y, x]:
-                continue
-            total = mean = variance = 0.0
-            for entry in range(num_entries):
-                row = min(max(y + rows[entry], 0), height - 1)
-                column = min(max(x + columns[entry], 0), width - 1)
-                window_tones[entry] = tone[row, column]
-                away = (window_tones[entry] - tone[y, x]) / likeness
-                raw[entry] = spatial[entry] * math.exp(-away * away / 2) * valid[row, column]
-                total += raw[entry]
-                mean += raw[entry] * window_tones[entry]
-            mean /= total
-            for entry in range(num_entries):
-                scaled = raw[entry] / total
-                centered = scaled * (window_tones[entry] - mean)
-                weight[entry, y, x], deviation[entry, y, x] = scaled, centered
-                variance += centered * (window_tones[entry] - mean)
-            power[y, x] = variance
 
 
 # Loops of one written row and few read ones: only those become vector instructions.
@@ -207,7 +151,7 @@ def window_scores(
         shift: Of the same, ``source 3``.
         tone: Of the sources, ``source height width``.
         usable: Valid pixels of the sources.
-        weight: Of the pixels of every window, ``entry height width``; 0 where ``valid`` is false.
+        weight: Of the pixels of every window, ``entry height width``; adds up to 1.
         deviation: That weight times the tone's difference to the window's mean.
         power: Variance of the tone in every window.
         valid: Of the reference view; elsewhere the score is 0.

@@ -1,11 +1,12 @@
 """The compiled registration of a bucket of templates: the matrices J and D."""
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.patches.sources import Sources
 from pimper_torch.records import Cameras, Observations, Templates
@@ -62,48 +63,39 @@ def resampled(
     return Observations(radiance=radiance, valid=valid)
 
 
-def hide(
-    registered: Observations, cameras: Cameras, sources: Sources, templates: Templates, stride: int
-) -> None:
-    """Invalidate, in place, the samples that the sources' surface occludes.
+def occluded(
+    valid: Bool[Tensor, "patch view height width"],
+    cameras: Cameras,
+    caster: RayCaster,
+    templates: Templates,
+    stride: int,
+) -> Bool[Tensor, "patch view height width"]:
+    """Mark samples that a surface occludes; a constant to autograd.
 
-    One ray for every ``stride`` samples either way, from the camera to just before the surface;
-    all of a bucket at once.
+    One ray for every ``stride`` samples either way, from the camera to just before the surface,
+    where one of these samples is valid; all of a bucket at once.
     """
-    from pimper_torch.kernels import resample
-
-    assert sources.caster is not None
-    sparse = templates.points_patch[:, stride // 2 :: stride, stride // 2 :: stride].double()
+    middle = slice(stride // 2, None, stride)
+    sparse = templates.points_patch.detach()[:, middle, middle].double()
     if sparse.numel() == 0:
-        return
-    world_from_patch = invert_rigid(templates.patch_from_world.double())
-    height, width = sparse.shape[1:3]
+        return torch.zeros_like(valid)
+    world_from_patch = invert_rigid(templates.patch_from_world.detach().double())
     points = transform(world_from_patch, sparse.flatten(1, 2)).reshape(sparse.shape)
-    wanted = torch.zeros(*registered.valid.shape[:2], height, width, dtype=torch.bool)
-    rows = as_array(_nearest_site(height, templates.depth.shape[1]))
-    columns = as_array(_nearest_site(width, templates.depth.shape[2]))
-    rays = resample.sites(as_array(registered.valid), rows, columns, as_array(wanted))
-    starts, directions, reach = torch.empty(rays, 3), torch.empty(rays, 3), torch.empty(rays)
+    rows, columns = (
+        _nearest_site(sites, samples).to(valid.device)
+        for sites, samples in zip(sparse.shape[1:3], valid.shape[2:], strict=True)
+    )
+    shape = *valid.shape[:2], len(points[0]), valid.shape[3]
+    near = valid.new_zeros(shape).index_add_(2, rows, valid)
+    near = near.new_zeros(*near.shape[:3], points.shape[2]).index_add_(3, columns, near)
+    patch, view, row, column = near.nonzero(as_tuple=True)
+    starts = cameras.centers_world.detach().double()[view]
+    directions = points[patch, row, column] - starts
+    length = directions.norm(dim=1)
     # An enlarged triangle dips under its neighbours by the overlap's fraction of their slope.
-    tolerance = 4 * stride * templates.spacing
-    resample.sight_lines(
-        as_array(wanted),
-        as_array(points),
-        as_array(cameras.to(torch.float64).centers_world),
-        as_array(tolerance, torch.float64),
-        as_array(starts),
-        as_array(directions),
-        as_array(reach),
-    )
-    blocked = sources.caster.blocked(starts, directions, reach)
-    resample.hide(
-        as_array(wanted),
-        as_array(blocked),
-        rows,
-        columns,
-        as_array(registered.radiance),
-        as_array(registered.valid),
-    )
+    reach = (length - 4 * stride * templates.spacing.detach()[patch]).clamp_min(0)
+    near[patch, view, row, column] = caster.blocked(starts, directions / length[:, None], reach)
+    return near[:, :, rows][..., columns]
 
 
 def _nearest_site(sites: int, samples: int) -> Int[Tensor, " sample"]:

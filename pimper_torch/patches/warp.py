@@ -7,18 +7,17 @@ from functools import partial
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import normalize
 
 from pimper_torch.config import require, require_at_most
 from pimper_torch.failures import over_patches
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.pyramid import look_up, pyramid_level
-from pimper_torch.patches.resample import hide, resampled
+from pimper_torch.patches.resample import occluded, resampled
 from pimper_torch.patches.sources import LEVELS, Sources, prepare
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
@@ -136,12 +135,16 @@ class Warp(Stage):
             templates.origin,
             templates.spacing,
         )
-        if not fast:
-            return self._reference(cameras, sources, templates)
-        steepest = math.cos(math.radians(config.max_tilt_deg))
-        found = resampled(cameras, sources, templates, steepest, config.dark_level)
-        hide(found, cameras, sources, templates, config.occlusion_stride)
-        return found
+        if fast:
+            steepest = math.cos(math.radians(config.max_tilt_deg))
+            found = resampled(cameras, sources, templates, steepest, config.dark_level)
+        else:
+            found = self._reference(cameras, sources, templates)
+        assert sources.caster is not None  # forward sees to it
+        stride = config.occlusion_stride
+        hidden = occluded(found.valid, cameras, sources.caster, templates, stride)
+        found.radiance.masked_fill_(hidden[:, :, None], 0)
+        return found.replace(valid=found.valid & ~hidden)
 
     def _reference(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
         world_from_patch = invert_rigid(templates.patch_from_world)
@@ -194,27 +197,7 @@ class Warp(Stage):
         radiance = found.new_zeros(*wanted.shape, found.shape[1])
         radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
         valid = torch.zeros_like(wanted).index_put((wanted,), usable)
-        valid = valid & ~self._hidden(templates, points_world, center, sources.caster, valid)
         return radiance * valid[:, None], valid
-
-    def _hidden(
-        self,
-        templates: Templates,
-        points_world: Float[Tensor, "patch height width 3"],
-        center: Float[Tensor, " 3"],
-        caster: RayCaster | None,
-        wanted: Bool[Tensor, "patch height width"],
-    ) -> Bool[Tensor, "patch height width"]:
-        assert caster is not None  # forward sees to it
-        stride = self.config.occlusion_stride
-        sparse = points_world[:, stride // 2 :: stride, stride // 2 :: stride]
-        if not wanted.any() or sparse.numel() == 0:
-            return torch.zeros_like(wanted)
-        # An enlarged triangle dips under its neighbours by the overlap's fraction of their slope.
-        own = 4 * stride * templates.spacing[:, None, None]
-        hidden = caster.occluded(sparse, center, own)
-        dense = interpolate(hidden[:, None].float(), size=wanted.shape[-2:], mode="nearest-exact")
-        return dense[:, 0] > 0
 
 
 def missing_fraction(seen: PatchViews) -> float:

@@ -6,7 +6,7 @@ distances of all descriptors of two photographs; here only features near the lin
 about one in two hundred. A compiled kernel does it for two photographs in 30 ms.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,20 +15,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.pixels import homogeneous
-from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.matching import MatchSettings, PhotographPair, photograph_numbers
 from pimper_torch.sfm.workspace import Workspace
-
-# Features of the first photograph that are held against all of the second at once: a table of
-# 256 by 5000 distances fits the cache.
-_AT_ONCE = 256
-
-# Candidates whose descriptors are compared at once: 4 MB, which fit the cache.
-_COMPARED = 4096
 
 # Length of COLMAP's SIFT descriptors, in units of their bytes.
 _DESCRIPTOR_LENGTH = 512.0
@@ -61,47 +52,18 @@ class Alike(Record):
 
 
 @dataclass(frozen=True, slots=True)
-class NearEpipolarLines:
-    """Hold pixels against the epipolar geometry, to first order (Sampson's distance)."""
+class Near:
+    """Which pixels of two photographs can show the same point.
+
+    Attributes:
+        matrix: Fundamental matrix, or homography from the first photograph to the second.
+        max_error_px: Largest distance: Sampson's from the epipolar line, or from the mapped point.
+        planar: Whether it is a homography.
+    """
 
     matrix: Float[Tensor, "3 3"]
     max_error_px: float
-    planar: bool = False
-
-    def __call__(
-        self, first: Float[Tensor, "first 2"], second: Float[Tensor, "second 2"]
-    ) -> Bool[Tensor, "first second"]:
-        """Hold all pixels of one photograph against all of another."""
-        lines = homogeneous(first) @ self.matrix.mT
-        back = homogeneous(second) @ self.matrix
-        # From the centre of all on, single precision tells a hundredth of a pixel.
-        centre = second.mean(dim=0)
-        offsets = (lines[:, :2] @ centre + lines[:, 2]).float()
-        residual = torch.addmm(offsets[:, None], lines[:, :2].float(), (second - centre).float().mT)
-        slopes = [ends[:, :2].square().sum(dim=1).float() for ends in (lines, back)]
-        return residual.square_() <= self.max_error_px**2 * (slopes[0][:, None] + slopes[1])
-
-
-@dataclass(frozen=True, slots=True)
-class NearMappedPoints:
-    """Hold pixels against those that a homography maps to."""
-
-    matrix: Float[Tensor, "3 3"]
-    max_error_px: float
-    planar: bool = True
-
-    def __call__(
-        self, first: Float[Tensor, "first 2"], second: Float[Tensor, "second 2"]
-    ) -> Bool[Tensor, "first second"]:
-        """Hold all pixels of one photograph against all of another."""
-        mapped = homogeneous(first) @ self.matrix.mT
-        mapped = mapped[:, :2] / mapped[:, 2:]
-        gap = mapped[:, None] - second
-        return gap.square().sum(dim=2) <= self.max_error_px**2
-
-
-Near = NearEpipolarLines | NearMappedPoints
-"""Tells which pixels of two photographs can show the same point."""
+    planar: bool
 
 
 def match_guided(
@@ -152,8 +114,7 @@ def guided_matches(
     Returns:
         Features that are each other's best match.
     """
-    fast = compiled_for(first.pixels, second.pixels, first.descriptors, second.descriptors)
-    one, other = (compiled_likeness if fast else likeness)(first, second, near)
+    one, other = likeness(first, second, near)
     (some,) = torch.nonzero(_clearly_best(one, max_ratio), as_tuple=True)
     theirs = one.best[some]
     mutual = _clearly_best(other, max_ratio)[theirs] & (other.best[theirs] == some)
@@ -164,38 +125,14 @@ def _near(geometry: Any, max_error_px: float) -> Near | None:  # noqa: ANN401 - 
     """Choose by what verified a pair; nothing for a pair that was not."""
     kinds = loaded().TwoViewGeometryConfiguration
     if geometry.config in (kinds.CALIBRATED, kinds.UNCALIBRATED):
-        return NearEpipolarLines(torch.from_numpy(np.array(geometry.F)), max_error_px)
+        return Near(torch.from_numpy(np.array(geometry.F)), max_error_px, planar=False)
     if geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
-        return NearMappedPoints(torch.from_numpy(np.array(geometry.H)), max_error_px)
+        return Near(torch.from_numpy(np.array(geometry.H)), max_error_px, planar=True)
     return None
 
 
-def _candidates(
-    first: Features, second: Features, near: Near
-) -> Iterator[Int[Tensor, "candidate 2"]]:
-    yield torch.zeros(0, 2, dtype=torch.long)
-    for start in range(0, len(first.pixels), _AT_ONCE):
-        here = torch.nonzero(near(first.pixels[start : start + _AT_ONCE], second.pixels))
-        yield here + here.new_tensor([start, 0])
-
-
 def likeness(first: Features, second: Features, near: Near) -> tuple[Alike, Alike]:
-    """Find what each feature of two photographs is most like, of those that can show its point."""
-    pairs = torch.cat(list(_candidates(first, second, near)))
-    parts = [
-        (first.descriptors[some[:, 0]] * second.descriptors[some[:, 1]]).sum(dim=1)
-        for some in torch.split(pairs, _COMPARED)
-    ]
-    products = torch.cat(parts)
-    one, other = pairs.unbind(dim=1)
-    return (
-        _alike(one, other, products, len(first.pixels)),
-        _alike(other, one, products, len(second.pixels)),
-    )
-
-
-def compiled_likeness(first: Features, second: Features, near: Near) -> tuple[Alike, Alike]:
-    """Do what :func:`likeness` does, by a compiled kernel."""
+    """Find the most similar features of two photographs, among those that can show one point."""
     from pimper_torch.kernels.line_matches import most_alike
 
     one, other = (
@@ -219,27 +156,6 @@ def compiled_likeness(first: Features, second: Features, near: Near) -> tuple[Al
         other.best.numpy(),
     )
     return one, other
-
-
-def _alike(
-    group: Int[Tensor, " candidate"],
-    other: Int[Tensor, " candidate"],
-    products: Float[Tensor, " candidate"],
-    count: int,
-) -> Alike:
-    """Take the two largest products of each group."""
-    order = products.argsort(descending=True, stable=True)
-    order = order[group[order].argsort(stable=True)]
-    named = group[order]
-    again = torch.zeros_like(named, dtype=torch.bool)
-    again[1:] = named[1:] == named[:-1]
-    second = again.clone()
-    second[1:] &= ~again[:-1]
-    found = Alike(products=products.new_full((count, 2), -1), best=group.new_full((count,), -1))
-    found.best[named[~again]] = other[order[~again]]
-    found.products[named[~again], 0] = products[order[~again]]
-    found.products[named[second], 1] = products[order[second]]
-    return found
 
 
 def _clearly_best(alike: Alike, max_ratio: float) -> Bool[Tensor, " feature"]:

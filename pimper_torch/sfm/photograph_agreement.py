@@ -8,7 +8,6 @@ Cameras of whole photographs beside cropped ones are cropped until matches lie n
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,13 +20,7 @@ from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
 from pimper_torch.sfm.agreement import undistorted_pixels
 from pimper_torch.sfm.colmap import pinhole_of
-from pimper_torch.sfm.crops import (
-    around,
-    climbed,
-    refused_crop,
-    shifted_lenses,
-    tell_crop,
-)
+from pimper_torch.sfm.crops import around, climbed, refused_crop, shifted_lenses, tell_crop
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.squares import ERRORS, standard_errors
@@ -50,18 +43,10 @@ _STEP_PX = 0.5
 _PAIRS = 200
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Matches:
-    """Matches of pairs of photographs, undistorted."""
-
-    pairs: tuple[VerifiedPair, ...]
-    max_error_px: float
-
-    def agreeing(self, cameras: Cameras) -> float:
-        """Give the fraction that cameras explain."""
-        total = sum(pair.num_matches for pair in self.pairs)
-        right = sum(int(explained(cameras, pair, self.max_error_px).sum()) for pair in self.pairs)
-        return right / max(total, 1)
+def _agreement(pairs: Sequence[VerifiedPair], cameras: Cameras, max_error_px: float) -> float:
+    """Return the fraction of undistorted matches that cameras explain."""
+    right = sum(int(explained(cameras, pair, max_error_px).sum()) for pair in pairs)
+    return right / max(sum(pair.num_matches for pair in pairs), 1)
 
 
 def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool[Tensor, " match"]:
@@ -125,7 +110,8 @@ def best_of(
 ) -> int:
     """Choose the model that explains most matches; the first of equal ones."""
     scores = [
-        _matches(model, verified, max_error_px).agreeing(pinholes_of(model)) for model in models
+        _agreement(undistorted_pairs(model, verified), pinholes_of(model), max_error_px)
+        for model in models
     ]
     return scores.index(max(scores))
 
@@ -158,8 +144,8 @@ def find_crop(
     strongest = sorted(verified, key=lambda pair: -pair.num_matches)[:_PAIRS]
 
     def errors(model: SparseModel) -> Float[Tensor, " match"]:
-        matches, cameras = _matches(model, strongest, max_error_px), pinholes_of(model)
-        found = [_errors(cameras, pair) for pair in matches.pairs]
+        cameras = pinholes_of(model)
+        found = [_errors(cameras, pair) for pair in undistorted_pairs(model, strongest)]
         return torch.cat([*found, torch.zeros(0, dtype=torch.float64)]).clamp_max(max_error_px)
 
     usual = min(crops, key=lambda model: float(errors(model).mean()))
@@ -188,7 +174,7 @@ def find_crop(
     crop, evidence = shifted(shift), "what their matches show"
     beside = [errors(shifted(shift + _BESIDE_PX * one)) for one in around(shift)]
     sharp = min(standard_errors(one - best) for one in beside) > ERRORS
-    fraction = _matches(crop, verified, max_error_px).agreeing(pinholes_of(crop))
+    fraction = _agreement(undistorted_pairs(crop, verified), pinholes_of(crop), max_error_px)
     if fraction <= 1 - _MARGIN or not sharp:
         raise refused_crop(where, usual, views, evidence)
     tell_crop(where, crop, views, evidence)
@@ -209,28 +195,26 @@ def require_agreement(
     Raises:
         InputError: Names the convention that would fit, if one of the usual does.
     """
-    matches = _matches(model, verified, max_error_px)
-    total = sum(pair.num_matches for pair in matches.pairs)
-    cameras = pinholes_of(model)
-    given = matches.agreeing(cameras)
+    pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
+    total = sum(pair.num_matches for pair in pairs)
+    given = _agreement(pairs, cameras, max_error_px)
     if total < _FEWEST or given > 1 - _MARGIN:
         return
-    tried = [(matches.agreeing(one.undo(cameras)), one) for one in camera_mistakes(cameras)]
+    tried = [
+        (_agreement(pairs, one.undo(cameras), max_error_px), one)
+        for one in camera_mistakes(cameras)
+    ]
     best, mistake = max(tried, key=lambda one: one[0])
     better = best > given + _MARGIN and 1 - best < _LEFT * (1 - given)
     if given >= MIN_AGREEMENT and not better:
         return
     raise InputError(
         f"{where}: these cameras and the photographs do not belong together: {given:.0%} of "
-        f"{total} matches in {len(matches.pairs)} pairs of photographs lie within "
+        f"{total} matches in {len(pairs)} pairs of photographs lie within "
         f"{max_error_px:g} px of the cameras' epipolar lines and before both cameras; needed: at "
         f"least {MIN_AGREEMENT:.0%}, and more than under other conventions. "
         f"{_advice(best, mistake) if better else _NOTHING_FITS}"
     )
-
-
-def _matches(model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float) -> _Matches:
-    return _Matches(pairs=undistorted_pairs(model, verified), max_error_px=max_error_px)
 
 
 def _advice(fraction: float, mistake: CameraMistake) -> str:

@@ -21,7 +21,6 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels
-from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Record
@@ -250,49 +249,14 @@ def _aligned(
     window: _Window,
     settings: SightingSettings,
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "point 2"]]:
-    """Align one view's patches; tell which were found, and where."""
-    fast = compiled_for(pictures.log, homographies, templates.values)
-    alignment = (_compiled_alignment if fast else _iterated)(
-        pictures.log[view], homographies, chosen, templates, window, settings.max_shift_px
-    )
-    arrived = alignment.shift.isfinite().all(dim=1)
-    final = _shifted(homographies, torch.where(arrived[:, None], alignment.shift, 0))
-    found = arrived & (alignment.correlation >= settings.min_correlation)
-    found &= alignment.deviation <= settings.max_deviation_px
-    found &= _complete(pictures.unusable[view], final, window)
-    return found, final[:, :2, 2] / final[:, 2:, 2]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Alignment(Record):
-    """How patches of a view came to lie on their templates.
-
-    Attributes:
-        shift: Along the plane, in its steps; infinite where the patch was lost or did not arrive.
-        deviation: Of the place along its worst direction, in the same.
-        correlation: With the template, light taken out.
-    """
-
-    shift: Float[Tensor, "point 2"]
-    deviation: Float[Tensor, " point"]
-    correlation: Float[Tensor, " point"]
-
-
-def _compiled_alignment(
-    log: Float[Tensor, "height width"],
-    homographies: Float[Tensor, "point 3 3"],
-    chosen: Int[Tensor, " point"],
-    templates: _Templates,
-    window: _Window,
-    max_shift_px: float,
-) -> _Alignment:
-    """Do what :func:`_iterated` does, by a compiled kernel."""
+    """Align one view's patches; return which were found, and their pixels."""
     from pimper_torch.kernels.patch_alignment import align
 
-    found = _nothing_aligned(homographies)
-    limits = (_ITERATIONS, _LONGEST_STEP, _CONVERGED, _TRIAL, _HOPELESS, *_CONTRAST, max_shift_px)
+    limits = (_ITERATIONS, _LONGEST_STEP, _CONVERGED, _TRIAL, _HOPELESS, *_CONTRAST)
+    shift = homographies.new_empty(len(homographies), 2)
+    deviation, correlation = torch.empty_like(shift).mT.contiguous()
     align(
-        log.numpy(),
+        pictures.log[view].numpy(),
         homographies.contiguous().numpy(),
         chosen.contiguous().numpy(),
         templates.values.contiguous().numpy(),
@@ -301,67 +265,17 @@ def _compiled_alignment(
         window.places.contiguous().numpy(),
         window.root.contiguous().numpy(),
         window.light.contiguous().numpy(),
-        np.array(limits, dtype=np.float64),
-        found.shift.numpy(),
-        found.deviation.numpy(),
-        found.correlation.numpy(),
+        np.array([*limits, settings.max_shift_px], dtype=np.float64),
+        shift.numpy(),
+        deviation.numpy(),
+        correlation.numpy(),
     )
-    return found
-
-
-def _iterated(
-    log: Float[Tensor, "height width"],
-    homographies: Float[Tensor, "point 3 3"],
-    chosen: Int[Tensor, " point"],
-    templates: _Templates,
-    window: _Window,
-    max_shift_px: float,
-) -> _Alignment:
-    """Align one view's patches by Gauss-Newton.
-
-    Args:
-        log: Of the view's radiance.
-        homographies: From steps of the plane to the view's pixels.
-        chosen: The template of each.
-        templates: To align them with.
-        window: Of both.
-        max_shift_px: From where the cameras put the point.
-    """
-    found = _nothing_aligned(homographies)
-    shift = found.shift.zero_()
-    active = torch.arange(len(homographies), device=shift.device)
-    for iteration in range(_ITERATIONS):
-        if len(active) == 0:
-            break
-        some = templates.take(chosen[active])
-        patches = window.freed(_look_up(log, _shifted(homographies[active], shift[active]), window))
-        power = some.values.square().sum(dim=1).clamp_min(1e-12)
-        common = (patches * some.values).sum(dim=1)
-        left = patches / (common / power).clamp(*_CONTRAST)[:, None] - some.values
-        step = -(some.inverse @ (some.slopes.mT @ left[..., None]))[..., 0].double()
-        length = step.norm(dim=1)
-        shift[active] += step * (_LONGEST_STEP / length.clamp_min(_LONGEST_STEP))[:, None]
-        variance = left.square().sum(dim=1) / window.total
-        spread = torch.linalg.eigvalsh(some.inverse)[:, -1]
-        found.deviation[active] = (variance * spread).sqrt().double()
-        alike = common / (patches.norm(dim=1) * power.sqrt()).clamp_min(1e-12)
-        found.correlation[active] = alike.double()
-        lost = shift[active].norm(dim=1) > max_shift_px
-        if iteration >= _TRIAL:
-            lost |= alike < _HOPELESS
-        shift[active[lost]] = torch.inf
-        active = active[~lost & (length > _CONVERGED)]
-    shift[active] = torch.inf
-    return found
-
-
-def _nothing_aligned(homographies: Float[Tensor, "point 3 3"]) -> _Alignment:
-    count = len(homographies)
-    return _Alignment(
-        shift=homographies.new_full((count, 2), torch.inf),
-        deviation=homographies.new_full((count,), torch.inf),
-        correlation=homographies.new_zeros(count),
-    )
+    arrived = shift.isfinite().all(dim=1)
+    final = _shifted(homographies, torch.where(arrived[:, None], shift, 0))
+    found = arrived & (correlation >= settings.min_correlation)
+    found &= deviation <= settings.max_deviation_px
+    found &= _complete(pictures.unusable[view], final, window)
+    return found, final[:, :2, 2] / final[:, 2:, 2]
 
 
 def _shifted(

@@ -18,7 +18,7 @@ from pimper_torch.sfm.agreement import epipolar_geometry, undistorted_pixels
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
 from pimper_torch.sfm.features import FeatureSettings, find_features, too_small
-from pimper_torch.sfm.guided import NearEpipolarLines, guided_matches, read_features
+from pimper_torch.sfm.guided import Near, guided_matches, read_features
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
 from pimper_torch.sfm.matching import (
     MatchSettings,
@@ -184,7 +184,7 @@ def _match_along_lines(
             first, second = (features[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
-            near = NearEpipolarLines(epipolar_geometry(model, pair), matching.max_error_px)
+            near = Near(epipolar_geometry(model, pair), matching.max_error_px, planar=False)
             found = guided_matches(first, second, near, matching.max_ratio)
             ends = VerifiedPair(
                 views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]

@@ -226,8 +226,18 @@ class Sweep(Stage):
             photometry.lights_patch,
             photometry.convergence.residual,
         )
-        how = self._compiled_costs if fast else self._costs
-        costs, swept = how(templates, registered, photometry, transferred, cameras, sources)
+        given = templates, registered, photometry, transferred, cameras, sources
+        if fast:
+            costs, swept = compiled_costs(
+                *given,
+                ladder=_STEP * torch.arange(-config.steps, config.steps + 1.0),
+                scale=self._scale(photometry),
+                num_views=config.num_views,
+                min_views=config.min_views,
+                min_facing=_MIN_FACING,
+            )
+        else:
+            costs, swept = self._costs(*given)
         step = _STEP * templates.spacing
         window = level_weight(templates.depth.detach(), swept, templates.spacing, _CLIFF)
         averaged = window_size(_WINDOW)
@@ -249,31 +259,6 @@ class Sweep(Stage):
     def _scale(self, photometry: Photometry) -> Float[Tensor, " patch"]:
         """Give the residuals of each patch that count as large."""
         return _LOSS_SCALE * photometry.convergence.residual.clamp_min(MIN_SPREAD)
-
-    def _compiled_costs(
-        self,
-        templates: Templates,
-        registered: Observations,
-        photometry: Photometry,
-        transferred: Float[Tensor, "patch height width 3"],
-        cameras: Cameras,
-        sources: Sources,
-    ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
-        """Give what :meth:`_costs` gives."""
-        config = self.config
-        return compiled_costs(
-            templates,
-            registered,
-            photometry,
-            transferred,
-            cameras,
-            sources,
-            ladder=_STEP * torch.arange(-config.steps, config.steps + 1.0),
-            scale=self._scale(photometry),
-            num_views=config.num_views,
-            min_views=config.min_views,
-            min_facing=_MIN_FACING,
-        )
 
     def _costs(
         self,

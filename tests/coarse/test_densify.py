@@ -57,16 +57,16 @@ def test_windows_match_on_the_true_surface_under_any_light_and_nowhere_else():
     depth = truth.depth[2].float()
     inner = torch.isfinite(depth) & (truth.normals_world[2][..., 2] > 0.6)
     true = torch.where(depth.isfinite(), 1 / depth, 0.25)
-    assert matcher.score(true)[inner].median() > 0.95
-    assert matcher.score(1.1 * true)[inner].median() < 0.6
+    assert matcher.scores(true, [0.0])[0][inner].median() > 0.95
+    assert matcher.scores(1.1 * true, [0.0])[0][inner].median() < 0.6
     # A photograph twice as bright, as another exposure: the same.
     brighter = level.replace(
         tone=level.tone * torch.tensor([1.4, 0.8, 1.0, 1.2, 0.9])[:, None, None]
     )
     other = Matcher(brighter, pair(level, 2, torch.tensor([0, 1, 3, 4])), WINDOWS)
-    assert other.score(true)[inner].median() > 0.95
+    assert other.scores(true, [0.0])[0][inner].median() > 0.95
     # Darkness matches nothing.
-    assert matcher.score(true)[:10, :10].abs().max() < 0.05
+    assert matcher.scores(true, [0.0])[0][:10, :10].abs().max() < 0.05
 
 
 def test_a_sweep_finds_the_offset_between_its_steps():

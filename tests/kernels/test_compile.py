@@ -68,13 +68,14 @@ def test_no_kernel_is_compiled_twice_at_once(fresh):
         "from pimper_torch.kernels.compile import cache_folder, load\n"
         "from pimper_torch.progress import listening\n"
         "print(cache_folder(), flush=True); input()\n"
-        "with listening(lambda done, total: print(done, flush=True)): load(('denied', 'lookup'))"
+        "with listening(lambda done, total: print(done, flush=True)):\n"
+        "    load(('line_matches', 'lookup'))"
     )
     with started(code) as other:
         assert other.stdout is not None
         assert other.stdin is not None
         folder = other.stdout.readline().strip()
-        with FileLock(f"{folder}/denied.lock"):
+        with FileLock(f"{folder}/line_matches.lock"):
             print(file=other.stdin, flush=True)
             assert [other.stdout.readline() for _ in range(2)] == ["0\n", "1\n"]
             time.sleep(1.0)
@@ -102,8 +103,8 @@ def test_the_compiling_process_ends_with_its_parent(fresh, end):
 
 def test_kernels_are_compiled_where_the_compiling_process_died(fresh):
     code = (
-        f"{AHEAD} child.kill(); child.wait(); load(('denied',))\n"
-        "from pimper_torch.kernels.denied import count_denied as kernel\n"
+        f"{AHEAD} child.kill(); child.wait(); load(('line_matches',))\n"
+        "from pimper_torch.kernels.line_matches import most_alike as kernel\n"
         "print(dict(kernel.stats.cache_misses))"
     )
     with started(code) as parent:

@@ -8,14 +8,11 @@ import torch
 from torch.nn.functional import pad
 
 from pimper_torch.io.photographs import load_views
-from pimper_torch.kernels.switch import using
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.features import find_features
 from pimper_torch.sfm.guided import (
     Features,
-    NearEpipolarLines,
-    NearMappedPoints,
-    compiled_likeness,
+    Near,
     guided_matches,
     likeness,
     match_guided,
@@ -28,6 +25,7 @@ CONFIG = ReconstructConfig(threads=1)
 
 # Cameras side by side: epipolar lines are rows.
 ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+BESIDE = Near(ROWS, 2.0, planar=False)
 
 
 def features(pixels, descriptors):
@@ -44,50 +42,40 @@ def test_a_twin_off_the_line_is_no_rival_and_one_on_it_is():
     second = features(
         [[30.0, 11.0], [40.0, 30.0], [30.0, 60.0], [40.0, 61.5]], [10.0, 0.0, 90.0, 92.0]
     )
-    found = guided_matches(first, second, NearEpipolarLines(ROWS, 2.0), 0.8)
+    found = guided_matches(first, second, BESIDE, 0.8)
     assert found.tolist() == [[0, 0], [1, 2]]  # 0 against 2 degrees: clear
     ratio = features([[30.0, 11.0], [40.0, 9.0]], [10.0, 12.0])
-    assert guided_matches(first, ratio, NearEpipolarLines(ROWS, 2.0), 0.8).tolist() == []
-    assert guided_matches(first, ratio, NearEpipolarLines(ROWS, 2.0), 0.9).tolist() == [[0, 0]]
+    assert guided_matches(first, ratio, BESIDE, 0.8).tolist() == []
+    assert guided_matches(first, ratio, BESIDE, 0.9).tolist() == [[0, 0]]
 
 
 def test_matches_are_each_others_best():
     first = features([[5.0, 10.0], [9.0, 10.5]], [0.0, 10.0])
     second = features([[30.0, 10.0]], [2.0])
-    assert guided_matches(first, second, NearEpipolarLines(ROWS, 2.0), 0.8).tolist() == [[0, 0]]
+    assert guided_matches(first, second, BESIDE, 0.8).tolist() == [[0, 0]]
 
 
 def test_descriptors_that_are_unlike_do_not_match_though_nothing_rivals():
     first, second = features([[5.0, 10.0]], [0.0]), features([[30.0, 10.0]], [45.0])
-    assert guided_matches(first, second, NearEpipolarLines(ROWS, 2.0), 0.8).tolist() == []
+    assert guided_matches(first, second, BESIDE, 0.8).tolist() == []
 
 
-def test_the_distance_from_epipolar_lines_is_sampsons():
-    generator = torch.Generator().manual_seed(3)
-    fundamental = torch.rand(3, 3, generator=generator, dtype=torch.float64) - 0.5
-    fundamental[2] *= 500
-    first, second = 1000 * torch.rand(2, 300, 2, generator=generator, dtype=torch.float64)
+def sampsons_distance(fundamental, first, second):
     ends = pad(first, (0, 1), value=1), pad(second, (0, 1), value=1)
     residual = ends[0] @ fundamental.mT @ ends[1].mT
     lines, back = ends[0] @ fundamental.mT, ends[1] @ fundamental
     slope = lines[:, None, :2].square().sum(dim=2) + back[None, :, :2].square().sum(dim=2)
-    error = residual.abs() / slope.sqrt()
-    near = NearEpipolarLines(fundamental, 2.0)(first, second)
-    assert near.any()
-    assert not near[error > 2.01].any()
-    assert near[error < 1.99].all()
+    return residual.abs() / slope.sqrt()
 
 
-def test_a_homography_maps_to_a_circle():
-    shift = torch.tensor([[1.0, 0, 20], [0, 1, -5], [0, 0, 1]], dtype=torch.float64)
-    first = torch.tensor([[10.0, 10.0]], dtype=torch.float64)
-    second = torch.tensor([[30.0, 5.0], [31.9, 5.0], [31.5, 6.5]], dtype=torch.float64)
-    assert NearMappedPoints(shift, 2.0)(first, second).tolist() == [[True, True, False]]
+def distance_from_mapped(homography, first, second):
+    mapped = pad(first, (0, 1), value=1) @ homography.mT
+    return (mapped[:, None, :2] / mapped[:, None, 2:] - second).norm(dim=2)
 
 
 @pytest.mark.parametrize("length", [128, 13])
 @pytest.mark.parametrize("planar", [False, True])
-def test_the_kernel_finds_what_torch_finds(generator, length, planar):
+def test_the_two_largest_products_within_the_distance_are_found(generator, length, planar):
     def some(count):
         described = torch.rand(count, length, generator=generator)
         pixels = 200 * torch.rand(count, 2, generator=generator, dtype=torch.float64)
@@ -95,29 +83,28 @@ def test_the_kernel_finds_what_torch_finds(generator, length, planar):
 
     first, second = some(300), some(200)
     if planar:
-        near = NearMappedPoints(torch.diag(torch.tensor([1.1, 0.9, 1.0]).double()), 20.0)
+        matrix, limit = torch.tensor([[1.1, 0, 5], [0, 0.9, 0], [1e-4, 0, 1]]).double(), 20.0
     else:
         rotated = torch.tensor([[1e-6, -3e-6, 0.001], [2e-6, 1e-6, -0.01], [-0.002, 0.01, 0.05]])
-        near = NearEpipolarLines(rotated.double(), 5.0)
-    for mine, theirs in zip(
-        compiled_likeness(first, second, near), likeness(first, second, near), strict=True
-    ):
-        assert (theirs.best >= 0).sum() > 0.8 * len(theirs.best)  # most have some that are near
-        assert (theirs.products[:, 1] >= 0).sum() > 0.5 * len(theirs.best)
-        assert torch.equal(mine.best, theirs.best)
-        torch.testing.assert_close(mine.products, theirs.products, rtol=0, atol=1e-6)  # float32
+        matrix, limit = rotated.double(), 5.0
+    distance = distance_from_mapped if planar else sampsons_distance
+    away = distance(matrix, first.pixels, second.pixels)
+    assert ((away - limit).abs() > 1e-5 * limit).all()  # none within rounding of the limit
+    products = first.descriptors @ second.descriptors.mT
+    products = torch.where(away <= limit, products, -1)
+    found = likeness(first, second, Near(matrix, limit, planar=planar))
+    for alike, table in zip(found, (products, products.mT), strict=True):
+        largest, best = table.topk(2, dim=1)
+        best = torch.where(largest[:, 0] >= 0, best[:, 0], -1)
+        assert (best >= 0).sum() > 0.8 * len(best)  # most have some that are near
+        assert (largest[:, 1] >= 0).sum() > 0.5 * len(best)
+        assert torch.equal(alike.best, best)
+        torch.testing.assert_close(alike.products, largest, rtol=0, atol=1e-6)  # float32
 
 
-def test_matches_are_the_same_without_kernels():
-    first = features([[5.0, 10.0], [5.0, 60.0]], [0.0, 90.0])
-    second = features([[30.0, 11.0], [40.0, 30.0], [30.0, 60.0]], [10.0, 0.0, 90.0])
-    with using("torch"):
-        found = guided_matches(first, second, NearEpipolarLines(ROWS, 2.0), 0.8)
-    assert found.tolist() == [[0, 0], [1, 2]]
-    nothing = features([[5.0, 200.0]], [0.0])
-    for kernels in ("torch", "numba"):
-        with using(kernels):
-            assert len(guided_matches(nothing, second, NearEpipolarLines(ROWS, 2.0), 0.8)) == 0
+def test_features_without_any_near_do_not_match():
+    second = features([[30.0, 11.0], [40.0, 30.0]], [10.0, 0.0])
+    assert len(guided_matches(features([[5.0, 200.0]], [0.0]), second, BESIDE, 0.8)) == 0
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from pimper_torch.evidence.datasets import (
     write_idr,
     write_transforms,
 )
-from pimper_torch.evidence.datasets.posed import shrink
+from pimper_torch.evidence.datasets.posed import assemble, shrink
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
@@ -206,7 +206,9 @@ def read(job: Job) -> Capture:
             whatever the reader refuses.
     """
     reader = readers()[job.source]
-    known = inspect.signature(reader).parameters
+    known = dict(inspect.signature(reader).parameters)
+    if "options" in known:
+        known |= inspect.signature(assemble).parameters
     plain = ReadOptions()
     given = {
         name: getattr(job.options, name)

@@ -1,7 +1,7 @@
 """COLMAP models beside their photographs: read and written."""
 
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
@@ -14,7 +14,13 @@ from pimper_torch.evidence.datasets.pictures import (
     write_mask,
     write_picture,
 )
-from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble, mask_finder, read_views
+from pimper_torch.evidence.datasets.posed import (
+    PosedOptions,
+    PosedPhotograph,
+    assemble,
+    mask_finder,
+    read_views,
+)
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, SparseScene, Views
 from pimper_torch.sfm.colmap import pinhole_lenses, read_model, write_binary
@@ -30,10 +36,7 @@ def read_colmap(
     *,
     images: Path | str | None = None,
     masks: Path | str | None = None,
-    names: Sequence[str] | None = None,
-    mesh: Path | str | None = None,
-    encoding: Encoding = FROM_FILES,
-    max_size_px: int = 0,
+    **options: Unpack[PosedOptions],
 ) -> Capture:
     """Read a COLMAP model, text or binary, and the photographs it was made from.
 
@@ -46,24 +49,14 @@ def read_colmap(
             ``sparse``, ``model`` or ``0``.
         images: Folder of the photographs; by default ``images`` beside or above the model.
         masks: Folder of masks; by default ``masks`` beside that, if there is one.
-        names: Keep these photographs, as the model calls them, in this order.
-        mesh: File of the true surface, if it is known.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+        options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`. Names are
+            the model's.
 
     Raises:
         InputError: The folder is laid out otherwise, or a file is missing or damaged.
     """
     model_folder, photographs = _photographs(Path(folder), images, masks)
-    return assemble(
-        photographs,
-        model_folder,
-        _KIND,
-        names=names,
-        mesh=mesh,
-        encoding=encoding,
-        max_size_px=max_size_px,
-    )
+    return assemble(photographs, model_folder, _KIND, **options)
 
 
 def read_colmap_scene(

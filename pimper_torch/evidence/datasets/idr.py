@@ -1,7 +1,7 @@
 """IDR and NeuS: ``cameras.npz`` beside ``image/`` and ``mask/``; read and written."""
 
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from pimper_torch.camera_files.posed_camera import pinhole_lens
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.pictures import write_mask, write_picture
 from pimper_torch.evidence.datasets.posed import (
+    PosedOptions,
     PosedPhotograph,
     assemble,
     image_files,
@@ -21,7 +22,6 @@ from pimper_torch.evidence.datasets.posed import (
 from pimper_torch.geometry.pixels import indices_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.decode import read_header
-from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Views
 
 _CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz", "cameras_large.npz")
@@ -33,10 +33,7 @@ def read_idr(
     folder: Path | str,
     *,
     camera_file: str | None = None,
-    names: Sequence[str] | None = None,
-    mesh: Path | str | None = None,
-    encoding: Encoding = FROM_FILES,
-    max_size_px: int = 0,
+    **options: Unpack[PosedOptions],
 ) -> Capture:
     """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
 
@@ -51,10 +48,8 @@ def read_idr(
         folder: Of the set.
         camera_file: Its name; by default ``cameras.npz``, ``cameras_sphere.npz`` or
             ``cameras_large.npz``.
-        names: Keep these photographs, in this order.
-        mesh: File of the true surface, if it is known, in the world's units.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+        options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`. A mesh has the
+            world's units.
 
     Raises:
         InputError: The folder is laid out otherwise, or a file is missing or damaged.
@@ -76,15 +71,7 @@ def read_idr(
         _photograph(*one)
         for one in zip(files, masks, *read_world_mats(path, len(files)), strict=True)
     ]
-    return assemble(
-        photographs,
-        folder,
-        IDR,
-        names=names,
-        mesh=mesh,
-        encoding=encoding,
-        max_size_px=max_size_px,
-    )
+    return assemble(photographs, folder, IDR, **options)
 
 
 def read_scale_mats(

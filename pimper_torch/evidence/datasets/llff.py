@@ -1,8 +1,8 @@
 """LLFF: ``poses_bounds.npy`` beside a folder of photographs."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from pimper_torch.camera_files.layout import expect, first_of
 from pimper_torch.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.posed import (
+    PosedOptions,
     PosedPhotograph,
     assemble,
     image_files,
@@ -20,7 +21,6 @@ from pimper_torch.evidence.datasets.posed import (
 )
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.numpy_files import read_npy
-from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Capture, Lens
 
 _KIND = "an LLFF set"
@@ -32,10 +32,7 @@ def read_llff(
     *,
     images: Path | str | None = None,
     masks: Path | str | None = None,
-    names: Sequence[str] | None = None,
-    mesh: Path | str | None = None,
-    encoding: Encoding = FROM_FILES,
-    max_size_px: int = 0,
+    **options: Unpack[PosedOptions],
 ) -> Capture:
     """Read the cameras of ``poses_bounds.npy`` and the photographs beside it.
 
@@ -58,10 +55,7 @@ def read_llff(
             and so on.
         masks: Folder of masks; by default ``masks``, ``mask`` or ``images_mask``, if there is
             one.
-        names: Keep these photographs, in this order.
-        mesh: File of the true surface, if it is known.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+        options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`.
 
     Raises:
         InputError: The folder is laid out otherwise, there is not one photograph a row, or a
@@ -90,15 +84,7 @@ def read_llff(
         )
         for path, row in zip(files, rows, strict=True)
     ]
-    return assemble(
-        photographs,
-        folder,
-        _KIND,
-        names=names,
-        mesh=mesh,
-        encoding=encoding,
-        max_size_px=max_size_px,
-    )
+    return assemble(photographs, folder, _KIND, **options)
 
 
 def _read_rows(path: Path, folder: Path) -> Float[Tensor, "view 3 5"]:

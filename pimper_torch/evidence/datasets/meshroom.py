@@ -1,12 +1,16 @@
 """Meshroom and AliceVision: ``cameras.sfm``, and any other SfMData in JSON."""
 
-from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
+from typing import Unpack
 
 from pimper_torch.camera_files.layout import expect, first_of, inside
 from pimper_torch.camera_files.meshroom_sfm import KIND, read_meshroom_cameras
-from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble, mask_finder
-from pimper_torch.radiometry import FROM_FILES, Encoding
+from pimper_torch.evidence.datasets.posed import (
+    PosedOptions,
+    PosedPhotograph,
+    assemble,
+    mask_finder,
+)
 from pimper_torch.records import Capture
 
 _FILES = ("cameras.sfm", "sfm.json", "sfm.sfm", "cameras.json")
@@ -17,10 +21,7 @@ def read_meshroom(
     *,
     images: Path | str | None = None,
     masks: Path | str | None = None,
-    names: Sequence[str] | None = None,
-    mesh: Path | str | None = None,
-    encoding: Encoding = FROM_FILES,
-    max_size_px: int = 0,
+    **options: Unpack[PosedOptions],
 ) -> Capture:
     """Read the cameras of Meshroom's ``cameras.sfm`` and the photographs it names.
 
@@ -33,10 +34,7 @@ def read_meshroom(
             file are those of the machine that wrote it. By default ``images`` beside the file,
             or the file's own folder.
         masks: Folder of masks, if there are any.
-        names: Keep these photographs, in this order.
-        mesh: File of the true surface, if it is known.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+        options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`.
 
     Raises:
         InputError: The file has another structure or describes a lens or rig that cannot be
@@ -63,6 +61,4 @@ def read_meshroom(
                 cam_from_world=camera.cam_from_world,
             )
         )
-    return assemble(
-        photographs, path, KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
-    )
+    return assemble(photographs, path, KIND, **options)

@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
+from typing import Unpack
 
 from pimper_torch.camera_files.layout import expect, first_of
 from pimper_torch.camera_files.metashape_xml import KIND, read_metashape_cameras
 from pimper_torch.errors import some
 from pimper_torch.evidence.datasets.posed import (
+    PosedOptions,
     PosedPhotograph,
     assemble,
     image_files,
     mask_finder,
 )
-from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Capture
 
 
@@ -21,10 +22,7 @@ def read_metashape(
     *,
     images: Path | str | None = None,
     masks: Path | str | None = None,
-    names: Sequence[str] | None = None,
-    mesh: Path | str | None = None,
-    encoding: Encoding = FROM_FILES,
-    max_size_px: int = 0,
+    **options: Unpack[PosedOptions],
 ) -> Capture:
     """Read the cameras that Metashape exported as XML, and their photographs.
 
@@ -36,10 +34,8 @@ def read_metashape(
         images: Folder of the photographs, which are called as the cameras are labelled, with
             or without suffix; by default ``images`` beside the file, or the file's own folder.
         masks: Folder of masks, if there are any.
-        names: Keep these photographs, in this order; names of files.
-        mesh: File of the true surface, if it is known.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+        options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`. Names are
+            those of files.
 
     Raises:
         InputError: The file is something else, defines entities, or describes a lens or rig
@@ -63,9 +59,7 @@ def read_metashape(
         )
         for camera, image in zip(cameras, images_of, strict=True)
     ]
-    return assemble(
-        photographs, path, KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
-    )
+    return assemble(photographs, path, KIND, **options)
 
 
 def _xml_file(given: Path) -> Path:

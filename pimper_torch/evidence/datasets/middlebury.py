@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Unpack
 
 from pimper_torch.camera_files.layout import expect, inside, numbers, read_text
 from pimper_torch.camera_files.posed_camera import pinhole_lens, rigid_or_refuse
 from pimper_torch.evidence.datasets.posed import (
+    PosedOptions,
     PosedPhotograph,
     assemble,
     mask_finder,
 )
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.decode import read_header
-from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Capture
 
 _KIND = "a Middlebury multi-view set"
@@ -22,10 +23,7 @@ def read_middlebury(
     folder: Path | str,
     *,
     masks: Path | str | None = None,
-    names: Sequence[str] | None = None,
-    mesh: Path | str | None = None,
-    encoding: Encoding = FROM_FILES,
-    max_size_px: int = 0,
+    **options: Unpack[PosedOptions],
 ) -> Capture:
     """Read the cameras of ``*_par.txt`` and the photographs beside it.
 
@@ -38,10 +36,7 @@ def read_middlebury(
     Args:
         folder: Of the set, or the ``_par.txt`` file itself.
         masks: Folder of masks, if there are any.
-        names: Keep these photographs, in this order.
-        mesh: File of the true surface, if it is known.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+        options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`.
 
     Raises:
         InputError: The folder is laid out otherwise, or a file is missing or damaged.
@@ -59,16 +54,7 @@ def read_middlebury(
     photographs = [
         _photograph(line, path).replace(mask=mask_of(path.parent / line[0])) for line in lines[1:]
     ]
-    return assemble(
-        photographs,
-        path,
-        _KIND,
-        names=names,
-        mesh=mesh,
-        encoding=encoding,
-        max_size_px=max_size_px,
-        one_light=True,
-    )
+    return assemble(photographs, path, _KIND, one_light=True, **options)
 
 
 def _parameter_file(given: Path) -> Path:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict
 
 import torch
 from jaxtyping import Float
@@ -45,6 +46,15 @@ class PosedPhotograph(Record):
     lens: Lens
     skew_px: float = 0.0
     mask: Path | None = None
+
+
+class PosedOptions(TypedDict, total=False):
+    """Options of every reader of posed photographs; see :func:`assemble`."""
+
+    names: Sequence[str] | None
+    mesh: Path | str | None
+    encoding: Encoding
+    max_size_px: int
 
 
 def assemble(

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
@@ -22,11 +23,10 @@ from pimper_torch.evidence.datasets.pictures import (
     write_mask,
     write_picture,
 )
-from pimper_torch.evidence.datasets.posed import PosedPhotograph, assemble
+from pimper_torch.evidence.datasets.posed import PosedOptions, PosedPhotograph, assemble
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.io.decode import SUFFIXES, read_header
 from pimper_torch.io.meshes import write_ply
-from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Mesh, Views
 
 _FILES = ("transforms.json", "transforms_train.json")
@@ -34,11 +34,7 @@ _FILES = ("transforms.json", "transforms_train.json")
 
 def read_transforms(
     folder: Path | str,
-    *,
-    names: Sequence[str] | None = None,
-    mesh: Path | str | None = None,
-    encoding: Encoding = FROM_FILES,
-    max_size_px: int = 0,
+    **options: Unpack[PosedOptions],
 ) -> Capture:
     """Read the cameras of a ``transforms.json`` and the photographs it names.
 
@@ -50,11 +46,8 @@ def read_transforms(
 
     Args:
         folder: With ``transforms.json`` or ``transforms_train.json``; or a file of that kind.
-        names: Keep these photographs, in this order. They are called as their files, or by
-            their whole paths in the file where that is not unique.
-        mesh: File of the true surface, if it is known.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink larger photographs; the cameras follow. 0 leaves them.
+        options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`. Names are those of
+            files, or whole paths in the file where these are not unique.
 
     Raises:
         InputError: The file has another structure, or a photograph is missing or damaged.
@@ -69,9 +62,7 @@ def read_transforms(
         _photograph(frame, image, name, path)
         for frame, image, name in zip(frames, images, _names(images, path), strict=True)
     ]
-    return assemble(
-        photographs, path, KIND, names=names, mesh=mesh, encoding=encoding, max_size_px=max_size_px
-    )
+    return assemble(photographs, path, KIND, **options)
 
 
 def write_transforms(
