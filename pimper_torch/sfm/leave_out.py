@@ -1,6 +1,7 @@
 """Leave features of a room at rest out of COLMAP's database."""
 
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.ledger import leave_out
-from pimper_torch.progress import track
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.camera_in_place import (
     mapped,
@@ -26,7 +26,6 @@ from pimper_torch.sfm.static_background import (
     Pair,
     StaticBackground,
     find_static_background,
-    is_still,
     moving_matches,
 )
 
@@ -36,12 +35,9 @@ STILL_PX = 1.0
 # Where the room shifts and is brought back: measured on 20 rendered photographs of 800x600, panned
 # by up to 80 px, 99 % of its matches are shorter, and 0.8 % of those of a turning mug.
 _SHIFTED_PX = 2.0
-# Pairs that must show that the room and what turns contradict each other before all are verified.
-_TRIED = 24
-
-# Enough where half of the matches are right; 10,000, as COLMAP makes, take 0.1 s in each pair whose
-# moving matches are wrong, and on a turntable those are most.
-_TRIALS = 3000
+# Of RANSAC: enough where half of the matches are right. COLMAP's own 10,000 take 0.1 s in each pair
+# whose moving matches are wrong, and on a turntable those are most.
+_TRIALS = 1000
 
 
 def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
@@ -120,7 +116,7 @@ class _Found:
 
 def _at_rest(matched: Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found:
     maps = tuple(torch.eye(3, dtype=torch.float64) for _ in matched.keypoints)
-    return _find(matched.keypoints, maps, track(matched.pairs), verifier, settings, STILL_PX)
+    return _find(matched.keypoints, maps, verifier, settings, STILL_PX)
 
 
 def _shifted(matched: Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found | None:
@@ -136,15 +132,9 @@ def _shifted(matched: Matched, verifier: "_Verifier", settings: MatchSettings) -
         return None
     pixels = [mapped(*one).float() for one in zip(maps, matched.keypoints, strict=True)]
     still_px = still_length_px(pixels, matched.pairs, _SHIFTED_PX)
-
-    def both(pair: Pair) -> int:
-        still = int(is_still(pixels, pair, still_px).sum())
-        return min(still, len(pair.matches) - still)
-
-    some = sorted(matched.pairs, key=both, reverse=True)[:_TRIED]
-    if not _find(pixels, maps, some, verifier, settings, still_px).rest.room:
+    found = _find(pixels, maps, verifier, settings, still_px)
+    if not found.rest.room:
         return None
-    found = _find(pixels, maps, track(matched.pairs), verifier, settings, still_px)
     shift = shift_px(maps, matched.keypoints)
     return replace(found, rest=found.rest.replace(shift_px=shift))
 
@@ -152,14 +142,13 @@ def _shifted(matched: Matched, verifier: "_Verifier", settings: MatchSettings) -
 def _find(
     keypoints: Keypoints,
     maps: tuple[Float[Tensor, "3 3"], ...],
-    pairs: Iterable[Pair],
     verifier: "_Verifier",
     settings: MatchSettings,
     still_px: float,
 ) -> _Found:
     rest = find_static_background(
         keypoints,
-        pairs,
+        verifier.matched.pairs,
         verifier,
         still_px=still_px,
         max_error_px=settings.max_error_px,
@@ -198,27 +187,43 @@ class _Verifier:
     settings: MatchSettings
     found: dict[tuple[int, int], Any] = field(default_factory=dict)
 
-    def __call__(self, pair: Pair) -> Bool[Tensor, " match"]:
-        ids = self.matched.ids[pair.first], self.matched.ids[pair.second]
-        geometry = self.found[ids] = verified_again(self.matched, pair, self.settings, _TRIALS)
-        return among(pair.matches, indices(geometry.inlier_matches))
+    def __call__(self, pairs: Sequence[Pair]) -> list[Int[Tensor, "match 2"]]:
+        ids = [(self.matched.ids[pair.first], self.matched.ids[pair.second]) for pair in pairs]
+        found = verified_again(self.matched, pairs, self.settings)
+        self.found.update(zip(ids, found, strict=True))
+        return [indices(geometry.inlier_matches) for geometry in found]
 
 
-def verified_again(matched: Matched, pair: Pair, settings: MatchSettings, trials: int) -> Any:  # noqa: ANN401 - see read_matched
-    """Find COLMAP's geometry of some of a pair's matches, within so many trials of RANSAC."""
+def verified_again(matched: Matched, pairs: Sequence[Pair], settings: MatchSettings) -> list[Any]:
+    """Find COLMAP's geometries of some of the matches of pairs, side by side.
+
+    In a database of their own: COLMAP's function for one pair would hold Python's lock.
+    """
     pycolmap = loaded()
 
-    ends = pair.first, pair.second
-    cameras = [matched.cameras[end] for end in ends]
-    pixels = [matched.keypoints[end].double().numpy() for end in ends]
-    return pycolmap.estimate_two_view_geometry(
-        cameras[0],
-        pixels[0],
-        cameras[1],
-        pixels[1],
-        pair.matches.numpy().astype(np.uint32),
-        _options(settings, trials),
-    )
+    ids = [(matched.ids[pair.first], matched.ids[pair.second]) for pair in pairs]
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = settings.min_inliers
+    options.ransac.max_error = settings.max_error_px
+    options.ransac.random_seed = settings.seed
+    options.ransac.max_num_trials = _TRIALS
+    verifying = pycolmap.GeometricVerifierOptions()
+    verifying.num_threads = settings.threads
+    with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
+        path = Path(folder) / "pairs.db"
+        with pycolmap.Database.open(path) as stored:
+            for camera in {camera.camera_id: camera for camera in matched.cameras}.values():
+                stored.write_camera(camera, use_camera_id=True)
+            views = zip(matched.ids, matched.cameras, matched.keypoints, strict=True)
+            for image, camera, pixels in views:
+                known = pycolmap.Image(name=str(image), camera_id=camera.camera_id, image_id=image)
+                stored.write_image(known, use_image_id=True)
+                stored.write_keypoints(image, pixels.numpy())
+            for ends, pair in zip(ids, pairs, strict=True):
+                stored.write_matches(*ends, pair.matches.numpy().astype(np.uint32))
+        pycolmap.geometric_verification(path, verifying, two_view_geometry_options=options)
+        with pycolmap.Database.open(path) as stored:
+            return [stored.read_two_view_geometry(*ends) for ends in ids]
 
 
 def read_geometries(stored: Any) -> dict[tuple[int, int], Any]:  # noqa: ANN401 - see read_matched
@@ -270,17 +275,6 @@ def _drop_matches(
             if len(inliers) >= fewest:
                 geometry.inlier_matches = inliers
                 stored.write_two_view_geometry(*ids, geometry)
-
-
-def _options(settings: MatchSettings, trials: int) -> Any:  # noqa: ANN401 - see read_matched
-    pycolmap = loaded()
-
-    options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers = settings.min_inliers
-    options.ransac.max_error = settings.max_error_px
-    options.ransac.random_seed = settings.seed
-    options.ransac.max_num_trials = trials
-    return options
 
 
 def indices(rows: Any) -> Int[Tensor, "match 2"]:  # noqa: ANN401 - see read_matched

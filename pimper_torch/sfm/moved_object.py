@@ -35,8 +35,8 @@ _MIN_BOTH, _MIN_BOTH_FRACTION = 8, 0.1
 _ENOUGH, _OTHERWISE = 50, 0.001
 
 Rows = Int[Tensor, "match 2"]
-Verify = Callable[[PhotographPair, Rows], Rows]
-"""Gives those of a pair's matches that one epipolar geometry explains."""
+Verify = Callable[[Mapping[PhotographPair, Rows]], Mapping[PhotographPair, Rows]]
+"""Those of each pair's matches that one epipolar geometry explains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -86,32 +86,31 @@ def find_moved_object(
         fewest: Matches below which a pair does not count.
     """
     whole = MovedObject(series=torch.zeros(len(keypoints), dtype=torch.long))
-    seconds: dict[PhotographPair, Rows] = {}
-    for pair, rows in outside.items():
-        if len(rows) >= _MIN_SECOND:
-            second = verify(pair, rows)
-            enough = len(second) >= max(_MIN_SECOND, _MIN_FRACTION * len(rows))
-            if enough and _contradict(keypoints, pair, verified[pair], second, max_error_px):
-                seconds[pair] = second
+    many = {pair: rows for pair, rows in outside.items() if len(rows) >= _MIN_SECOND}
+    seconds = {
+        pair: second
+        for pair, second in verify(many).items()
+        if len(second) >= max(_MIN_SECOND, _MIN_FRACTION * len(many[pair]))
+        and _contradict(keypoints, pair, verified[pair], second, max_error_px)
+    }
     if len(seconds) < _MIN_PAIRS:
         return whole
     votes = object_votes(keypoints, sizes_px, verified, seconds)
     series = series_of(len(keypoints), verified, seconds, votes)
     if int(series.max()) == 0:
         return whole
-    tying, dropped = {}, []
+    own, around_it = {}, {}
     for pair, rows in verified.items():
-        if series[pair[0]] == series[pair[1]]:
-            continue
-        own, surroundings = _counts(votes, pair, rows)
-        if own > surroundings and pair not in seconds:
-            continue  # as it is
-        if own <= surroundings:
-            rows = seconds[pair] if pair in seconds else _second(pair, outside, verify, votes)
-        if len(rows) >= fewest:
-            tying[pair] = rows
-        else:
-            dropped.append(pair)
+        if series[pair[0]] != series[pair[1]]:
+            counts = _counts(votes, pair, rows)
+            if counts[0] <= counts[1]:
+                around_it[pair] = _perhaps_own(votes, pair, outside[pair])
+            elif pair in seconds:
+                own[pair] = rows  # without a second geometry it stays as it is
+    own |= verify({pair: rows for pair, rows in around_it.items() if pair not in seconds})
+    own |= {pair: seconds[pair] for pair in around_it if pair in seconds}
+    tying = {pair: rows for pair, rows in own.items() if len(rows) >= fewest}
+    dropped = [pair for pair in own if pair not in tying]
     around = {
         pair: _surroundings(votes, pair, torch.cat([rows, seconds.get(pair, rows[:0])]))
         for pair, rows in verified.items()
@@ -206,16 +205,9 @@ def clusters(weight: Float[Tensor, "view view"]) -> Int[Tensor, " view"]:
         weight[gone] = weight[:, gone] = 0
 
 
-def _second(
-    pair: PhotographPair,
-    outside: Mapping[PhotographPair, Rows],
-    verify: Verify,
-    votes: Sequence[Float[Tensor, " _"]],
-) -> Rows:
-    """Give what the object shows in a pair whose geometry is that of the surroundings."""
-    first, second = (votes[view][outside[pair][:, side]] for side, view in enumerate(pair))
-    rows = outside[pair][(first >= 0) & (second >= 0)]
-    return verify(pair, rows) if len(rows) else rows
+def _perhaps_own(votes: Sequence[Tensor], pair: PhotographPair, rows: Rows) -> Rows:
+    first, second = (votes[view][rows[:, side]] for side, view in enumerate(pair))
+    return rows[(first >= 0) & (second >= 0)]
 
 
 def _contradict(

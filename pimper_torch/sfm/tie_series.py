@@ -3,6 +3,7 @@
 See :mod:`pimper_torch.sfm.moved_object`.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,6 @@ from pimper_torch.sfm.leave_out import (
 from pimper_torch.sfm.matching import MatchSettings, PhotographPair, VerifiedPair
 from pimper_torch.sfm.moved_object import MovedObject, Rows, find_moved_object
 from pimper_torch.sfm.static_background import Pair
-
-_TRIALS = 1000  # of RANSAC: enough where two thirds of the matches are right
 
 
 def tie_series(
@@ -55,10 +54,10 @@ def tie_series(
         }
         seconds: dict[PhotographPair, Any] = {}
 
-        def verify(pair: PhotographPair, rows: Rows) -> Rows:
-            one = Pair(first=pair[0], second=pair[1], matches=rows)
-            seconds[pair] = verified_again(matched, one, settings, _TRIALS)
-            return indices(seconds[pair].inlier_matches)
+        def verify(some: Mapping[PhotographPair, Rows]) -> dict[PhotographPair, Rows]:
+            pairs = [Pair(first=pair[0], second=pair[1], matches=some[pair]) for pair in some]
+            seconds.update(zip(some, verified_again(matched, pairs, settings), strict=True))
+            return {pair: indices(seconds[pair].inlier_matches) for pair in some}
 
         found = find_moved_object(
             matched.keypoints,

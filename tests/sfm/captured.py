@@ -48,7 +48,12 @@ class Captured:
     def rest(self) -> StaticBackground:
         """Find what is at rest."""
         return find_static_background(
-            self.keypoints, self.pairs, self.right, still_px=1.0, max_error_px=2.0, fewest=15
+            self.keypoints,
+            self.pairs,
+            lambda pairs: [pair.matches[self.right(pair)] for pair in pairs],
+            still_px=1.0,
+            max_error_px=2.0,
+            fewest=15,
         )
 
 

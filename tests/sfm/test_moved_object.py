@@ -40,7 +40,7 @@ def found_in(keypoints, verified, outside):
         SIZE.expand(len(keypoints), 2),
         verified,
         outside,
-        lambda pair, rows: rows,
+        lambda some: some,
         max_error_px=2.0,
         fewest=15,
     )
