@@ -47,7 +47,7 @@ from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import ContourPoints, Mesh, Silhouettes, SparseScene
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.surfaces import simplified
+from pimper_torch.sfm.surfaces import reduced
 from pimper_torch.sfm.undistort import undistorted
 from pimper_torch.silhouettes.contours import Contours, TraceContours
 
@@ -119,14 +119,9 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
         within = hull.depth_of(centre) > -max(away, float(hull.spacing))
         kept = seen_surface(vertices, faces, support, counts, within, pixel, builder.fine)
         used, faces = torch.unique(faces[kept], return_inverse=True)
-        if len(faces) <= builder.config.num_facets:
-            return vertices[used], faces
-        return simplified(
-            vertices[used],
-            faces,
-            num_faces=builder.config.num_facets,
-            boundary_weight=10.0,
-        )
+        mesh = Mesh(vertices_world=vertices[used], faces=faces)
+        few = reduced(mesh, builder.config.num_facets)
+        return few.vertices_world, few.faces
 
     def both() -> Surface:
         corners, cells = cut_surface(cloud, maps, hull, contour)

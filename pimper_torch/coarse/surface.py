@@ -22,7 +22,7 @@ from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
-from pimper_torch.sfm.surfaces import simplified
+from pimper_torch.sfm.surfaces import reduced
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
 
@@ -93,7 +93,8 @@ class CoarseSurface(Stage):
         reference = reference_view(scene, self.config.reference)
         reliable, count = self.reliable(scene), self.config.num_facets
         if mesh is not None:
-            vertices, faces = _used(*simplified(*oriented_outward(mesh, scene.cameras), count))
+            vertices, faces = oriented_outward(mesh, scene.cameras)
+            vertices, faces = _facets(vertices, faces, count)
             pixel = pixel_size(scene, reliable) if len(reliable) else float("inf")
             support = None
         else:
@@ -107,14 +108,15 @@ class CoarseSurface(Stage):
                     "degrees), and at least 4 are needed. Take more photographs."
                 )
             fine = fine_surface(scene, reliable, contours, self.densify, self.fine)
-            vertices, faces = _used(*simplified(fine.vertices_world, fine.faces, count))
+            vertices, faces = _facets(fine.vertices_world, fine.faces, count)
             crowded = len(faces)
             faces = two_faces_an_edge(vertices, faces)
             leave_out("coarse.crowded", crowded - len(faces), total=crowded)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
             kept = supported_components(vertices, faces, whole, min_fraction(contours))
             leave_out("coarse.pieces", ~kept)
-            vertices, faces = _used(vertices, faces[kept])
+            used, faces = torch.unique(faces[kept], return_inverse=True)
+            vertices = vertices[used]
             pixel, support = fine.pixel, fine.support_of(vertices[faces])
         return CoarseMesh(
             mesh=Mesh(
@@ -187,8 +189,8 @@ def _on_facets(
     )
 
 
-def _used(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> tuple[Float[Tensor, "used 3"], Int[Tensor, "face 3"]]:
-    used, faces = torch.unique(faces, return_inverse=True)
-    return vertices[used], faces
+def _facets(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], count: int
+) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
+    few = reduced(Mesh(vertices_world=vertices, faces=faces), count)
+    return few.vertices_world, few.faces

@@ -18,9 +18,6 @@ _SLICES = 4
 # Edges of which the median is taken: it is certain to a few thousandths.
 _EDGES = 100_000
 
-# Passes over the vertices: few vertices go after the first ten.
-_ITERATIONS = 30
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bounds:
@@ -94,69 +91,54 @@ def simplify(
     if normals is None:
         normals = vertex_normals(mesh.vertices_world, mesh.faces)
     spacing = _median_edge(vertices, mesh.faces.cpu())
-    points = (vertices - vertices.mean(dim=0)).float().contiguous().numpy()
+    points = _rows(vertices - vertices.mean(dim=0))
     faces = mesh.faces.to("cpu", torch.int32, copy=True).contiguous().numpy()
-    channels = np.zeros((len(points), 0), np.float32) if values is None else _rows(values)
-    head = np.empty(len(points), np.int32)
-    following = np.empty(faces.size, np.int32)
-    first, after = np.full(len(faces), -1, np.int32), np.full(len(points), -1, np.int32)
+    channels = _rows(normals if values is None else torch.cat([normals, values.to(normals)], dim=1))
+    links = np.empty(len(points) + faces.size, np.int32)
+    lists = np.full(len(faces) + len(points), -1, np.int32)
     off = np.tile(np.array([0, 1], np.float32), (len(points), 1))
-    decimation.link_corners(faces, head, following)
+    cosine = float(np.cos(np.radians(bounds.angle_deg)))
+    decimation.link_corners(faces, links)
 
-    def thin_out(part: np.ndarray, mine: int, fresh: np.ndarray) -> int:
-        return decimation.decimate(
-            points,
-            _rows(normals),
-            channels,
-            bounds.spacings * spacing,
-            float(np.cos(np.radians(bounds.angle_deg))),
-            _ITERATIONS,
-            faces,
-            head,
-            following,
-            part,
-            mine,
-            fresh,
-            first,
-            after,
-            off,
-        )
-
-    parts = _slices(points)
-    corners = parts[faces]
+    part = _slices(points)
+    corners = part[faces]
     between = np.zeros(len(points), bool)
     between[faces[(corners != corners[:, :1]).any(axis=1)]] = True
-    fresh = ~between
-    list(side_by_side(lambda mine: thin_out(parts, mine, fresh), range(_SLICES)))
-    thin_out(np.zeros_like(parts), 0, fresh | between)
+    candidates = ~between
+
+    def thin_out(free: np.ndarray) -> None:
+        arguments = (free, candidates, faces, links, lists, off)
+        decimation.decimate(points, channels, bounds.spacings * spacing, cosine, *arguments)
+
+    inner = [(part == mine) & ~between for mine in range(_SLICES)]
+    list(side_by_side(thin_out, inner))
+    candidates |= between
+    thin_out(np.ones_like(between))
 
     left = faces[:, 0] >= 0
     kept, renumbered = np.unique(faces[left], return_inverse=True)
-    face = np.full(len(points), -1, np.int32)
-    decimation.read_lists(first[left], after, face)
     chosen = torch.from_numpy(kept).long().to(mesh.faces.device)
+    fewer = torch.from_numpy(renumbered.reshape(-1, 3)).to(mesh.faces)
     return Simplified(
-        mesh=_taken(mesh, chosen, torch.from_numpy(renumbered.reshape(-1, 3)).to(mesh.faces)),
+        mesh=mesh.take(chosen).replace(faces=fewer),
         kept=chosen,
-        face=torch.from_numpy(face).to(mesh.faces),
+        face=torch.from_numpy(_listed(lists, left)).to(mesh.faces),
         spacing=spacing,
         max_spacings=float(off[:, 0].max()) / spacing,
         max_angle_deg=float(np.degrees(np.arccos(min(1.0, float(off[:, 1].min()))))),
     )
 
 
-def _taken(mesh: Mesh, kept: Int[Tensor, " kept"], faces: Int[Tensor, "face 3"]) -> Mesh:
-    def of(values: Tensor | None) -> Tensor | None:
-        return None if values is None else values[kept]
-
-    return Mesh(
-        vertices_world=mesh.vertices_world[kept],
-        faces=faces,
-        normals_world=of(mesh.normals_world),
-        albedo=of(mesh.albedo),
-        confidence=of(mesh.confidence),
-        expected_error=of(mesh.expected_error),
-    )
+def _listed(lists: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Return the remaining face of every removed vertex, and -1 of the others."""
+    heads, following = lists[: len(left)][left], lists[len(left) :]
+    face = np.full(len(following), -1, np.int32)
+    number, point = np.arange(len(heads)), heads
+    while len(point):
+        number, point = number[point >= 0], point[point >= 0]
+        face[point] = number
+        point = following[point]
+    return face
 
 
 def _rows(values: Float[Tensor, "vertex channel"]) -> np.ndarray:

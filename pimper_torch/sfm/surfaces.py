@@ -1,16 +1,24 @@
-"""COLMAP's surfaces: screened Poisson reconstruction, and simplification.
+"""COLMAP's surfaces: screened Poisson reconstruction, and meshes of few faces.
 
 Both run on one thread: on several, sums in another order give another surface in each run.
 """
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
+from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.surfaces import barycentric
+from pimper_torch.geometry.topology import half_edges
+from pimper_torch.records import Mesh
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.exchange import read_faces, write_cloud, write_faces
 
@@ -59,40 +67,77 @@ def poisson_surface(
         return _made(surface, "Poisson", pycolmap.poisson_meshing, cloud, surface, options)
 
 
-def simplified(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    num_faces: int,
-) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
-    """Merge vertices of a mesh where that changes its planes least, until few faces are left.
+def reduced(mesh: Mesh, num_faces: int) -> Mesh:
+    """Merge vertices where that changes the planes of faces least, until few faces are left.
 
-    Borders count ten times as much as the surface. A mesh with no more faces comes back as it is.
+    Borders count ten times as much as the surface. Normals, albedo, confidence and expected error
+    are those of the nearest place of the former surface, blended over its face. A constant to
+    autograd.
 
     Args:
-        vertices: Any unit.
-        faces: Of the mesh.
-        num_faces: About so many are left.
+        mesh: Any; one that is small enough comes back as it is.
+        num_faces: Of the result at most; a few more are left where nothing else can be merged.
 
     Raises:
+        ConfigError: Fewer than 4 faces are asked for.
         ReconstructionError: COLMAP cannot simplify the mesh.
 
     Source: Garland & Heckbert, Surface simplification using quadric error metrics,
     SIGGRAPH 1997.
     """
-    if len(faces) <= num_faces:
-        return vertices, faces
+    require(num_faces >= 4, "faces", num_faces, "4 at least, those of a tetrahedron")
+    if len(mesh.faces) <= num_faces:
+        return mesh
     pycolmap = loaded()
     options = pycolmap.MeshSimplificationOptions()
-    options.target_face_ratio = num_faces / max(1, len(faces))
+    options.target_face_ratio = num_faces / len(mesh.faces)
     options.boundary_weight, options.num_threads = _BORDER_WEIGHT, 1
     options.interpolate_colors = False
+    # COLMAP works in single precision: a mesh far from the origin is brought there.
+    places = mesh.vertices_world.detach().cpu().double()
+    centre = places.median(dim=0).values
     with tempfile.TemporaryDirectory() as folder:
         before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
-        # COLMAP works in single precision: a mesh far from the origin is brought there.
-        centre = vertices.median(dim=0).values
-        write_faces(vertices - centre, faces, before)
-        fewer, left = _made(after, "simplification", pycolmap.simplify_mesh, before, after, options)
-        return fewer.to(vertices) + centre, left.to(faces)
+        write_faces(places - centre, mesh.faces, before)
+        vertices, faces = _made(
+            after, "simplification", pycolmap.simplify_mesh, before, after, options
+        )
+    used, faces = torch.unique(_oriented(faces), return_inverse=True)
+    points = vertices[used].double() + centre
+    known = [one.name for one in fields(Mesh) if getattr(mesh, one.name) is not None][2:]
+    return Mesh(
+        vertices_world=points.to(mesh.vertices_world),
+        faces=faces.to(mesh.faces),
+        **(_nearest_values(mesh, known, points) if known else {}),
+    )
+
+
+def _nearest_values(
+    mesh: Mesh, names: list[str], points: Float[Tensor, "point 3"]
+) -> dict[str, Tensor]:
+    """Blend fields of a mesh at the places that are nearest to points."""
+    places = mesh.vertices_world.detach().cpu().double()
+    nearest = NearestSurface(mesh).query(points)
+    corners = mesh.faces.cpu()[nearest.face]
+    weights = barycentric(nearest.points, places[corners])
+
+    def blended(values: Tensor) -> Tensor:
+        rows = values.detach().cpu().double()[corners].reshape(len(corners), 3, -1)
+        return (weights[..., None] * rows).sum(dim=1).reshape(-1, *values.shape[1:])
+
+    found = {name: blended(getattr(mesh, name)).to(getattr(mesh, name)) for name in names}
+    if "normals_world" in found:
+        found["normals_world"] = normalize(found["normals_world"], dim=-1)
+    return found
+
+
+def _oriented(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
+    """Drop faces that run along an edge the way that an earlier face does."""
+    ends = half_edges(faces)
+    _, label = torch.unique(ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], return_inverse=True)
+    number = torch.arange(len(faces)).repeat_interleave(3)
+    first = torch.full_like(label, len(faces)).scatter_reduce(0, label, number, "amin")
+    return faces[(first[label] == number).reshape(-1, 3).all(dim=1)]
 
 
 def _made(

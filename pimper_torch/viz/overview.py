@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.geometry.projection import project
-from pimper_torch.meshing.reduce import reduced
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
+from pimper_torch.sfm.surfaces import reduced
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.render import bounding_box, frame, rotation, shade
 from pimper_torch.viz.silhouettes import RELIABLE, thumbnails

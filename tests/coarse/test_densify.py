@@ -27,8 +27,8 @@ from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.topology import connected_to
-from pimper_torch.records import Support
-from pimper_torch.sfm.surfaces import poisson_surface, simplified
+from pimper_torch.records import Mesh, Support
+from pimper_torch.sfm.surfaces import poisson_surface, reduced
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
 
@@ -130,10 +130,10 @@ def test_poisson_puts_a_ball_through_points_of_a_ball_and_simplification_keeps_i
     vertices, _ = icosphere(4)
     found, faces = poisson_surface(vertices, vertices, depth=6, point_weight=1.0)
     assert (found.norm(dim=1) - 1).abs().max() < 0.02
-    few, left = simplified(found, faces, num_faces=200)
-    assert 150 <= len(left) <= 200
-    assert (few.norm(dim=1) - 1).abs().max() < 0.06
-    a, b, c = few[left].unbind(dim=1)
+    few = reduced(Mesh(vertices_world=found, faces=faces), num_faces=200)
+    assert 150 <= len(few.faces) <= 200
+    assert (few.vertices_world.norm(dim=1) - 1).abs().max() < 0.06
+    a, b, c = few.vertices_world[few.faces].unbind(dim=1)
     assert (torch.linalg.cross(b - a, c - a) * (a + b + c)).sum(dim=-1).min() > 0
 
 

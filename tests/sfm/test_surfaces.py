@@ -5,8 +5,8 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.topology import boundary_vertices, half_edges
-from pimper_torch.meshing.reduce import reduced
 from pimper_torch.records import Mesh
+from pimper_torch.sfm.surfaces import reduced
 
 
 def ball(level: int = 5) -> Mesh:
