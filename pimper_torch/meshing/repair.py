@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.config import Range, require_ranges
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import side_lengths, vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, corners_of, vertex_components
 from pimper_torch.ledger import leave_out
 from pimper_torch.meshing.faults import faults
@@ -24,6 +24,9 @@ from pimper_torch.stage import Stage
 # Rings of sound vertices that a component with defects may take in, one at a time: with twice the
 # samples a pixel, 6 left 5 openings in a skull's orbit, and 12 none (commit 3dadfd4).
 _RINGS = 12
+# Longest side of a face in typical ones, below which it is a point: a closed piece with one sound
+# vertex shrinks to that. In float32 it shrank to 1e-7.
+_POINT = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,6 +108,7 @@ def repair(
     Differentiable in the vertices that stay; which these are is a constant.
     """
     before, count = vertices.detach(), len(vertices)
+    shortest = _POINT * side_lengths(before[faces]).amax(dim=1).median()
     fixed = boundary_vertices(faces, count)
     free = corners_of(faces, broken(before), count)
     free = _with_neighbours(faces, free & ~_components_with(faces, free, fixed))
@@ -112,7 +116,8 @@ def repair(
         positions = least_bent(before, faces, free)
         fixed = fixed | (free & ~small_groups(positions, faces, free, max_extent))
         free = free & ~fixed
-        still = _components_with(faces, free, corners_of(faces, broken(positions), count))
+        wrong = broken(positions) | (side_lengths(positions[faces]).amax(dim=1) < shortest)
+        still = _components_with(faces, free, corners_of(faces, wrong, count))
         if not bool(still.any()):
             break
         wider = corners_of(faces, still[faces].any(dim=1), count) & ~fixed
@@ -123,7 +128,7 @@ def repair(
 def surroundings(
     faces: Int[Tensor, "face 3"], broken: Bool[Tensor, " face"], num_vertices: int
 ) -> Bool[Tensor, " face"]:
-    """Mark the faces round defective ones that :func:`repair` may use: it needs no others."""
+    """Find the faces round defective ones that :func:`repair` may use: it needs no others."""
     near = broken
     for _ in range(_RINGS + 3):  # two rings clamp the plate, and one shows the border
         near = corners_of(faces, near, num_vertices)[faces].any(dim=1)
@@ -133,7 +138,7 @@ def surroundings(
 def _components_with(
     faces: Int[Tensor, "face 3"], among: Bool[Tensor, " vertex"], some: Bool[Tensor, " vertex"]
 ) -> Bool[Tensor, " vertex"]:
-    """Mark the connected components of vertices ``among`` that have some of others."""
+    """Find the connected components of vertices ``among`` that have some of others."""
     label = vertex_components(faces, among)
     named = torch.zeros_like(among)
     named[label[among & some]] = True

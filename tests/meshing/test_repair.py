@@ -312,3 +312,19 @@ def test_the_border_is_never_moved():
     places, moved = repair(surface.vertices_world, upper, growing, torch.tensor(10.0).double())
     assert moved.sum() >= 60
     assert torch.equal(places[contour], surface.vertices_world[contour])
+
+
+def test_a_closed_piece_does_not_shrink_to_its_only_sound_vertex():
+    """All but one vertex of a small sphere beside a large one are on defective faces."""
+    vertices, faces = icosphere(2)
+    count = len(vertices)
+    vertices = torch.cat([5 * vertices, vertices + 9])
+    faces = torch.cat([faces, faces + count])
+    defective = (faces >= count).all(dim=1) & (faces != count).all(dim=1)
+
+    def broken(moved):
+        return defective & (moved[faces] == vertices[faces]).flatten(1).all(dim=1)
+
+    after, moved = repair(vertices, faces, broken, torch.tensor(torch.inf))
+    assert not moved.any()
+    assert torch.equal(after, vertices)
