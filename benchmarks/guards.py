@@ -78,7 +78,9 @@ PATCHES: dict[str, dict[str, object]] = {
     "remesh.data": {"coarse.remesh._with_data": everything(1)},
     "fuse.outvoted": {"fusion.blend._agreement": lambda found, *_: torch.ones_like(found.height)},
     "repair": {"meshing.repair.Repair.forward": lambda _, surface: surface},
-    "extract.spikes": {"meshing.extract.Extract._spikes": lambda _, one: nothing(0)(one.faces)},
+    "extract.spikes": {
+        "meshing.extract.Extract._long_and_overturned": lambda _, one: (nothing(0)(one.faces),) * 2
+    },
     "extract.borders": {"meshing.extract.protruding": nothing(1)},
 }
 CHANGES: dict[str, dict[str, object]] = {

@@ -44,7 +44,13 @@ def parameters(found: typing.Any) -> Iterator[tuple[str, typing.Any]]:
         if inspect.isfunction(one) and (not name.startswith("_") or name == "__init__"):
             # Figures are annotated in quotes: matplotlib is imported when one is drawn.
             hints = inspect.get_annotations(inspect.unwrap(one))
-            yield from ((f"{found.__name__}.{name}({key})", hint) for key, hint in hints.items())
+            for key, hint in hints.items():
+                options = {key: hint}
+                if typing.get_origin(hint) is typing.Unpack:  # of a dictionary that readers share
+                    options = typing.get_type_hints(typing.get_args(hint)[0])
+                yield from (
+                    (f"{found.__name__}.{name}({key})", one) for key, one in options.items()
+                )
 
 
 def parts(hint: typing.Any) -> Iterator[typing.Any]:
